@@ -8,7 +8,7 @@ The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is
     tau_b  = 0 if |e| < deadband else tau_c
     limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)      b: 1 driving, braking_slope while it brakes
     motor  = clip(tau_b, -limit, +limit)                            what the motor's current shows
-    joint  = efficiency * lag(motor) + ripple(q) - friction
+    joint  = efficiency * lag(motor) + parasitic(q, qd) - friction
 
 Voltage drive: duty = clip(kp * e - kd * qd_m, -1, 1), motor = torque_limit * (duty * supply - qd / no_load_speed).
 
@@ -48,29 +48,29 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.actuator.columns import FEATURES, INDEX
+from dexsim.actuator.columns import INDEX
 from dexsim.actuator.laws import (
     arrived,
     difference,
     eccentricity,
     eccentricity_slope,
+    fading_friction,
     gear_friction,
     hold,
     lag_share,
     load_share,
-    opposed_square,
     other_terms,
+    parasitic_torque,
     pd,
     preslide,
     preslide_slope,
-    ripple_wave,
     sagging,
     stribeck_power,
     torque_limits,
     transmission,
     transmission_damping,
     voltage_torque,
-    warmed,
+    warm_motor,
     wind,
 )
 
@@ -100,19 +100,15 @@ COULOMB, ASYMMETRY = INDEX["coulomb_friction"], INDEX["friction_asymmetry"]
 STRIBECK_PEAK, STRIBECK_SPEED = INDEX["stribeck_peak"], INDEX["stribeck_speed"]
 VISCOUS = INDEX["viscous_friction"]
 LOAD, LOAD_BACK = INDEX["load_friction"], INDEX["load_friction_backdriven"]
-LOAD_OUTSIDE, LOAD_PEAK, LOAD_PEAK_OUTSIDE, LOAD_SQUARE, LOAD_SQUARE_OUTSIDE = (INDEX[n] for n in FEATURES["load"])
-RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE = INDEX["torque_ripple"], INDEX["ripple_per_turn"], INDEX["ripple_phase"]
+LOAD_OUTSIDE = INDEX["load_friction_external"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 SPEED_LAG, DEADBAND_KIND = INDEX["speed_lag"], INDEX["deadband_kind"]
 BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
     INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
 )
-THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE, WARMTH = (
-    INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance", "warmth")
-)
-BRAKING = INDEX["braking_slope"]
-STRIBECK_EXPONENT, PRESLIDING, RIPPLE_SHAPE = (INDEX[n] for n in ("stribeck_exponent", "presliding", "ripple_shape"))
+WARMTH, BRAKING = INDEX["warmth"], INDEX["braking_slope"]
+STRIBECK_EXPONENT, PRESLIDING = INDEX["stribeck_exponent"], INDEX["presliding"]
 FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (
     INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain")
 )
@@ -207,6 +203,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     )
     extended = bool(features & EXTENDED)
     Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
+    parasitic = parasitic_torque(features)
 
     @wp.struct
     # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
@@ -311,15 +308,11 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         m.efficiency = d.params[w, j, EFFICIENCY]
         m.friction = real(1.0)
         if wp.static(rare):
-            warmth = d.params[w, j, WARMTH]
-            constant = warmed(d.params[w, j, THERMAL_TORQUE], warmth)
-            m.friction = wp.max(warmed(d.params[w, j, THERMAL_FRICTION], warmth), real(0.0))
-            m.tau0 = m.tau0 * constant
-            if wp.static(voltage):
-                m.tau0 = m.tau0 / wp.max(warmed(d.params[w, j, THERMAL_RESISTANCE], warmth), wp.static(real(0.1)))
-                m.no_load = m.no_load / constant
-            else:
-                m.efficiency = m.efficiency * constant
+            warm = warm_motor(d.params[w, j], d.params[w, j, WARMTH], wp.static(voltage))
+            m.tau0 = warm[0]
+            m.no_load = warm[1]
+            m.efficiency = warm[2]
+            m.friction = warm[3]
         if wp.static(sag):
             m.supply = sagging(m.supply, d.params[w, j, SAG], d.given[w] - wp.abs(d.torque[w, j]))
         return m
@@ -462,11 +455,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         left = wp.exp(-stribeck_power(r.v / d.params[w, j, STRIBECK_SPEED], exponent))
         if wp.static(load):
             outside = d.outside[w, d.dof[j]]
-            of = d.params[w, j]
-            by_share = gear_friction(last, outside, share, factor * of[LOAD_OUTSIDE])
-            fading = gear_friction(last, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
-            fading += opposed_square(last, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
-            f.level += peak * left + by_share + factor * left * fading
+            by_share = gear_friction(last, outside, share, factor * d.params[w, j, LOAD_OUTSIDE])
+            f.level += peak * left + by_share + factor * left * fading_friction(d.params[w, j], last, outside)
         else:
             f.level += peak * left + share * wp.abs(last)
         f.own = f.level - d.base_frictionloss[w, j]
@@ -558,16 +548,15 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         m = remaining(d, w, j)
         t = ask(dt, queue, x0, sense(dt, x0, fresh, r, d, w, j), r, m, d, w, j)
 
-        # Ripple; where its slope is that of a spring, it too is taken at the end of the step.
-        turn = d.params[w, j, RIPPLE_PER_TURN]
-        form = real(0.0)
-        if wp.static(shape):
-            form = d.params[w, j, RIPPLE_SHAPE]
-        wave = ripple_wave(turn * q + d.params[w, j, RIPPLE_PHASE], form)
-        t.end += d.params[w, j, RIPPLE] * wave[0]
-        stiffness = wp.max(real(0.0), -d.params[w, j, RIPPLE] * turn * wave[1])
+        # Ripple and its like; what of it brakes, or pulls like a spring, is taken at the end of the step.
+        beside = parasitic(d.params[w, j], q, r.v)
+        t.end += beside[0]
+        stiffness = wp.max(real(0.0), -beside[1])
         t.end -= stiffness * dt * v
         t.slope += stiffness * dt
+        drag = wp.max(real(0.0), -beside[2])
+        t.slope += drag
+        t.on_drive += drag
 
         # The stand-in for what is not known; what of it brakes, or pulls like a spring, is taken at the end of the
         # step.

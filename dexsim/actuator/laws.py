@@ -1,12 +1,29 @@
 """The physics of a drive, one small Warp function a law, in SI units: what the training's servo (`kernel.py`) and the
 search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32 and in float64; `reference.py` has the
-same laws in NumPy, written apart, as their check."""
+same laws in NumPy, written apart, as their check.
+
+Where several laws make up one quantity they are put together here, for both kernels: `parasitic_torque`, `warm_motor`,
+`fading_friction`. `of` is there a drive's row of the table, in the order of `columns.py`."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
+from functools import cache
 from typing import Any
 
 import warp as wp
+
+from dexsim.actuator.columns import INDEX
+
+TORQUE_LIMIT, NO_LOAD_SPEED, EFFICIENCY = (INDEX[n] for n in ("torque_limit", "no_load_speed", "efficiency"))
+THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE = (
+    INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance")
+)
+LOAD_PEAK, LOAD_PEAK_OUTSIDE, LOAD_SQUARE, LOAD_SQUARE_OUTSIDE = (
+    INDEX[n] for n in ("load_stribeck", "load_stribeck_external", "load_quadratic", "load_quadratic_external")
+)
+RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE, RIPPLE_SHAPE = (
+    INDEX[n] for n in ("torque_ripple", "ripple_per_turn", "ripple_phase", "ripple_shape")
+)
 
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
@@ -52,6 +69,26 @@ def warmed(per_degree: Any, warmth: Any):
     Copper's resistance has +0.0039 (IEC 60028), the magnets' flux about -0.001 (NdFeB) per degree; grease gets
     thinner."""
     return type(warmth)(1.0) + per_degree * warmth
+
+
+@wp.func
+def warm_motor(of: wp.array(dtype=Any), warmth: Any, voltage: bool):
+    """(stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction) of a drive `warmth` [degC] above
+    the temperature that its figures hold at (`warmed`).
+
+    The torque constant k is Nm/A and V.s/rad in one. A voltage drive's stall torque k u / R and no-load speed u / k
+    follow from it and from the resistance R; a torque drive asks for a current, and k is lost on the way to the
+    joint."""
+    constant = warmed(of[THERMAL_TORQUE], warmth)
+    tau0 = of[TORQUE_LIMIT] * constant
+    no_load = of[NO_LOAD_SPEED]
+    efficiency = of[EFFICIENCY]
+    if voltage:
+        tau0 = tau0 / wp.max(warmed(of[THERMAL_RESISTANCE], warmth), type(warmth)(0.1))
+        no_load = no_load / constant
+    else:
+        efficiency = efficiency * constant
+    return wp.vector(tau0, no_load, efficiency, wp.max(warmed(of[THERMAL_FRICTION], warmth), type(warmth)(0.0)))
 
 
 @wp.func
@@ -173,6 +210,15 @@ def opposed_square(motor: Any, outside: Any, per_motor: Any, per_outside: Any):
 
 
 @wp.func
+def fading_friction(of: wp.array(dtype=Any), motor: Any, outside: Any):
+    """Dry friction [N.m] of a drive by what its gear carries, `motor` and `outside` [N.m], as far as it falls with
+    speed like the column `stribeck_peak` (`gear_friction`, `opposed_square`): at rest."""
+    friction = gear_friction(motor, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
+    friction += opposed_square(motor, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
+    return friction
+
+
+@wp.func
 def preslide(taken: Any, turned: Any):
     """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn /
     presliding.
@@ -236,6 +282,36 @@ def ripple_wave(angle: Any, shape: Any):
     return wp.vector(value, slope)
 
 
+# -- what a drive adds by itself ---------------------------------------------------------------------------------------
+
+
+@cache
+def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of all torque of a drive that neither its motor is asked for nor is dry friction, as a sum of
+    laws of position and speed, for a kernel with these of `columns.FEATURES`.
+
+    A further such law is a function of this file and a term here, and in `reference.parasitic_torque`: training, search
+    and what a diagnosis hands on take their torque from these two."""
+
+    @wp.func
+    def parasitic(of: wp.array(dtype=Any), q: Any, v: Any):
+        """(torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]) at position q [rad] of the joint
+        and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
+        torque = type(q)(0.0)
+        by_position = type(q)(0.0)
+        by_speed = type(v)(0.0)
+        if of[RIPPLE] != type(q)(0.0):
+            form = type(q)(0.0)
+            if wp.static("shape" in features):
+                form = of[RIPPLE_SHAPE]
+            wave = ripple_wave(of[RIPPLE_PER_TURN] * q + of[RIPPLE_PHASE], form)
+            torque += of[RIPPLE] * wave[0]
+            by_position += of[RIPPLE] * of[RIPPLE_PER_TURN] * wave[1]
+        return wp.vector(torque, by_position, by_speed)
+
+    return parasitic
+
+
 # -- the controller ----------------------------------------------------------------------------------------------------
 #
 # tau_c = kp e - kd qd_m + speed_feedforward * r' + acceleration_feedforward * r'' + integral_gain * integral of e dt,
@@ -249,7 +325,6 @@ def ripple_wave(angle: Any, shape: Any):
 # holds -K_vi q, a term in q alone: kp = K_vp K_pp + K_vi then acts on -q, and only K_vp K_pp of it on r; that one is
 # not expressed by these columns. A current loop below is the column `lag`. (G. Ellis, Control System Design Guide,
 # 4th ed. 2012, chapter 17.)
-
 
 
 @wp.func

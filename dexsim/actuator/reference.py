@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from dexsim.actuator.columns import INDEX
+from dexsim.actuator.columns import FEATURES, INDEX
 from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
 
 Numbers = float | np.ndarray
@@ -70,6 +70,26 @@ def torque_along(
         return asked
     limit = stall * np.maximum(1 - np.abs(v) / no_load, 0.0)
     return np.clip(asked, -limit, limit)
+
+
+def parasitic_torque(
+    p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES
+) -> tuple[Numbers, Numbers, Numbers]:
+    """(torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its motor is
+    asked for nor is dry friction: of all terms of `laws.parasitic_torque`.
+
+    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
+    count."""
+    angle = p["ripple_per_turn"] * q + p["ripple_phase"]
+    wave, tilt = np.sin(angle), np.cos(angle)
+    if "shape" in features:
+        form = p["ripple_shape"]
+        centre = np.where(form < 0.0, np.pi, 0.0)
+        tooth = np.sign(form) * (np.mod(angle - centre + np.pi, 2 * np.pi) / np.pi - 1.0)
+        wave = (1.0 - np.abs(form)) * wave + np.abs(form) * tooth
+        tilt = (1.0 - np.abs(form)) * tilt + form / np.pi
+    torque, by_position = p["torque_ripple"] * wave, p["torque_ripple"] * p["ripple_per_turn"] * tilt
+    return torque, by_position, np.zeros_like(v)
 
 
 def load_level(
@@ -239,18 +259,11 @@ def servo(
     damping = efficiency * damping
     on_drive = efficiency * blend * on_drive
 
-    angle = p["ripple_per_turn"] * q + p["ripple_phase"]
-    wave, tilt = np.sin(angle), np.cos(angle)
-    if "shape" in features:
-        form = p["ripple_shape"]
-        centre = np.where(form < 0.0, np.pi, 0.0)
-        tooth = np.sign(form) * (np.mod(angle - centre + np.pi, 2 * np.pi) / np.pi - 1.0)
-        wave = (1.0 - np.abs(form)) * wave + np.abs(form) * tooth
-        tilt = (1.0 - np.abs(form)) * tilt + form / np.pi
-    applied = applied + p["torque_ripple"] * wave
-    stiffness = np.maximum(0.0, -p["torque_ripple"] * p["ripple_per_turn"] * tilt)
-    applied = applied - stiffness * dt * v
-    damping = damping + stiffness * dt
+    beside, by_position, by_speed = parasitic_torque(p, q, v_drive, features)
+    stiffness, drag = np.maximum(0.0, -by_position), np.maximum(0.0, -by_speed)
+    applied = applied + beside - stiffness * dt * v
+    damping = damping + stiffness * dt + drag
+    on_drive = on_drive + drag
 
     of_motor, slope_motor, drawn = applied, damping, applied
     pull = p["standin_position"]

@@ -7,80 +7,77 @@ An effect names the classes that it belongs to; only members of one class may be
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from dexsim.gap.effects.body import ExternalForce, Inertia, JointSpring, Payload
-from dexsim.gap.effects.drive import (
-    BrakingLimit,
-    ControllerTerm,
-    Deadband,
-    GainMismatch,
-    SupplySag,
-    Thermal,
-    TorqueLimit,
-    TorqueSpeedLimit,
-)
+from dexsim.gap.effects import body, drive, friction, signals, touch, transmission
 from dexsim.gap.effects.effect import Effect, TouchEffect, Variant
-from dexsim.gap.effects.friction import CoulombFriction, LoadFriction, Presliding, StribeckFriction, ViscousFriction
-from dexsim.gap.effects.signals import CommandDelay, CurrentSensor, Lag, PositionOffset, PositionScale
-from dexsim.gap.effects.touch import (
-    ContactFriction,
-    ContactStiffness,
-    TactileCrosstalk,
-    TactileDelay,
-    TactileDrift,
-    TactileGain,
-    TactileHysteresis,
-    TactileStiffening,
-)
-from dexsim.gap.effects.transmission import Backlash, Compliance, JointCoupling, TorqueRipple
 from dexsim.gap.rules import JUDGE
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
 
-CATALOGUE: tuple[Effect, ...] = (
-    CoulombFriction(),
-    StribeckFriction(),
-    ViscousFriction(),
-    LoadFriction(),
-    Backlash(),
-    Compliance(),
-    CommandDelay(),
-    Lag(),
-    TorqueLimit(),
-    TorqueSpeedLimit(),
-    SupplySag(),
-    TorqueRipple(),
-    Thermal(),
-    JointCoupling(),
-    PositionOffset(),
-    PositionScale(),
-    Payload(),
-    Inertia(),
-    GainMismatch(),
-    Deadband(),
-    CurrentSensor(),
-    BrakingLimit(),
-    ControllerTerm(),
-    Presliding(),
-    JointSpring(),
-    ExternalForce(),
+FIRST = (
+    "coulomb_friction",
+    "stribeck_friction",
+    "viscous_friction",
+    "load_friction",
+    "backlash",
+    "compliance",
+    "command_delay",
+    "lag",
+    "torque_limit",
+    "torque_speed_limit",
+    "supply_sag",
+    "torque_ripple",
+    "thermal",
+    "joint_coupling",
+    "position_offset",
+    "position_scale",
+    "payload",
+    "inertia",
+    "gain_mismatch",
+    "deadband",
+    "current_sensor",
+    "braking_limit",
+    "controller_term",
+    "presliding",
+    "joint_spring",
+    "external_force",
 )
+"""The order in which the search asks; an effect that is not named here comes after, in the order of the files."""
+FIRST_TOUCH = (
+    "tactile_gain",
+    "tactile_stiffening",
+    "tactile_hysteresis",
+    "tactile_crosstalk",
+    "tactile_delay",
+    "thermal",
+    "contact_friction",
+    "contact_stiffness",
+)
+"""The same for touch."""
+
+Entry = TypeVar("Entry", Effect, TouchEffect)
+
+
+def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[str]) -> tuple[Entry, ...]:
+    """An entry of each class of a kind that stands in the files of these families: to write it there is to add it."""
+    found = [
+        c()
+        for family in families
+        for c in vars(family).values()
+        if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
+    ]
+    return tuple(sorted(found, key=lambda e: first.index(e.id) if e.id in first else len(first)))
+
+
+CATALOGUE = gathered(Effect, (friction, transmission, signals, drive, body), FIRST)
 """Effects of a joint and its drive."""
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
-TOUCH_CATALOGUE: tuple[TouchEffect, ...] = (
-    TactileGain(),
-    TactileStiffening(),
-    TactileHysteresis(),
-    TactileCrosstalk(),
-    TactileDelay(),
-    TactileDrift(),
-    ContactFriction(),
-    ContactStiffness(),
-)
+TOUCH_CATALOGUE = gathered(TouchEffect, (touch,), FIRST_TOUCH)
 """Effects of touch and contact."""
 TOUCH_EFFECTS: dict[str, TouchEffect] = {e.id: e for e in TOUCH_CATALOGUE}
 
@@ -95,10 +92,10 @@ CLASSES: dict[str, str] = {
     "zero or gravity": "static poses over the whole range, and the same with the mechanism turned over: "
     "what gravity does changes sign, an encoder's zero stays",
     "limits at speed": "large steps at full speed, and stops from it: one limit acts while driving, the other while "
-                       "braking",
+    "braking",
     "loop": "constant speeds from slow to fast, steps of several sizes and long holds against a known load",
     "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint "
-                        "to a side",
+    "to a side",
     "friction or pull": "static poses over the whole range with the drive off at each: friction holds the joint where "
     "a pull moves it",
     "weight or push": "static poses over the whole range, twice, with nothing in reach",

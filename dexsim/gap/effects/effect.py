@@ -204,6 +204,8 @@ class Effect:
     # effects that are this one with a size of nothing, whatever else is like them
     nests: ClassVar[tuple[str, ...]] = ()
     also_sizes: ClassVar[tuple[str, ...]] = ()  # parameters by which it is there though its first size is nothing
+    # its columns say nothing without one another: one that is unknown is taken as absent, and the effect looked for
+    whole: ClassVar[bool] = False
     simulated: ClassVar[bool] = True  # the plant has a law of it
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it

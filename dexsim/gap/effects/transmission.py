@@ -111,6 +111,7 @@ class TorqueRipple(Effect):
     shows = "periodically in position"
     experiment = "slow constant speed over the whole range"
     kinds = 2
+    whole = True
 
     def variants(self, s: Scales) -> list[Variant]:
         out = []
@@ -165,6 +166,7 @@ class JointCoupling(Effect):
     kinds = 2
     from_poses = True
     couples = True
+    whole = True
 
     def variants(self, s: Scales) -> list[Variant]:
         out = []

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim import intervals
-from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
-from dexsim.actuator.reference import load_level, torque_along
+from dexsim.actuator.columns import COLUMNS, INDEX
+from dexsim.actuator.reference import load_level, parasitic_torque, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.judge import kept_out
@@ -297,7 +297,8 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     if p("lag") > 0:
         motor = _lagged(t, motor, p("lag"))
     slope = 0.05 * max(case.scales.speed, 1e-9)
-    ripple = p("torque_ripple") * np.sin(p("ripple_per_turn") * q + p("ripple_phase"))
+    columns = {n: row[i] for n, i in INDEX.items()}
+    beside, _, _ = parasitic_torque(columns, q, v)
     inertia = s("inertia") * p("inertia_scale") + p("armature")
     needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
     needed += p("spring") * q + p("spring_preload")
@@ -306,7 +307,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     )
     fades = np.exp(-((v / p("stribeck_speed")) ** 2))
     share = np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction"))
-    by_load = load_level({n: p(n) for n in FEATURES["load"]}, share, motor, inertia * a - needed, fades)
+    by_load = load_level(columns, share, motor, inertia * a - needed, fades)
     level = p("coulomb_friction") + p("stribeck_peak") * fades + by_load + case.constants.friction
     friction = (
         level * np.sign(v)
@@ -317,7 +318,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     if r.enabled is not None:
         on &= r.enabled[:, j] > 0.5
     on[:3] = on[-3:] = False
-    return needed + friction - p("efficiency") * motor - ripple, on
+    return needed + friction - p("efficiency") * motor - beside, on
 
 
 def _lagged(t: np.ndarray, x: np.ndarray, time_constant: float) -> np.ndarray:

@@ -22,28 +22,29 @@ from dexsim.actuator.laws import (
     difference,
     eccentricity,
     eccentricity_slope,
+    fading_friction,
     gear_friction,
     hold,
     lag_share,
     load_share,
-    opposed_square,
     other_terms,
+    parasitic_torque,
     pd,
     preslide,
     preslide_speed,
-    ripple_wave,
     sagging,
     stribeck_power,
     torque_limits,
     transmission,
     transmission_damping,
     voltage_torque,
-    warmed,
+    warm_motor,
     wind,
 )
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
+parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
 LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
@@ -51,8 +52,8 @@ TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
 CONSTS = 10  # of them
-P_KP, P_KD, P_DEADBAND, P_LIMIT, P_NLS, P_EFF, P_DELAY, P_LAG, P_SUPPLY = (
-    INDEX[n] for n in ("kp", "kd", "deadband", "torque_limit", "no_load_speed", "efficiency", "delay", "lag", "supply")
+P_KP, P_KD, P_DEADBAND, P_DELAY, P_LAG, P_SUPPLY = (
+    INDEX[n] for n in ("kp", "kd", "deadband", "delay", "lag", "supply")
 )
 P_COULOMB, P_ASYM, P_PEAK, P_VS, P_VISC, P_LOAD, P_BACK = (
     INDEX[n]
@@ -61,10 +62,8 @@ P_COULOMB, P_ASYM, P_PEAK, P_VS, P_VISC, P_LOAD, P_BACK = (
         "load_friction", "load_friction_backdriven",
     )
 )  # fmt: skip
-P_LOADOUT, P_LOADPEAK, P_LOADPEAKOUT, P_SQUARE, P_SQUAREOUT = (INDEX[n] for n in SERVO_FEATURES["load"])
-P_RIPPLE, P_TURN, P_PHASE, P_OFFSET, P_SCALE = (
-    INDEX[n] for n in ("torque_ripple", "ripple_per_turn", "ripple_phase", "position_offset", "position_scale")
-)
+P_LOADOUT = INDEX["load_friction_external"]  # the first of `FEATURES["load"]`, which stand in a row
+P_OFFSET, P_SCALE = INDEX["position_offset"], INDEX["position_scale"]
 P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, P_SAG = (
     INDEX[n]
     for n in (
@@ -72,13 +71,10 @@ P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, 
         "rotor", "sag",
     )
 )  # fmt: skip
-P_TTORQUE, P_TFRICTION, P_TRES, P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
+P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
     INDEX[n]
-    for n in (
-        "thermal_torque", "thermal_friction", "thermal_resistance", "coupling", "eccentric_sin", "eccentric_cos",
-        "speed_lag", "bias", "feedback_delay", "limit_speed",
-    )
-)  # fmt: skip
+    for n in ("coupling", "eccentric_sin", "eccentric_cos", "speed_lag", "bias", "feedback_delay", "limit_speed")
+)
 X = SERIES_INDEX
 XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
     X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
@@ -100,7 +96,7 @@ P_READSCALE, P_READOFFSET = INDEX["readout_scale"], INDEX["readout_offset"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
-P_EXPONENT, P_SHAPE = INDEX["stribeck_exponent"], INDEX["ripple_shape"]
+P_EXPONENT = INDEX["stribeck_exponent"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
@@ -171,7 +167,6 @@ class Guess:  # the columns of one guess that every step asks for
     two: bool  # rotor and link are two bodies
     give: f64  # presliding
     viscous: f64
-    ripple: f64
     coulomb: f64
     peak: f64
     stribeck_speed: f64
@@ -299,7 +294,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
-    p.ripple = c.params[h, P_RIPPLE]
     p.coulomb = c.params[h, P_COULOMB]
     p.peak = c.params[h, P_PEAK]
     p.stribeck_speed = c.params[h, P_VS]
@@ -434,17 +428,11 @@ def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * p.rotor
     n.load = c.series[g, XR] + n.load
 
-    warmth = c.series[g, XWARM]
-    constant = warmed(c.params[h, P_TTORQUE], warmth)
-    n.friction = wp.max(warmed(c.params[h, P_TFRICTION], warmth), f64(0.0))
-    n.tau0 = c.params[h, P_LIMIT] * constant
-    n.no_load = c.params[h, P_NLS]
-    n.efficiency = c.params[h, P_EFF]
-    if p.voltage:
-        n.tau0 = n.tau0 / wp.max(warmed(c.params[h, P_TRES], warmth), f64(0.1))
-        n.no_load = n.no_load / constant
-    else:
-        n.efficiency = n.efficiency * constant
+    warm = warm_motor(c.params[h], c.series[g, XWARM], p.voltage)
+    n.tau0 = warm[0]
+    n.no_load = warm[1]
+    n.efficiency = warm[2]
+    n.friction = warm[3]
     n.supply = sagging(c.params[h, P_SUPPLY] * c.series[g, XSUP], c.params[h, P_SAG], c.series[g, XOTH])
     n.weak = c.params[h, P_WEAK] * c.series[g, XOTH]
     if p.open_ > f64(0.0):
@@ -597,8 +585,7 @@ def borne_friction(borne: f64, v: f64, p: Guess):
 @wp.func
 def carried_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, share: f64, p: Guess):
     """Level [N.m] by what the gear carries on both sides (BAM's models m3 to m6)."""
-    fading = gear_friction(torque, outside, c.params[h, P_LOADPEAK], c.params[h, P_LOADPEAKOUT])
-    fading += opposed_square(torque, outside, c.params[h, P_SQUARE], c.params[h, P_SQUAREOUT])
+    fading = fading_friction(c.params[h], torque, outside)
     left = wp.exp(-stribeck_power(v / p.stribeck_speed, p.exponent))
     return gear_friction(torque, outside, share, c.params[h, P_LOADOUT]) + left * fading
 
@@ -661,10 +648,10 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 
 
 @wp.func
-def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, dt: f64, p: Guess,
-               n: Now, b: Pair):  # fmt: skip
+def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, drag: f64, dt: f64,
+               p: Guess, n: Now, b: Pair):  # fmt: skip
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
-    the step."""
+    the step. drag: on the rotor [N.m.s/rad], beyond friction."""
     zero = f64(0.0)
     begun = x.v
     begun_m = x.vm
@@ -684,7 +671,7 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
     link_share = f64(1.0) - p.motor_share
     level += p.motor_share * p.base_friction
     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
-    a11 = b.rotor_rate + p.viscous * n.friction + p.motor_share * p.base_damping + kh + d_m
+    a11 = b.rotor_rate + p.viscous * n.friction + p.motor_share * p.base_damping + kh + d_m + drag
     a12 = -kh + d_l
     a21 = -kh
     a22 = b.link_rate + link_share * p.base_damping + kh + stop_d
@@ -766,6 +753,10 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     if by_gear and (n.held or x.fresh != zero):
         x.borne = load
 
+    beside = parasitic(c.params[h], x.q, v_drive)
+    drag = wp.max(zero, -beside[2])  # what of it brakes is taken at the end of the step
+    visc += drag
+
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)
     body = n.inertia
@@ -827,14 +818,14 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
 
     # what acts on the bodies
     applied = n.efficiency * t.end
-    if p.ripple != zero:
-        wave = ripple_wave(c.params[h, P_TURN] * x.q + c.params[h, P_PHASE], c.params[h, P_SHAPE])
-        applied += p.ripple * wave[0]
+    applied += beside[0]
     applied += p.bias
     level = dry_friction(c, h, before, p.bias - load, v_drive, p, n)
     if by_gear:
         level += borne_friction(x.borne, v_drive, p) * n.friction
     applied -= p.uneven * level
+    if drag > zero:
+        applied += drag * v_drive
     stop_d = zero
     if x.q < p.low:
         load -= p.stop * (p.low - x.q - dt * x.v)
@@ -848,7 +839,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         if p.gap2 > zero:  # a spring behind the play would keep it closed: one that leaves it open is before it
             on_motor = p.preload + p.spring * (x.qm + half * dt * x.vm)
             load -= pulled
-        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, dt, p, n, b)
+        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, drag, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
     if by_gear and not n.held:

@@ -127,15 +127,6 @@ USUAL = (
     "backlash",
     "softness",
 )
-WITH_OTHERS = (
-    "torque_ripple",
-    "ripple_per_turn",
-    "ripple_phase",
-    "deadband_kind",
-    "coupling",
-    "coupling_from",
-    "warmth",
-)
 MEASURED = (
     "kp",
     "kd",
@@ -152,11 +143,9 @@ MEASURED = (
 
 def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
     """How a servo column that is said to be unknown is fitted with every hypothesis, as the effect that writes it would
-    be, and from where. None where no effect does, or where the column says nothing without others (`WITH_OTHERS`): it
+    be, and from where. None where no effect does, or where the column says nothing without others (`Effect.whole`): it
     is taken as absent, and the effect looked for."""
-    if name in WITH_OTHERS:
-        return None
-    for effect in CATALOGUE:
+    for effect in (e for e in CATALOGUE if not e.whole):
         for v in effect.variants(s):
             for i, p in enumerate(v.params):
                 if p.columns == (name,):
