@@ -222,7 +222,7 @@ def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
 def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
     """Four runs with commands, times and temperature, the measured motion still to be simulated."""
     from dexsim.actuator.table import ServoTable
-    from dexsim.gap.read.runs import Run
+    from dexsim.gap.read import Run
 
     out, J = [], len(b["joints"])
     t_cmd = np.arange(0.0, SECONDS, 0.01)

@@ -16,7 +16,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX as PLANT
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.paths import CONFIGS
 from dexsim.recording.mechanism import drive, mechanism
 from dexsim.recording.schema import COMMANDS, Series

@@ -23,8 +23,7 @@ from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build, noise
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
-from dexsim.gap.read import inputs, stage_tests
-from dexsim.gap.read.runs import Run, conditions, local_polynomial
+from dexsim.gap.read import Run, conditions, inputs, local_polynomial, stage_tests
 from dexsim.gap.search.search import JointSearch
 from dexsim.gap.touch import judge
 from dexsim.recording import read, write

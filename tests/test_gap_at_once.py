@@ -16,7 +16,7 @@ from dexsim.gap import compute
 from dexsim.gap.compute import TimeLimit, away, map_joints, side_by_side
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.search import JointSearch, Outcome
 from tests.test_gap import model

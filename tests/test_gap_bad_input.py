@@ -278,8 +278,7 @@ def test_links_that_touch_each_other_are_cut_out():
     import mujoco
 
     from dexsim.assets import xhand
-    from dexsim.gap.read import inputs
-    from dexsim.gap.read.runs import Run
+    from dexsim.gap.read import Run, inputs
 
     model = xhand.hand_spec().compile()
     data = mujoco.MjData(model)

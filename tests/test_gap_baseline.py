@@ -11,7 +11,7 @@ import pytest
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.gap.search import baseline
 from dexsim.gap.search.baseline import forbids, room_for_friction
 

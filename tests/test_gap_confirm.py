@@ -18,7 +18,7 @@ from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.judge import full_model
 from dexsim.gap.judge.full_model import Hypothesis, World, free_runs
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.search.search import JointSearch, Member
 from dexsim.paths import CONFIGS
 from dexsim.recording import read

@@ -20,12 +20,12 @@ from test_gap import SERVO, model, plant_run
 
 import dexsim.gap
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TOUCH_EFFECTS
-from dexsim.gap.effects.effect import Variant
 from dexsim.gap.judge.kept_out import free_run
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import NAMES, SERIES
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
 

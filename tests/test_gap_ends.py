@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.read import inputs
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, inputs
 
 XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/>
  <geom type="capsule" size="0.01" fromto="0 0 0 0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>"""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dexsim.gap.effects.catalogue import CATALOGUE
-from dexsim.gap.judge.joint import stretched, traded
+from dexsim.gap.judge.joint_answer import stretched, traded
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted

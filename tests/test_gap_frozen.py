@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dexsim.gap.read import channels
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels
 
 T = np.arange(0, 7, 0.01)
 QUANTUM = 2 * np.pi / 4096

@@ -19,7 +19,7 @@ from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.judge import handed_on
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.search.search import JointSearch
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
@@ -279,7 +279,7 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
     true = copy.deepcopy(table)
     true.set("joint", "standin_drag", drag)
     spec = mujoco.MjSpec.from_string(demo.MODEL)
-    from dexsim.gap.read.runs import Run
+    from dexsim.gap.read import Run
     from dexsim.recording.mechanism import Mechanism
 
     runs = []

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, joint, kept_out
-from dexsim.gap.judge.joint import JointAnswer
+from dexsim.gap.judge import confidence, joint_answer, kept_out
+from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 
 ROWS = 400
@@ -75,7 +75,7 @@ def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
     f = judged(answer)
     assert f["confidence"] == JUDGE.hinted and f["held_out"]["after"] > 30
     reasons = answer.evidence[0].reasons
-    assert reasons[-1] == joint.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
+    assert reasons[-1] == joint_answer.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
 
 
 def test_what_removes_much_of_all_that_was_kept_out_needs_no_moments_left_out():
@@ -100,7 +100,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=Fal
     monkeypatch.setattr(confidence, "holds_nothing", lambda params, spread, case: spread)
     monkeypatch.setattr(confidence, "too_small", lambda *_: "")
     monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)
-    monkeypatch.setattr(joint, "at_bound", lambda *_: "")
+    monkeypatch.setattr(joint_answer, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
     return JointAnswer._weighed(answer, answer.member, {}, fitted, 1.0, 0.1, False, borne_out, 1.0)
 

@@ -11,7 +11,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build, dragged_by
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 
 ROTOR, BOB = 5e-4, 0.2 * 0.1**2
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody>

@@ -15,7 +15,7 @@ from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.judge.handed_on import columns_beside
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.search import JointSearch
 
 ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" armature="1e-4"/>

@@ -10,14 +10,14 @@ from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
+from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.body import add_mass
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.effects.effect import FittedEffect
-from dexsim.gap.judge import joint
+from dexsim.gap.judge import joint_answer
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.plant.mechanics import leaf_of
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
@@ -243,7 +243,7 @@ def test_jitter_of_a_delay_is_found_and_sized(sd):
     runs = [jittered(k, sd) for k in (0, 1, 3)]
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"command_delay"})
     best = search.run().best
-    found = joint.estimate_jitter(search, best)
+    found = joint_answer.estimate_jitter(search, best)
     assert best.ids == ("command_delay",) and best.fit.value("command_delay.delay") == pytest.approx(0.02, abs=0.002)
     if not sd:
         assert found is None
@@ -264,4 +264,4 @@ def test_what_only_looks_like_jitter_is_not_reported():
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
     none = search.without_search().none
-    assert none.fit.loss > JUDGE.jitter_left and joint.estimate_jitter(search, none) is None
+    assert none.fit.loss > JUDGE.jitter_left and joint_answer.estimate_jitter(search, none) is None

@@ -11,7 +11,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CLASSES, EFFECTS, members, separating
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.report import next_recording
 from dexsim.gap.search.search import JointSearch, Member
 from dexsim.recording import excitation, read

@@ -106,8 +106,8 @@ def test_notes_that_recordings_share_are_said_once():
 
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     from dexsim.gap.inquiry import Diagnosis, empty
+    from dexsim.gap.judge.conclude import sentence
     from dexsim.gap.report.files import Findings, render
-    from dexsim.gap.report.sentence import sentence
 
     def found(effect: str, confidence: float, key: str) -> dict:
         return {

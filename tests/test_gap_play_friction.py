@@ -14,7 +14,7 @@ from dexsim.gap.judge.full_model import Hypothesis
 from dexsim.gap.judge.handed_on import model_changes, servo_changes
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch, Member
 

@@ -12,8 +12,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant.case import build
-from dexsim.gap.read import channels, inputs
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels, inputs
 from dexsim.recording import read, write
 
 TWO = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/>

@@ -8,8 +8,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
-from dexsim.gap.read import channels
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels
 from tests.test_gap import SERVO, model
 
 STEP = 1.5e-3  # rad, of the encoder

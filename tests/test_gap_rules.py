@@ -18,11 +18,11 @@ from dexsim.gap import diagnosis as diagnosing
 from dexsim.gap import locate, rules
 from dexsim.gap.compute import Deadline
 from dexsim.gap.diagnosis import Drives
+from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.drive import temperature_follows
-from dexsim.gap.effects.effect import Variant, param
-from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint, kept_out
-from dexsim.gap.judge.joint import JointAnswer, stretched
+from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint_answer, kept_out
+from dexsim.gap.judge.joint_answer import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.report import files, next_recording
@@ -435,7 +435,7 @@ def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
         refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
         e.joint = "j"
         assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
-        assert (joint.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
+        assert (joint_answer.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
 
 
 def test_what_was_kept_out_may_side_with_neither():
@@ -734,12 +734,12 @@ def test_a_joint_is_searched_again_where_the_others_move_it_otherwise():
 
 
 def test_jitter_is_reported_where_the_likelihood_gains_much():
-    assert joint.certain(9.0, 2e-3, 0.1, 1.0) and not joint.certain(6.0, 2e-3, 0.1, 1.0)
+    assert joint_answer.certain(9.0, 2e-3, 0.1, 1.0) and not joint_answer.certain(6.0, 2e-3, 0.1, 1.0)
 
 
 def test_jitter_is_more_than_that_of_the_clocks():
-    assert joint.certain(50.0, 4e-4, 0.1, 1.0) and not joint.certain(50.0, 2e-4, 0.1, 1.0)
-    assert not joint.certain(50.0, 4e-4, 1.1, 1.0), "what is left beside it is not noise"
+    assert joint_answer.certain(50.0, 4e-4, 0.1, 1.0) and not joint_answer.certain(50.0, 2e-4, 0.1, 1.0)
+    assert not joint_answer.certain(50.0, 4e-4, 1.1, 1.0), "what is left beside it is not noise"
 
 
 def test_a_motion_that_settles_it_is_planned_alone():
@@ -861,7 +861,7 @@ def test_jitter_is_looked_for_where_much_is_left():
         answer.member.effect.jitters = True
         answer.best = SimpleNamespace(members=(answer.member,), fit=SimpleNamespace(loss=loss, params=[], x=[]))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(joint, "estimate_jitter", lambda *_: SimpleNamespace(entry=lambda: {}))
+            patch.setattr(joint_answer, "estimate_jitter", lambda *_: SimpleNamespace(entry=lambda: {}))
             assert ("jitter" in judged(answer)["parameters"]) is looked_for, loss
 
 

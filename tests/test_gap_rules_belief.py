@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from dexsim.gap.effects.effect import param
+from dexsim.gap.effects import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
 from dexsim.gap.plant.columns import Scales

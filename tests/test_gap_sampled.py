@@ -11,7 +11,7 @@ from test_gap import SERVO, model, motion
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import _true, build
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.gap.search.search import JointSearch
 
 FREE = SERVO | {"coulomb_friction": 0.0, "torque_limit": 1e3, "no_load_speed": 1e6}

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
 from dexsim.gap.judge import conclude, kept_out
-from dexsim.gap.judge.joint import stretched
+from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.rules import JUDGE

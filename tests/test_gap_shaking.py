@@ -12,7 +12,7 @@ from test_gap_torque_route import arm, run
 
 from dexsim.gap.judge import conclude
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.search import logged_torque, shaking
 from dexsim.gap.search.search import JointSearch
 from dexsim.recording.audit_values import repeats

@@ -11,7 +11,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.case import _since_reversal, moved, refined_cases
 from dexsim.gap.plant.mechanics import cross, on_lines
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 
 SERVO = {"drive": "torque", "joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit": 2.0}}}
 

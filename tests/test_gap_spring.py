@@ -12,11 +12,11 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.compute import Deadline
+from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import EFFECTS, nested
-from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.hypotheses import named
 from dexsim.gap.search.search import JointSearch, JointSelection, Member, Trial

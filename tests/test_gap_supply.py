@@ -9,7 +9,7 @@ from test_gap import model, plant_run
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read import conditions
 from dexsim.gap.search.search import JointSearch, Member
 
 SAGS = {"sag_torque": 0.15, "sag_own": 0.3}

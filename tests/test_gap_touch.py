@@ -12,8 +12,7 @@ from benchmarks import press_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
 from dexsim.gap.judge import confidence
-from dexsim.gap.read import inputs
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, inputs
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import plant as touch_plant
 from dexsim.gap.touch import read as touch_read

@@ -16,8 +16,8 @@ from dexsim.cli import help as help_page
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.effects import PadFacts
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
-from dexsim.gap.effects.effect import PadFacts
 from dexsim.gap.touch import diagnosis
 from dexsim.gap.touch.diagnosis import HEAD
 from dexsim.gap.touch.diagnosis import save_tactile as write

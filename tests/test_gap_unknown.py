@@ -15,7 +15,7 @@ from dexsim.gap.judge import conclude
 from dexsim.gap.judge.handed_on import servo_changes
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
 

@@ -107,8 +107,7 @@ def test_more_messages_than_are_read_are_refused(tmp_path, monkeypatch):
 def test_nothing_is_allocated_by_span_of_time(tmp_path, at):
     """Half of the samples far later than the others: read, audited and cut in two without a grid over the time
     between."""
-    from dexsim.gap.read import channels, inputs
-    from dexsim.gap.read.runs import Run
+    from dexsim.gap.read import Run, channels, inputs
 
     made = recordings.signal(8.0)
     for s in (made.commands, made.states.position, made.states.velocity, made.states.effort):

@@ -8,8 +8,7 @@ import pytest
 import recordings
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.read import channels
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels
 from dexsim.recording.audit import audit as audited
 from dexsim.recording.schema import COMMANDS, STATES
 

@@ -29,11 +29,10 @@ from dexsim.gap.inquiry import (
 )
 from dexsim.gap.judge import conclude, full_model, handed_on, kept_out
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
-from dexsim.gap.judge.joint import JointAnswer, Kept
+from dexsim.gap.judge.joint_answer import JointAnswer, Kept
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
 from dexsim.gap.plant.columns import DRAGGERS
-from dexsim.gap.read import inputs, stage_tests
-from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next, rival_of
 from dexsim.gap.rules import JUDGE, SEARCH

@@ -17,10 +17,9 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import locate
 from dexsim.gap.compute import TimeLimit
-from dexsim.gap.effects.effect import PadFacts
+from dexsim.gap.effects import PadFacts
 from dexsim.gap.judge import confidence, full_model, handed_on
-from dexsim.gap.read import channels, inputs
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels, inputs
 from dexsim.gap.search.search import Outcome
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording

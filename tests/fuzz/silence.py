@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 from . import corpus

@@ -21,8 +21,7 @@ from dexsim.calibration.file import Calibration
 from dexsim.cli import start
 from dexsim.deploy import bundle
 from dexsim.errors import UserError
-from dexsim.gap.read import channels, inputs
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run, channels, inputs
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.recording import metadata, read, write

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.effects import Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.effects.signals import PositionOffset
 from dexsim.gap.plant.columns import Scales
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from dexsim.gap.effects import body, drive, friction, signals, touch, transmission
-from dexsim.gap.effects.effect import Effect, TouchEffect, Variant
+from dexsim.gap.effects import Effect, TouchEffect, Variant, body, drive, friction, signals, touch, transmission
 from dexsim.gap.rules import JUDGE
 
 if TYPE_CHECKING:

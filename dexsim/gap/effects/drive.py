@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param, word
+from dexsim.gap.effects import Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
 from dexsim.gap.rules import JUDGE, SEARCH

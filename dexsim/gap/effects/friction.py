@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import ByTorque, Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.effects import ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.rules import BELIEF, JUDGE
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Fit, PadFacts, PadSettings, TouchEffect, fitted, instead, ranged, times, wide
+from dexsim.gap.effects import Fit, PadFacts, PadSettings, TouchEffect, fitted, instead, ranged, times, wide
 from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import THICKNESS, readings, shear
 from dexsim.tactile.pads import PAD_COLUMNS

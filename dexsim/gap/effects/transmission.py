@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param, word
+from dexsim.gap.effects import Effect, FittedEffect, Variant, entry, param, word
 from dexsim.gap.plant.columns import DRAGGERS, Param, Scales
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from dexsim.gap.judge.kept_out import free_run
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX, expand
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 from dexsim.recording.mechanism import Mechanism

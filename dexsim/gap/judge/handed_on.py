@@ -19,7 +19,7 @@ from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
-from dexsim.gap.read.runs import BLOCK, Run
+from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 

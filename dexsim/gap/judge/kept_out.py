@@ -12,7 +12,7 @@ from dexsim import intervals
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param, expand
-from dexsim.gap.read.runs import BLOCK, Run, same_commands, spans
+from dexsim.gap.read import BLOCK, Run, same_commands, spans
 from dexsim.gap.rules import JUDGE
 
 # -- what is kept out -------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
-from dexsim.gap.read.runs import Run, local_polynomial
+from dexsim.gap.read import Run, local_polynomial
 from dexsim.gap.rules import SEARCH
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque

@@ -15,7 +15,7 @@ from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 
 if TYPE_CHECKING:
-    from dexsim.gap.read.runs import Run
+    from dexsim.gap.read import Run
 
 # Hz at which the model is evaluated (along a refined motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0

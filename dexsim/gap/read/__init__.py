@@ -1,1 +1,139 @@
-"""Step 1: recordings in, their signals tested, runs of plain arrays out."""
+"""Step 1: recordings in, their signals tested, out of it the runs that all further steps work on: one recording as
+plain arrays, in the order of the joints that are diagnosed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexsim.actuator.table import ServoTable
+
+BLOCK = 0.5
+"""s of a stretch whose samples are resampled together: errors that lie nearer to each other are not independent."""
+
+
+@dataclass
+class Run:
+    """One recording, J joints; times in s from the recording's first sample, positions in rad (m for a slide).
+
+    cmd_t [K], cmd [K, J]: targets, held until the next; t [S], q [S, J]: measured positions. Optional, None where not
+    logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or the plain current in A
+    where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V. gravity: the world's, m/s2, [3].
+    servo: the table believed for this recording; counted: the mechanism's joints, by whose number its `coupling_from`
+    counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of
+    them. breaks: stretches [s] over which its clock cannot be trusted.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    cmd_t: np.ndarray
+    cmd: np.ndarray
+    t: np.ndarray
+    q: np.ndarray
+    servo: ServoTable
+    gravity: np.ndarray
+    v: np.ndarray | None = None
+    torque: np.ndarray | None = None
+    torque_unit: str = "N.m"
+    duty: np.ndarray | None = None
+    temperature: np.ndarray | None = None
+    enabled: np.ndarray | None = None
+    supply: np.ndarray | None = None
+    tactile: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+    counted: tuple[str, ...] = ()
+    left_out: frozenset[str] = frozenset()
+    breaks: tuple[tuple[float, float], ...] = ()
+    # filled by `smooth`
+    qs: np.ndarray = None  # type: ignore[assignment]  # asked for only after it
+    vs: np.ndarray = None  # type: ignore[assignment]
+    as_: np.ndarray = None  # type: ignore[assignment]
+    # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
+    fine: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def duration(self) -> float:
+        """s"""
+        return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
+
+    def smooth(self) -> None:
+        """Fills qs, vs, as_ [S, J]: position, speed and acceleration by a local cubic through the samples near each."""
+        if self.qs is None:
+            self.qs, self.vs, self.as_ = local_polynomial(self.t, self.q)
+
+    def command_at(self, t: np.ndarray) -> np.ndarray:
+        """[n, J] the target in force at each time (the first target before any)."""
+        k = np.clip(np.searchsorted(self.cmd_t, t, side="right") - 1, 0, len(self.cmd_t) - 1)
+        return self.cmd[k]
+
+
+def local_polynomial(t: np.ndarray, x: np.ndarray, width: float = 0.03, degree: int = 2) -> tuple[np.ndarray, ...]:
+    """Value and first two time derivatives of x [S, J] at t [S] by weighted least squares in a window of +- width s.
+
+    The window holds at least two samples on each side. Times may be irregular.
+    """
+    n = len(t)
+    if n < 5:
+        zero = np.zeros_like(x)
+        return x.copy(), zero, zero
+    step = float(np.median(np.diff(t)))
+    k = int(np.clip(round(width / max(step, 1e-6)), 2, 40))
+    k = min(k, (n - 1) // 2)
+    index = np.clip(np.arange(n)[:, None] + np.arange(-k, k + 1)[None, :], 0, n - 1)
+    dt = t[index] - t[:, None]
+    weight = np.exp(-0.5 * (dt / (0.6 * k * step)) ** 2)
+    # an index clipped at an end repeats a sample: count it once
+    first = np.ones_like(weight, dtype=bool)
+    first[:, 1:] = index[:, 1:] != index[:, :-1]
+    weight = weight * first
+    scale = k * step
+    basis = np.stack([(dt / scale) ** d for d in range(degree + 1)], -1)  # [S, m, D]
+    wb = weight[..., None] * basis
+    normal = np.einsum("smd,sme->sde", wb, basis)
+    normal += 1e-9 * np.eye(degree + 1)
+    right = np.einsum("smd,smj->sdj", wb, x[index])
+    c = np.linalg.solve(normal, right)
+    return c[:, 0], c[:, 1] / scale, 2.0 * c[:, 2] / scale**2
+
+
+def conditions(runs: list[Run]) -> list[int]:
+    """A group number for each run: runs with the same commands (repeats) share one."""
+    groups: list[int] = []
+    representatives: list[Run] = []
+    for run in runs:
+        for g, other in enumerate(representatives):
+            if same_commands(run, other):
+                groups.append(g)
+                break
+        else:
+            representatives.append(run)
+            groups.append(len(representatives) - 1)
+    return groups
+
+
+def same_commands(a: Run, b: Run) -> bool:
+    """Whether two runs were sent the same targets (and have the same drive), so that they are repeats."""
+    if a.joints != b.joints or a.servo.to_dict() != b.servo.to_dict() or abs(a.duration - b.duration) > 0.5:
+        return False
+    t = np.linspace(0.05, 0.95, 200) * min(a.duration, b.duration)
+    start_a, start_b = a.t[0], b.t[0]
+    x, y = a.command_at(start_a + t), b.command_at(start_b + t)
+    span = max(np.ptp(x), np.ptp(y), 1e-6)
+    return bool(np.quantile(np.abs(x - y), 0.9) < 0.01 * span + 1e-6)
+
+
+def spans(t: np.ndarray, on: np.ndarray, join: float) -> list[tuple[float, float]]:
+    """Stretches of time (start, end) [s] in which `on` [S] holds at the samples t [S] s, those less than `join` s apart
+    joined."""
+    out: list[tuple[float, float]] = []
+    if not on.any():
+        return out
+    edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
+    step = float(np.median(np.diff(t)))
+    for a, b in zip(t[edge[::2]], t[edge[1::2] - 1] + step, strict=True):
+        if out and a - out[-1][1] < join:
+            out[-1] = (out[-1][0], float(b))
+        else:
+            out.append((float(a), float(b)))
+    return out

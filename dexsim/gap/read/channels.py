@@ -24,7 +24,7 @@ import numpy as np
 from scipy import signal
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 

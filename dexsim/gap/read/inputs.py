@@ -15,7 +15,7 @@ from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.effects.signals import CurrentSensor
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import COMMANDS_FIX, Recording, Series

@@ -13,7 +13,7 @@ import numpy as np
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.plant.case import Case
-from dexsim.gap.read.runs import BLOCK, Run
+from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import TORQUE
 
 DRAWS = 300  # of the bootstrap

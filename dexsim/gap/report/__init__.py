@@ -1,1 +1,1 @@
-"""Step 6: the page, the files, the sentence, what to record next."""
+"""Step 6: the page, the files, what to record next."""

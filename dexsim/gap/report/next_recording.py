@@ -15,14 +15,14 @@ import numpy as np
 
 from dexsim import outputs
 from dexsim.errors import UserError
+from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
-from dexsim.gap.effects.effect import Effect
 from dexsim.gap.inquiry import Diagnosis, Settings
+from dexsim.gap.judge.conclude import place
 from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import INDEX, expand
-from dexsim.gap.read.runs import Run
-from dexsim.gap.report.sentence import place
+from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording import excitation

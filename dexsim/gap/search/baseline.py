@@ -22,7 +22,7 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
-from dexsim.gap.read.runs import BLOCK
+from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset

@@ -11,13 +11,13 @@ from typing import Self
 import numpy as np
 
 from dexsim.gap.compute import Deadline
+from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, compatible
-from dexsim.gap.effects.effect import Effect, Variant
 from dexsim.gap.effects.friction import give
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
-from dexsim.gap.read.runs import BLOCK
+from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
 

@@ -22,7 +22,7 @@ from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
 from dexsim.gap.effects.friction import LoadFriction, StribeckFriction
-from dexsim.gap.read.runs import BLOCK, Run
+from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import SEARCH, TORQUE
 
 # -- the body's torque ------------------------------------------------------------------------------------------------

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from dexsim.gap.effects import ByTorque
 from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.effects.effect import ByTorque
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
@@ -569,7 +569,7 @@ def claim_push(d: Diagnosis, pushes: Sequence[Push]) -> None:
     pushes = [p for p in pushes if p.joint not in followed]
     if not pushes:
         return
-    from dexsim.gap.report.sentence import sentence
+    from dexsim.gap.judge.conclude import sentence
 
     joints = {p.joint for p in pushes if not p.cut}
     kept = [

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from dexsim import intervals
+from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
-from dexsim.gap.effects.effect import Variant
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from dexsim.gap.effects import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
-from dexsim.gap.effects.effect import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
 from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge.conclude import sentence
 from dexsim.gap.judge.kept_out import rms_interval
-from dexsim.gap.report.sentence import sentence
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.gap.effects import Fit, PadFacts, word
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
-from dexsim.gap.effects.effect import Fit, PadFacts, word
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.inquiry import PadCurve
 from dexsim.gap.judge.confidence import kept
-from dexsim.gap.read.runs import spans
+from dexsim.gap.read import spans
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch.plant import PARAMS, contact, readings
 from dexsim.gap.touch.read import newtons

@@ -16,7 +16,7 @@ from dexsim import yaml_text
 from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.gap.plant.case import noise
-from dexsim.gap.read.runs import local_polynomial, spans
+from dexsim.gap.read import local_polynomial, spans
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.tactile import reference as ref

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from dexsim import intervals
+from dexsim.gap.effects import TouchEffect
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
-from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.plant.case import noise
-from dexsim.gap.read.runs import BLOCK
+from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun

@@ -12,13 +12,13 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq, minimize
 
 from dexsim.gap import locate
+from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import confusable, inseparable, separating
-from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.inquiry import Curve
 from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE
 from dexsim.gap.search.fit import Fitted, Fitter, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
