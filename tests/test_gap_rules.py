@@ -69,16 +69,12 @@ def test_a_rule_that_is_moved_fails_its_test(name, factor):
     test = {n: t for n, *_, t in rules.described()}[name]
     room, _, rule = name.partition(".")
     value = getattr(getattr(rules.RULES, room), rule)
-    ratio = rule in RATIOS and value > 1  # x something: what is left of 1 is what decides
     try:
-        object.__setattr__(getattr(rules.RULES, room), rule, type(value)(value**factor if ratio else value * factor))
+        object.__setattr__(getattr(rules.RULES, room), rule, rules.moved(name, factor))
         with pytest.raises(AssertionError):
             TESTS[test]()
     finally:
         object.__setattr__(getattr(rules.RULES, room), rule, value)
-
-
-RATIOS = ("enough", "worse", "noise", "carries", "unsettled", "alike")
 
 
 def test_an_effect_must_remove_a_least_share():
@@ -280,7 +276,7 @@ def test_what_saves_much_in_hindsight_is_tried_whatever_its_price():
 
 
 def test_within_the_noise_an_effect_must_be_clear():
-    for here, found in ((0.9, ()), (0.88, ("lag",))):  # left of the squared error where it was fitted
+    for here, found in ((0.89, ()), (0.87, ("lag",))):  # left of the squared error where it was fitted
         losses = lambda ids, here=here: (0.5, here) if ids else (1.0, 1.0)  # noqa: E731
         search = Selecting(losses, ("lag", 0.0), saved=[(0.5, "lag")])
         assert search.run().best.ids == found, here

@@ -58,12 +58,6 @@ class SearchRules:
         "which follows it a tenth better since it scales the friction too",
         "test_a_size_at_its_bound_must_do_far_better_than_another",
     )
-    off: float = _rule(
-        0.025,
-        "relative: what a refitted belief may be off by whatever the residuals say",
-        "by judgement: half of the tolerance within which beliefs are refitted",
-        "test_intervals_hold_what_no_residual_shows",
-    )
     balance: float = _rule(
         0.03,
         "share of its misfit without any effect that a signal counts as noise at least, beside another",
@@ -118,12 +112,6 @@ class SearchRules:
         "by judgement: twice the difference that counts for half in a comparison of rivals",
         "test_intervals_hold_the_laws_that_do_as_well",
     )
-    clear: float = _rule(
-        0.11,
-        "share of the squared error that an effect must remove where the error is within the noise without it",
-        "set above `least` on benchmarks.planted: there is less to tell effects by",
-        "test_within_the_noise_an_effect_must_be_clear",
-    )
     per_parameter: float = _rule(
         0.03,
         "of the loss on what was left out: what each parameter of a hypothesis costs",
@@ -135,12 +123,6 @@ class SearchRules:
         "of the loss: a rival as much worse than the best counts for a third of it in one draw",
         "by judgement: finer than the plant is to be trusted",
         "test_rivals_are_told_apart_by_what_they_lose",
-    )
-    unsettled: float = _rule(
-        1.7,
-        "x the noise squared: where several joints leave more, they are looked at again with what was found in each",
-        "by judgement",
-        "test_joints_that_are_not_followed_are_looked_at_again",
     )
     instead: float = _rule(
         0.5,
@@ -179,12 +161,6 @@ class SearchRules:
         "by judgement: above `rival`, for a draft is not yet at its best",
         "test_what_cannot_follow_is_no_rival",
     )
-    draft_noise: float = _rule(
-        0.4,
-        "x the noise squared that a draft of a rival may leave beside that",
-        "by judgement",
-        "test_what_cannot_follow_is_no_rival",
-    )
     lead: float = _rule(
         0.1,
         "share of the bootstraps by which a rival must win more often to be taken in an effect's place",
@@ -202,12 +178,6 @@ class SearchRules:
         2.5,
         "x `chance` for a first effect that removes from twice `least` on: few moments show it, and draws vary",
         "by judgement: a limit that is reached twice is missed by some draws",
-        "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
-    )
-    rarer: float = _rule(
-        5.0,
-        "x `chance` for a first effect that removes four times `least`",
-        "by judgement",
         "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
     )
     promise: float = _rule(
@@ -315,12 +285,6 @@ class JudgeRules:
         "by judgement",
         "test_what_was_kept_out_may_side_with_neither",
     )
-    sides: float = _rule(
-        0.24,
-        "share of the squared error that an effect must remove to be doubted only, where a free run does not show it",
-        "by judgement: twice SEARCH.least",
-        "test_what_was_kept_out_may_side_with_neither",
-    )
     mute: float = _rule(
         0.1,
         "share of the squared error of a half second by which it differs with an effect that it can speak of; less, "
@@ -384,13 +348,6 @@ class JudgeRules:
         "between 0.12 (a case of another plant with one load) and 0.54 (the least of six with several)",
         "test_friction_at_one_load_is_a_set",
     )
-    overstated: float = _rule(
-        1.3,
-        "x what repeats differ by beyond what was found: a floor from repeats that is larger holds what was found, not "
-        "noise",
-        "by judgement: as `within`, what is taken for the same floor",
-        "test_repeats_that_differ_by_what_was_found_are_no_floor",
-    )
     part: float = _rule(
         0.2,
         "share of the squared error on what was kept out that an effect removes at least that is more than a hint",
@@ -433,19 +390,6 @@ class JudgeRules:
         "the largest factor on intervals",
         "coverage on concealed cases",
         "test_intervals_grow_with_what_is_left",
-    )
-    clear: float = _rule(
-        1.5,
-        "x the noise that windows keep after the fit, from which on what it depends on is said",
-        "by judgement",
-        "test_what_the_rest_depends_on_is_said_where_much_is_left",
-    )
-    apart: float = _rule(
-        1.3,
-        "x: the engine that trains confirms the search's plant where it leaves no more than so much of what that "
-        "leaves",
-        "by judgement",
-        "test_the_engine_that_trains_confirms",
     )
     little: float = _rule(
         0.1,
@@ -623,29 +567,11 @@ class JudgeRules:
 class TouchRules:
     """What the search of one pad and its judgement decide by."""
 
-    least: float = _rule(
-        0.12,
-        "share of the squared error on presses left out that an effect must remove",
-        "as of the drives (SEARCH.least)",
-        "test_a_touch_effect_must_remove_a_least_share",
-    )
-    chance: float = _rule(
-        0.03,
-        "share of the bootstraps in which an effect may be of no use to the presses left out",
-        "as of the drives",
-        "test_a_touch_effect_must_help_in_nearly_all_bootstraps",
-    )
     enough: float = _rule(
         1.2,
         "x the noise: an error within it needs no effect",
         "by judgement",
         "test_within_the_noise_no_touch_effect_is_looked_for",
-    )
-    most: int = _rule(
-        4,
-        "effects on one pad",
-        "by judgement: more of them can imitate anything",
-        "test_a_pad_has_at_most_so_many_effects",
     )
     map_price: float = _rule(
         1.5,
@@ -664,12 +590,6 @@ class TouchRules:
         "of the loss on presses left out: nearer than this, what follows the fitted presses better is taken",
         "by judgement: half of what tells rivals apart",
         "test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken",
-    )
-    told_apart: float = _rule(
-        0.03,
-        "of the loss on presses left out: a rival that loses by as much has 1/e of the weight",
-        "by judgement",
-        "test_touch_rivals_are_told_apart_by_what_they_lose",
     )
     set_share: float = _rule(
         0.12,
@@ -773,12 +693,6 @@ class TouchRules:
         "by judgement",
         "test_a_touch_rival_follows_about_as_well",
     )
-    promise: float = _rule(
-        0.25,
-        "of `least`: what an effect must promise in the scan to be tried",
-        "as `search.promise`",
-        "test_a_touch_effect_must_promise_something",
-    )
     felt: float = _rule(
         8.0,
         "x the noise that the plant must press a taxel with, and its neighbours read, for it to be called silent",
@@ -828,12 +742,6 @@ class TorqueRules:
         "by judgement",
         "test_a_plain_fit_must_leave_much_for_a_push",
     )
-    quiet: float = _rule(
-        0.3,
-        "share of the quiet torque's variance that the trimmed fit may leave to be believed",
-        "by judgement: as `much`, of which it is the other side",
-        "test_pushes_are_clear_where_the_quiet_torque_fits",
-    )
     far: float = _rule(
         5.0,
         "x the quiet residual: a push",
@@ -863,12 +771,6 @@ class TorqueRules:
         "of the time: what pushes longer is no stretch",
         "by judgement: more than half, which the trimmed fit needs, of what moves",
         "test_what_pushes_most_of_the_time_is_no_stretch",
-    )
-    rest: float = _rule(
-        0.4,
-        "of the time that must be left without pushes for a joint to be judged by it",
-        "by judgement: the other side of `most`",
-        "test_a_joint_is_judged_without_pushes_where_enough_is_left",
     )
     join: float = _rule(
         0.15,
@@ -906,12 +808,6 @@ class TorqueRules:
         "by judgement",
         "test_a_drive_is_sound_by_its_logged_duty",
     )
-    slope: float = _rule(
-        0.05,
-        "by how much the gain of a sound drive may differ from what is believed",
-        "the tolerance within which beliefs are refitted",
-        "test_a_drive_is_sound_by_its_logged_duty",
-    )
     late: float = _rule(
         0.008,
         "s by which a sound drive may act earlier or later than is believed",
@@ -923,12 +819,6 @@ class TorqueRules:
         "x the plain model's error on what was kept out: beyond it an answer is not handed on",
         "by judgement",
         "test_an_answer_that_follows_worse_than_the_plain_model_is_not_handed_on",
-    )
-    noise: float = _rule(
-        1.3,
-        "x the noise: an answer that follows what was kept out to it is as good as any",
-        "by judgement",
-        "test_an_answer_within_the_noise_is_handed_on",
     )
     surely: float = _rule(
         0.95,
@@ -948,18 +838,6 @@ class TorqueRules:
         "by judgement",
         "test_a_weight_is_believed_where_the_torque_cannot_tell",
     )
-    further: float = _rule(
-        0.12,
-        "of the squared residual on the quarters left out: what a further effect must remove",
-        "as `search.least`",
-        "test_a_further_effect_of_the_torque_must_remove_a_least_share",
-    )
-    chance: float = _rule(
-        0.03,
-        "share of the bootstraps in which a further effect may be of no use to the quarters left out",
-        "as `search.chance`",
-        "test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps",
-    )
     lag: float = _rule(
         0.02,
         "s: a torque that acts later than this is no lag of a drive",
@@ -971,12 +849,6 @@ class TorqueRules:
         "of the torque's rms: what may be left for its figures to be believed",
         "by judgement: two thirds of the variance are then told",
         "test_a_torque_that_fits_nothing_is_no_witness",
-    )
-    alike: float = _rule(
-        1.05,
-        "x the error of a free run in closed loop: within it the loop does not tell one from the other",
-        "by judgement",
-        "test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them",
     )
     surest: float = _rule(
         0.95,
@@ -1007,12 +879,6 @@ class TorqueRules:
         5.0,
         "s of motion from which on a logged torque is fitted",
         "by judgement: ten blocks of the bootstraps",
-        "test_a_torque_is_fitted_where_enough_was_logged",
-    )
-    fewest: int = _rule(
-        500,
-        "samples from which on a logged torque is fitted",
-        "by judgement: shortest at 100 Hz",
         "test_a_torque_is_fitted_where_enough_was_logged",
     )
     shakes: float = _rule(
@@ -1123,7 +989,7 @@ SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = RULES.search, RULES.judge, RULES.touch, R
 
 
 # x something: what is left of 1 is what decides
-RATIOS = ("search.enough", "search.unsettled", "torque.carries", "torque.worse", "torque.noise", "torque.alike")
+RATIOS = ("search.enough", "torque.carries", "torque.worse")
 
 
 def moved(name: str, factor: float) -> float:

@@ -39,7 +39,7 @@ class Noise:
     def at_most(self, left: dict[str, float]) -> Noise:
         """The floor, where repeats differ by what was found (a drive that is warmer in one of them): what they differ
         by beyond it [rad or m, by joint] is then less, and is the floor."""
-        lower = {j: x for j, x in left.items() if JUDGE.overstated * x < self.joints[j]}
+        lower = {j: x for j, x in left.items() if JUDGE.within * x < self.joints[j]}
         if not lower:
             return self
         joints = self.joints | lower
@@ -259,12 +259,12 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
-    if before > SEARCH.enough**2 and after < (1 - JUDGE.sides) * before:
+    if before > SEARCH.enough**2 and after < (1 - 2 * SEARCH.least) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     if shaking.shown(search, outcome, test, span):
         return "it makes the joint ring by itself as it does in what was kept out, but no free run keeps step with that"
     sides_with_neither = ratio < JUDGE.neutral and after < JUDGE.neutral**2 * before
-    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= JUDGE.sides
+    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= 2 * SEARCH.least
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 

@@ -515,7 +515,7 @@ def confirm(
 
 
 def agree(engine: float, plant: float, floor: float, before: float) -> bool:
-    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.apart times as much, or what it
+    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.within times as much, or what it
     leaves beyond that is JUDGE.little beside the error before (the figures by which the plant absorbs its own
     inaccuracy are not handed on)."""
-    return engine <= max(JUDGE.apart * max(plant, floor), math.hypot(plant, JUDGE.little * before))
+    return engine <= max(JUDGE.within * max(plant, floor), math.hypot(plant, JUDGE.little * before))

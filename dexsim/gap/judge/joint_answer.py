@@ -322,7 +322,7 @@ class JointAnswer:
         spots = locate.control(locate.spots(case.joint, left * case.sigma, blocks, regimes, rng))
         self.spots, self.depends_on = (
             found,
-            [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.clear else [],
+            [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.unexplained else [],
         )
 
     def curve(self) -> Curve | None:

@@ -14,7 +14,7 @@ from dexsim import intervals
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read import BLOCK, Run
-from dexsim.gap.rules import TORQUE
+from dexsim.gap.rules import BELIEF, TORQUE
 
 DRAWS = 300  # of the bootstrap
 SHIFTS = np.arange(-0.01, 0.0401, 0.002)  # s: by which a drive may act later than is believed
@@ -38,7 +38,7 @@ class Stage:
     @property
     def sound(self) -> bool:
         """The drive does what is believed: gain within 5 % and nearly all of the signal."""
-        return self.fit > TORQUE.fit and abs(self.slope - 1) < TORQUE.slope and abs(self.delay) < TORQUE.late
+        return self.fit > TORQUE.fit and abs(self.slope - 1) < BELIEF.tolerance and abs(self.delay) < TORQUE.late
 
     @property
     def text(self) -> str:

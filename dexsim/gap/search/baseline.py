@@ -23,7 +23,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.read import BLOCK
-from dexsim.gap.rules import BELIEF, TORQUE
+from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
@@ -233,7 +233,7 @@ def refused(
             out[joint] = reason
         elif (
             plain is not None
-            and after > max(TORQUE.worse * plain.error, TORQUE.noise * max(joints[joint]["sigma"], floor))
+            and after > max(TORQUE.worse * plain.error, JUDGE.within * max(joints[joint]["sigma"], floor))
             and _surely(squares, plain)
         ):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"

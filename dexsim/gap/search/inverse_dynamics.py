@@ -432,7 +432,7 @@ def _name(
         kinds = {k: min((n for n in tried if _kind(n) == k), key=lambda n: tried[n].sum()) for k in map(_kind, tried)}
         each = (now - tried[best], *(tried[n] for n in kinds.values()))
         gained, *table = intervals.draws(each, lambda *x, axis: np.stack([one.sum(axis) for one in x]), rng, DRAWS)
-        if tried[best].sum() > (1 - TORQUE.further) * now.sum() or np.quantile(gained, TORQUE.chance) <= 0:
+        if tried[best].sum() > (1 - SEARCH.least) * now.sum() or np.quantile(gained, SEARCH.chance) <= 0:
             break
         wins = dict(zip(kinds, (np.argmin(table, 0)[None] == np.arange(len(kinds))[:, None]).mean(1), strict=True))
         rival = max((k for k in wins if k != _kind(best)), key=wins.__getitem__, default="")

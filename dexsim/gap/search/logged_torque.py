@@ -82,10 +82,8 @@ def identify_joints(
 
         top = min(inverse_dynamics.highest(runs[r].t) for r in use)
         first = at(top)[0]
-        if (
-            len(first.u) < TORQUE.fewest * min(PER_CUTOFF * top * float(np.median(np.diff(runs[use[0]].t))), 1.0)
-            or first.seconds < TORQUE.shortest
-        ):
+        kept = min(PER_CUTOFF * top * float(np.median(np.diff(runs[use[0]].t))), 1.0)
+        if first.seconds < TORQUE.shortest or len(first.u) < inverse_dynamics.RATE * TORQUE.shortest * kept:
             continue
         out.append((case, solve(at, top, seed), [runs[r].name for r in judge]))
     return out
@@ -179,7 +177,7 @@ def hand_on(
     loop does not say otherwise: what it was refitted to then is the fit's own wandering.
 
     d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run
-    over what was kept out is followed better than to `TORQUE.alike` with its own figures, or where a finding of at
+    over what was kept out is followed better than to `TORQUE.worse` with its own figures, or where a finding of at
     least a half is about them; not where `stages` say that the drive itself is not as believed, since what its loop
     does then speaks of the drive.
     """
@@ -254,7 +252,7 @@ def _alike(
         float(np.sqrt(np.mean((measured - free_run(whole, params, x, windows, fixed, True)[0]) ** 2)))
         for x in (trial.fit.x, told)
     ]
-    return error[1] <= TORQUE.alike * error[0] + 0.1 * case.sigma
+    return error[1] <= TORQUE.worse * error[0] + 0.1 * case.sigma
 
 
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
@@ -272,7 +270,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
             signal = effect.signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
-            confidence = min(n.share, TORQUE.surest) * (1.0 if helped > TORQUE.further else TORQUE.unhelped)
+            confidence = min(n.share, TORQUE.surest) * (1.0 if helped > SEARCH.least else TORQUE.unhelped)
             out.append(
                 {
                     "effect": n.effect,
@@ -438,7 +436,7 @@ def _of_joint(
     on = quiet[block]
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
     quiet_torque = float(np.var(torque[on]))
-    fits = noise**2 < TORQUE.quiet * quiet_torque and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
+    fits = noise**2 < TORQUE.much * quiet_torque and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
     least = max(TORQUE.far * noise, TORQUE.least * float(np.sqrt(np.mean(torque**2))))
     residual = [
         _beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)
@@ -539,7 +537,8 @@ def without_pushes(
         "in which nothing does",
     )
     seconds = lambda given: sum(r.duration for r in given)  # noqa: E731
-    if not rest or bool(held) != bool(kept) or len(kept) == len(rest) or seconds(rest) < TORQUE.rest * seconds(runs):
+    enough = seconds(rest) >= (1 - TORQUE.most) * seconds(runs)
+    if not rest or bool(held) != bool(kept) or len(kept) == len(rest) or not enough:
         return runs, held
     for p in clear:
         p.cut = True

@@ -145,7 +145,7 @@ class JointLosses(JointHypotheses):
         chance = (
             SEARCH.chance
             if old.members or gain < 2 * SEARCH.least
-            else (SEARCH.rare if gain < 4 * SEARCH.least else SEARCH.rarer) * SEARCH.chance
+            else (SEARCH.rare if gain < 4 * SEARCH.least else 2 * SEARCH.rare) * SEARCH.chance
         )
         return bool(np.quantile(self._boot(a - b), chance) > 0)
 

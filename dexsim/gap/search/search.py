@@ -15,7 +15,7 @@ from dexsim.gap import compute
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
-from dexsim.gap.rules import BELIEF, SEARCH
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
@@ -79,7 +79,7 @@ class JointSelection(JointScan):
                 ):  # the fit without it had stopped short: what is missing is looked for anew
                     continue
                 self.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
-            if enough and self.gain(best, current) < SEARCH.clear:
+            if enough and self.gain(best, current) < SEARCH.least:
                 break
             if not self._earns(best, current):
                 # a pair may be there where neither of its halves is seen alone
@@ -115,7 +115,7 @@ class JointSelection(JointScan):
         best = current
         for fork in forks:
             loss = self._left(fork).sum() / len(self.blocks)
-            if loss < SEARCH.unsettled or self.deadline.over():
+            if loss < JUDGE.within**2 or self.deadline.over():
                 continue
             listed = self._shortlist(self.scan(fork), shortlist, loss, fork.members)
             if not listed:
@@ -414,7 +414,7 @@ class JointSelection(JointScan):
         """The members that are confused with an effect replaced by a law of it that training has less exactly
         (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it."""
         mine = self._left(current).sum()
-        if mine < SEARCH.unsettled * len(self.blocks):
+        if mine < JUDGE.within**2 * len(self.blocks):
             return current
         best = current
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
@@ -510,7 +510,7 @@ class JointSelection(JointScan):
                 if trial is None:
                     draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
                     # one that cannot follow even short stretches is no rival
-                    if draft[2].loss > SEARCH.draft * short + SEARCH.draft_noise:
+                    if draft[2].loss > SEARCH.draft * short + 2 * SEARCH.rival_noise:
                         continue
                     trial = self.finish(*draft, current, quick=True)
                 self._on(0.05)
@@ -664,8 +664,9 @@ class JointSearch(JointSelection):
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
         """Intervals that also hold what the residuals do not show, added in squares: the disagreement of the fits
-        without one condition each (a jackknife); the believed figures being off by more than their fit says (SEARCH.off
-        each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant being no truer."""
+        without one condition each (a jackknife); the believed figures being off by more than their fit says (half of
+        `BELIEF.tolerance` each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant
+        being no truer."""
         f = trial.fit
         x, P = f.x, len(f.x)
         if P == 0:
@@ -686,9 +687,9 @@ class JointSearch(JointSelection):
             answer = np.linalg.solve(M, A[np.ix_(i, k)]) * span[i][:, None] / span[k][None]  # d effect / d nuisance
             off = np.array(
                 [
-                    SEARCH.off * abs(v)
+                    0.5 * BELIEF.tolerance * abs(v)
                     if p.mode == "factor"
-                    else 0.25 * min(p.span, 4 * SEARCH.off * abs(v) + 1e-3 * p.span)
+                    else 0.25 * min(p.span, 2 * BELIEF.tolerance * abs(v) + 1e-3 * p.span)
                     for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)
                 ]
             )

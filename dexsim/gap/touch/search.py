@@ -406,7 +406,7 @@ class PadSearch(PadFit):
         current = none
         notes: list[str] = []
         trials: dict[frozenset, TouchTrial] = {frozenset(): none}
-        for _ in range(TOUCH.most):
+        for _ in range(SEARCH.most):
             if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < TOUCH.enough**2:
                 break
             listed = self.scan(current)
@@ -478,7 +478,7 @@ class PadSearch(PadFit):
                     best = max(best, (2 * c * float(d @ clean) - c * c * dd) / max(total, 1e-12))
             found.append((1.0 if effect.by_taxel else best, effect))
         found.sort(key=lambda f: -f[0])
-        return [e for g, e in found[:most] if g > TOUCH.promise * TOUCH.least]
+        return [e for g, e in found[:most] if g > SEARCH.promise * SEARCH.least]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """The hypothesis with one effect more; None where it cannot be there."""
@@ -570,9 +570,9 @@ class PadSearch(PadFit):
 
     def _earns(self, new: TouchTrial, old: TouchTrial) -> bool:
         a, b = self.cross(old), self.cross(new)
-        if 1 - b.sum() / max(a.sum(), 1e-12) < TOUCH.least:
+        if 1 - b.sum() / max(a.sum(), 1e-12) < SEARCH.least:
             return False
-        return bool(np.quantile(self._boot(a - b), TOUCH.chance) > 0)
+        return bool(np.quantile(self._boot(a - b), SEARCH.chance) > 0)
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
         """Sums of a block bootstrap of x [B], in stretches of neighbouring blocks."""
@@ -628,7 +628,7 @@ class PadSearch(PadFit):
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[self.cross(t) for _, t in others], self.cross(base)])
         drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
-        shares = intervals.wins(table, drawn, TOUCH.told_apart)
+        shares = intervals.wins(table, drawn, SEARCH.apart)
         rows = sorted(
             ((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1]
         )
