@@ -36,7 +36,7 @@ class SearchRules:
     chance: float = _rule(
         0.03,
         "share of the bootstraps in which an effect may be of no use to what was left out",
-        "by judgement: a one-sided level between the customary 1 and 5 %",
+        "one-sided, between the customary 1 and 5 %; none of 42 empty cases of another plant alarmed with it",
         "test_an_effect_must_help_in_nearly_all_bootstraps",
     )
     price: float = _rule(
@@ -48,13 +48,13 @@ class SearchRules:
     doubt: float = _rule(
         0.015,
         "relative: what a fitted effect is off by whatever the residuals say",
-        "by judgement: the plant itself is trusted to about as much",
+        "planted sizes are off by 0.6 to 1.3 % in the median",
         "test_intervals_hold_what_no_residual_shows",
     )
     bounded: float = _rule(
         1.5,
         "x its loss: what a hypothesis counts for whose size stopped at the end of what is physical",
-        "by judgement; an inertia half as large again was taken for a reading scaled by 0.7, the least that is tried, "
+        "above 1.1: an inertia half as large again was taken for a reading scaled by 0.7, the least that is tried, "
         "which follows it a tenth better since it scales the friction too",
         "test_a_size_at_its_bound_must_do_far_better_than_another",
     )
@@ -79,14 +79,8 @@ class SearchRules:
     enough: float = _rule(
         1.08,
         "x the noise: an error within it needs no effect",
-        "by judgement: sampling noise of a minute of recordings is below it",
+        "noise of 300 independent samples, as a minute of recordings has, passes it once in 40",
         "test_within_the_noise_nothing_is_looked_for_nearby",
-    )
-    hint: float = _rule(
-        0.03,
-        "share of the squared error that an effect must save in the scan to be tried whatever its price",
-        "by judgement: a third of what it must remove in the end",
-        "test_what_saves_much_in_hindsight_is_tried_whatever_its_price",
     )
     astray: float = _rule(
         10.0,
@@ -103,14 +97,8 @@ class SearchRules:
     tie: float = _rule(
         0.02,
         "of the loss: nearer than this, fits without each condition decide",
-        "by judgement: twice what a fit ends within",
+        "twice the tolerance at which a fit ends",
         "test_where_two_fits_are_close_fits_of_their_own_do_not_decide",
-    )
-    alike: float = _rule(
-        0.06,
-        "of the loss on what was left out: laws of one effect that come within as much may each be the true one",
-        "by judgement: twice the difference that counts for half in a comparison of rivals",
-        "test_intervals_hold_the_laws_that_do_as_well",
     )
     per_parameter: float = _rule(
         0.03,
@@ -140,7 +128,7 @@ class SearchRules:
     most: int = _rule(
         4,
         "effects on one joint",
-        "by judgement: more of them can imitate anything",
+        "of ten names said fourth or later on a joint, in answers to five sets of cases, one is true",
         "test_a_joint_has_at_most_so_many_effects",
     )
     rival: float = _rule(
@@ -164,7 +152,7 @@ class SearchRules:
     lead: float = _rule(
         0.1,
         "share of the bootstraps by which a rival must win more often to be taken in an effect's place",
-        "by judgement: 300 draws tell hardly less apart",
+        "two that win evenly differ by as much in one of 24 lots of 300 draws",
         "test_a_rival_that_wins_clearly_takes_the_place",
     )
     differs: float = _rule(
@@ -177,7 +165,7 @@ class SearchRules:
     rare: float = _rule(
         2.5,
         "x `chance` for a first effect that removes from twice `least` on: few moments show it, and draws vary",
-        "by judgement: a limit that is reached twice is missed by some draws",
+        "what shows in three blocks is missed by a draw in 20, in two by one in seven: 2.5 x 0.03 lies between",
         "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
     )
     promise: float = _rule(
@@ -189,7 +177,7 @@ class SearchRules:
     warmth: float = _rule(
         2.0,
         "degC: a smaller change of temperature tells nothing of heat",
-        "by judgement: twice the resolution of a usual sensor",
+        "twice the 1 degC that servos' sensors resolve",
         "test_a_small_change_of_temperature_tells_nothing",
     )
     loud: float = _rule(
@@ -216,13 +204,14 @@ class JudgeRules:
     within: float = _rule(
         1.3,
         "x the noise floor: an error within it asks for no effect",
-        "by judgement",
+        "halved, an empty learning case is not told as such; empty cases lie at 1.0 (55 of our own plant) and 1.4 "
+        "(166 of another) in the median",
         "test_an_error_within_the_noise_asks_for_nothing",
     )
     far: float = _rule(
         5.0,
         "x the noise floor: an error that large is not nothing, though only a few moments show it",
-        "by judgement",
+        "above 4.8, the most of 166 empty cases of another plant",
         "test_a_large_error_is_never_nothing",
     )
     removed: float = _rule(
@@ -234,7 +223,7 @@ class JudgeRules:
     firm: float = _rule(
         0.5,
         "confidence from which a name counts; below it is a hint",
-        "by judgement: at a half a name is as likely wrong as right",
+        "of names below it 34 of 267 are true, from it on 248 of 268 (answers to five sets of cases)",
         "test_names_below_firm_are_hints",
     )
     hinted: float = _rule(
@@ -270,7 +259,8 @@ class JudgeRules:
     earns: float = _rule(
         0.1,
         "share of the error kept out that a name must cost when dropped to keep all of its confidence",
-        "by judgement: a name that explains less may be an accident",
+        "wrong names remove 3 to 8 % of the error in the median, 19 of 20 right ones a fifth and more (four sets of "
+        "cases of another plant)",
         "test_a_name_earns_its_confidence_by_what_it_removes",
     )
     helps: float = _rule(
@@ -289,13 +279,14 @@ class JudgeRules:
         0.1,
         "share of the squared error of a half second by which it differs with an effect that it can speak of; less, "
         "where neither follows, says nothing",
-        "by judgement: half of `part`",
+        "made for a true dead zone that half a second at a limit, missed alike with it and without, had lost; half "
+        "of `part`",
         "test_moments_that_nothing_follows_do_not_speak",
     )
     mutes: float = _rule(
         0.2,
         "share of what was kept out that may say nothing of an effect: more of it is not a few moments",
-        "by judgement",
+        "made for the same dead zone, which one half second of what was kept out had lost",
         "test_moments_that_nothing_follows_do_not_speak",
     )
     alone: float = _rule(
@@ -307,7 +298,7 @@ class JudgeRules:
     crowd: int = _rule(
         3,
         "effects on one joint from which on the smaller ones are taken for a series of likenesses",
-        "by judgement",
+        "of 36 names said third or later on a joint one is true, of 106 second ones 24 (five sets of cases)",
         "test_many_effects_on_one_joint_are_doubted",
     )
     trifle: float = _rule(
@@ -351,7 +342,8 @@ class JudgeRules:
     part: float = _rule(
         0.2,
         "share of the squared error on what was kept out that an effect removes at least that is more than a hint",
-        "by judgement: a tenth of the error itself",
+        "wrong names remove 0.07 to 0.16 in the median, 19 of 20 right ones 0.37 and more (four sets of cases of "
+        "another plant)",
         "test_an_effect_must_remove_a_part_of_what_was_kept_out",
     )
     borne_out: float = _rule(
@@ -418,7 +410,7 @@ class JudgeRules:
     jitter: float = _rule(
         8.0,
         "gain of the log likelihood from which jitter of a delay is reported",
-        "by judgement: a likelihood-ratio test passes it by chance three times in 100,000",
+        "a likelihood-ratio test passes it by chance three times in 100,000",
         "test_jitter_is_reported_where_the_likelihood_gains_much",
     )
     clocks: float = _rule(
@@ -430,13 +422,13 @@ class JudgeRules:
     settled: float = _rule(
         3.0,
         "x the noise: a motion on which two hypotheses differ by as much settles between them alone",
-        "by judgement",
+        "three standard deviations: noise passes it once in 370",
         "test_a_motion_that_settles_it_is_planned_alone",
     )
     surest: float = _rule(
         0.99,
         "the largest confidence of a name",
-        "by judgement: what no draw refutes may still be what the catalogue lacks",
+        "143 of 143 names said with it are true: 0.98 at least, and no number of cases shows 1",
         "test_no_name_is_certain",
     )
     at_end: float = _rule(
@@ -497,7 +489,7 @@ class JudgeRules:
     kept_most: float = _rule(
         0.45,
         "of all time that may be kept out",
-        "by judgement: what is fitted must be more",
+        "below a half: what is fitted must be more than what judges",
         "test_a_condition_that_is_most_of_the_time_is_fitted",
     )
     large: float = _rule(
@@ -528,19 +520,19 @@ class JudgeRules:
     warmed: float = _rule(
         5.0,
         "degC: what a temperature must span for cold and warm to be regimes",
-        "by judgement: over twice what tells of heat at all",
+        "of it 0.4 lie between what is cold and what is warm: the 2 degC that tell of heat (`search.warmth`)",
         "test_regimes_of_heat",
     )
     warm: float = _rule(
         0.3,
         "of that span, at each of its ends, that is cold and warm",
-        "by judgement",
+        "cold and warm then lie 0.4 of the span apart, 2 degC of the least span (`search.warmth`)",
         "test_regimes_of_heat",
     )
     visited: float = _rule(
         0.25,
         "s in which a regime is visited",
-        "by judgement: a few periods of a loop and half a block of the bootstraps",
+        "half a block of the bootstraps",
         "test_a_regime_is_visited_for_a_while",
     )
     unseen: float = _rule(
@@ -552,7 +544,7 @@ class JudgeRules:
     moved: float = _rule(
         0.002,
         "rad or m: a joint whose positions span less has not moved",
-        "by judgement",
+        "above a count of an encoder of 12 bits, 1.5 mrad",
         "test_a_recording_at_rest_tells_nothing",
     )
     commanded: float = _rule(
@@ -570,7 +562,7 @@ class TouchRules:
     enough: float = _rule(
         1.2,
         "x the noise: an error within it needs no effect",
-        "by judgement",
+        "what a crosstalk of 0.1 leaves, which a wider contact hides",
         "test_within_the_noise_no_touch_effect_is_looked_for",
     )
     map_price: float = _rule(
@@ -624,7 +616,7 @@ class TouchRules:
     short: float = _rule(
         3.0,
         "s of touch on a pad, at least, before anything but constant taxels is looked for",
-        "by judgement",
+        "doubled, the hysteresis of a learning case with recordings of 4 s is not told",
         "test_a_pad_must_be_touched_for_a_while",
     )
     plant: float = _rule(
@@ -642,7 +634,7 @@ class TouchRules:
     timing: float = _rule(
         3e-3,
         "s by which a reading's time is uncertain",
-        "by judgement: between two positions of the joints the contact is a guess",
+        "a reading at 90 Hz may be a period old: 11 ms over the root of 12",
         "test_the_time_of_a_reading_is_uncertain",
     )
     gain_prior: float = _rule(
@@ -678,7 +670,7 @@ class TouchRules:
     spread: float = _rule(
         0.15,
         "share that may pass to the taxels beside because pressure spreads by another law than the plant's",
-        "by judgement: laws of a foundation and of a half-space differ",
+        "between 0.1, a crosstalk that a wider contact hides, and 0.3, which is named",
         "test_a_little_crosstalk_may_be_another_law",
     )
     one_run: float = _rule(
@@ -739,13 +731,13 @@ class TorqueRules:
     much: float = _rule(
         0.3,
         "share of the torque's variance that a plain fit leaves, from which something else pushes",
-        "by judgement",
+        "doubled, the push of a learning case is not told; it must be above what friction's own law leaves",
         "test_a_plain_fit_must_leave_much_for_a_push",
     )
     far: float = _rule(
         5.0,
         "x the quiet residual: a push",
-        "by judgement: normal noise passes it once in a million samples",
+        "normal noise passes it less than once in a million samples",
         "test_a_push_stands_far_out_of_the_quiet_residual",
     )
     least: float = _rule(
@@ -763,13 +755,13 @@ class TorqueRules:
     slow: float = _rule(
         0.25,
         "of the residual's variance between half seconds: less is noise and no force",
-        "by judgement: of white noise at 100 Hz it is a fiftieth",
+        "between a fiftieth, of white noise at 100 Hz, and 1, of a force that lasts half a second",
         "test_a_force_lasts_and_noise_does_not",
     )
     most: float = _rule(
         0.6,
         "of the time: what pushes longer is no stretch",
-        "by judgement: more than half, which the trimmed fit needs, of what moves",
+        "the trimmed fit stands on half of the half seconds, so that hardly more than half may be pushed",
         "test_what_pushes_most_of_the_time_is_no_stretch",
     )
     join: float = _rule(
@@ -829,7 +821,7 @@ class TorqueRules:
     shed: float = _rule(
         0.8,
         "of the misfit: what halving the cutoff leaves at most, where what it sheds is noise of derivatives",
-        "by judgement: of white noise in a second derivative a fifth is left",
+        "between a fifth, which is left of white noise in a second derivative, and 1",
         "test_a_cutoff_is_halved_while_that_sheds_noise",
     )
     weighed: float = _rule(
@@ -878,7 +870,7 @@ class TorqueRules:
     shortest: float = _rule(
         5.0,
         "s of motion from which on a logged torque is fitted",
-        "by judgement: ten blocks of the bootstraps",
+        "ten blocks of the bootstraps",
         "test_a_torque_is_fitted_where_enough_was_logged",
     )
     shakes: float = _rule(
@@ -920,7 +912,8 @@ class BeliefRules:
     tolerance: float = _rule(
         0.05,
         "relative: figures of a real machine are off from its data sheet by as much, and that is no finding",
-        "by judgement: what data sheets promise",
+        "half of the gains, inertias and limits refitted in 166 empty cases of another plant end within 2.5 %; "
+        "doubled, a friction of the learning cases is less sure",
         "test_a_figure_within_its_tolerance_is_no_finding",
     )
     late: float = _rule(
@@ -932,19 +925,19 @@ class BeliefRules:
     filter: float = _rule(
         0.003,
         "s: a filter of the measured speed that any drive may have",
-        "by judgement: three periods of a loop of 1 kHz",
+        "19 of 20 refitted in 166 empty cases of another plant end within 2.7 ms",
         "test_any_drive_may_filter_its_speed",
     )
     gives: float = _rule(
         0.002,
         "rad by which what holds a joint gives before it slides; more is an effect",
-        "by judgement",
+        "19 of 20 refitted in 166 empty cases of another plant end within 1.5 mrad",
         "test_what_holds_a_joint_gives_a_little",
     )
     gives_slide: float = _rule(
         5e-05,
         "m by which what holds a slide gives before it slides",
-        "by judgement, as `gives` at a radius of 25 mm",
+        "as `gives` at a radius of 25 mm",
         "test_what_holds_a_joint_gives_a_little",
     )
     zero: float = _rule(
@@ -956,7 +949,7 @@ class BeliefRules:
     effort_zero: float = _rule(
         0.01,
         "of the torque limit: what a reading of the effort may be off by at rest",
-        "by judgement",
+        "in concealed cases an offset of 2.8 % of the limit is named, 0.3 and 0.8 % are within what any drive has",
         "test_sensors_have_zeros",
     )
     prior: float = _rule(

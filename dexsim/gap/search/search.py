@@ -57,7 +57,7 @@ class JointSelection(JointScan):
                 break
             listed = self._shortlist(scan, shortlist, loss, current.members)
             if loss < SEARCH.rough:
-                listed = self._hinted([] if enough else listed, current.members, SEARCH.hint)
+                listed = self._hinted([] if enough else listed, current.members, SEARCH.promise * SEARCH.least)
             if not listed:
                 break
             drafts = self._drafts(listed, current, pool, price)
@@ -562,15 +562,15 @@ class JointSearch(JointSelection):
     the scan (`JointScan`), the selection (`JointSelection`), and what was found on whole recordings."""
 
     def law_spread(self, trial: Trial) -> np.ndarray:
-        """[P, 2] lowest and highest value of each parameter over the laws that do about as well (`SEARCH.alike` of the
-        loss on what was left out)."""
+        """[P, 2] lowest and highest value of each parameter over the laws that do about as well: within twice
+        `SEARCH.apart` of the loss on what was left out."""
         x = trial.fit.x
         out = np.stack([x, x], 1)
         at = {p.key: i for i, p in enumerate(trial.fit.params)}
         for tries in self.by_law.values():
             least = min(float(self._left(t).sum()) for t in tries)
             for t in tries:
-                if t.ids != trial.ids or float(self._left(t).sum()) > (1 + SEARCH.alike) * least:
+                if t.ids != trial.ids or float(self._left(t).sum()) > (1 + 2 * SEARCH.apart) * least:
                     continue
                 for p, value in zip(t.fit.params, t.fit.x, strict=True):
                     if not p.nuisance and p.key in at:
