@@ -29,13 +29,15 @@ class SearchRules:
 
     least: float = _rule(
         0.12,
-        "share of the squared error on conditions left out that an effect must remove",
+        "share of the squared error on what was left out that an effect must remove, of joints, of torques and of "
+        "touch; of what is fitted, too, where that is within the noise without it",
         "with nothing missing some effect removes a twentieth by accident; set above on planted cases",
         "test_an_effect_must_remove_a_least_share",
     )
     chance: float = _rule(
         0.03,
-        "share of the bootstraps in which an effect may be of no use to what was left out",
+        "share of the bootstraps in which an effect, of joints, of torques or of touch, may be of no use to what was "
+        "left out",
         "one-sided, between the customary 1 and 5 %; none of 42 empty cases of another plant alarmed with it",
         "test_an_effect_must_help_in_nearly_all_bootstraps",
     )
@@ -97,7 +99,7 @@ class SearchRules:
     tie: float = _rule(
         0.02,
         "of the loss: nearer than this, fits without each condition decide",
-        "twice the tolerance at which a fit ends",
+        "twice the 1 % at which fits to what is not left out end",
         "test_where_two_fits_are_close_fits_of_their_own_do_not_decide",
     )
     per_parameter: float = _rule(
@@ -108,7 +110,8 @@ class SearchRules:
     )
     apart: float = _rule(
         0.03,
-        "of the loss: a rival as much worse than the best counts for a third of it in one draw",
+        "of the loss: a rival as much worse than the best counts for a third of it in one draw; laws of one effect "
+        "that come within twice as much may each be the true one",
         "by judgement: finer than the plant is to be trusted",
         "test_rivals_are_told_apart_by_what_they_lose",
     )
@@ -127,7 +130,7 @@ class SearchRules:
     )
     most: int = _rule(
         4,
-        "effects on one joint",
+        "effects on one joint or pad",
         "of ten names said fourth or later on a joint, in answers to five sets of cases, one is true",
         "test_a_joint_has_at_most_so_many_effects",
     )
@@ -139,7 +142,7 @@ class SearchRules:
     )
     rival_noise: float = _rule(
         0.2,
-        "x the noise squared that a rival may leave beside that",
+        "x the noise squared that a rival may leave beside that; its draft twice as much",
         "by judgement",
         "test_what_cannot_follow_is_no_rival",
     )
@@ -164,13 +167,15 @@ class SearchRules:
     )
     rare: float = _rule(
         2.5,
-        "x `chance` for a first effect that removes from twice `least` on: few moments show it, and draws vary",
+        "x `chance` for a first effect that removes from twice `least` on, twice that from four times on: few "
+        "moments show it, and draws vary",
         "what shows in three blocks is missed by a draw in 20, in two by one in seven: 2.5 x 0.03 lies between",
         "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
     )
     promise: float = _rule(
         0.25,
-        "of `least`: what an effect must promise in the scan to be on the short list at all",
+        "of `least`: what an effect must promise in the scan to be on the short list at all; what it saves in "
+        "hindsight by as much is tried whatever its price",
         "by judgement: the scan is linear and promises too little of effects that are not",
         "test_the_short_list_asks_a_promise",
     )
@@ -203,7 +208,8 @@ class JudgeRules:
 
     within: float = _rule(
         1.3,
-        "x the noise floor: an error within it asks for no effect",
+        "x the noise: an error within it asks for no effect, and is as good as any; two that differ by less are the "
+        "same, of repeats, or of two engines",
         "halved, an empty learning case is not told as such; empty cases lie at 1.0 (55 of our own plant) and 1.4 "
         "(166 of another) in the median",
         "test_an_error_within_the_noise_asks_for_nothing",
@@ -275,18 +281,10 @@ class JudgeRules:
         "by judgement",
         "test_what_was_kept_out_may_side_with_neither",
     )
-    mute: float = _rule(
-        0.1,
-        "share of the squared error of a half second by which it differs with an effect that it can speak of; less, "
-        "where neither follows, says nothing",
-        "made for a true dead zone that half a second at a limit, missed alike with it and without, had lost; half "
-        "of `part`",
-        "test_moments_that_nothing_follows_do_not_speak",
-    )
     mutes: float = _rule(
         0.2,
         "share of what was kept out that may say nothing of an effect: more of it is not a few moments",
-        "made for the same dead zone, which one half second of what was kept out had lost",
+        "made for a true dead zone that one half second at a limit, missed alike with it and without, had lost",
         "test_moments_that_nothing_follows_do_not_speak",
     )
     alone: float = _rule(
@@ -341,7 +339,8 @@ class JudgeRules:
     )
     part: float = _rule(
         0.2,
-        "share of the squared error on what was kept out that an effect removes at least that is more than a hint",
+        "share of the squared error on what was kept out that an effect removes at least that is more than a hint; a "
+        "half second that it changes by half as much can speak of it",
         "wrong names remove 0.07 to 0.16 in the median, 19 of 20 right ones 0.37 and more (four sets of cases of "
         "another plant)",
         "test_an_effect_must_remove_a_part_of_what_was_kept_out",
@@ -397,7 +396,7 @@ class JudgeRules:
     )
     unexplained: float = _rule(
         1.5,
-        "x the noise floor: a joint that keeps as much is offered a stand-in torque",
+        "x the noise: of a joint that keeps as much is said what it depends on, and a stand-in torque is offered",
         "by judgement",
         "test_a_stand_in_is_offered_where_much_is_left",
     )
@@ -730,7 +729,8 @@ class TorqueRules:
 
     much: float = _rule(
         0.3,
-        "share of the torque's variance that a plain fit leaves, from which something else pushes",
+        "share of the torque's variance that a plain fit leaves, from which something else pushes, and the fit of "
+        "the quiet rest, to which it is not believed",
         "doubled, the push of a learning case is not told; it must be above what friction's own law leaves",
         "test_a_plain_fit_must_leave_much_for_a_push",
     )
@@ -760,7 +760,8 @@ class TorqueRules:
     )
     most: float = _rule(
         0.6,
-        "of the time: what pushes longer is no stretch",
+        "of the time: what pushes longer is no stretch; a joint is judged without its pushes where the rest of the "
+        "time is left",
         "the trimmed fit stands on half of the half seconds, so that hardly more than half may be pushed",
         "test_what_pushes_most_of_the_time_is_no_stretch",
     )
@@ -797,7 +798,7 @@ class TorqueRules:
     fit: float = _rule(
         0.95,
         "share of a logged duty's variance that the believed law must give for a drive to be sound",
-        "by judgement",
+        "a sound servo's law gives all of the variance of its recorded duty (BAM's recordings)",
         "test_a_drive_is_sound_by_its_logged_duty",
     )
     late: float = _rule(
@@ -808,7 +809,8 @@ class TorqueRules:
     )
     worse: float = _rule(
         1.05,
-        "x the plain model's error on what was kept out: beyond it an answer is not handed on",
+        "x the error: beyond it an answer follows worse than the plain model does, or a loop with the torque's "
+        "figures worse than with its own",
         "by judgement",
         "test_an_answer_that_follows_worse_than_the_plain_model_is_not_handed_on",
     )
@@ -869,7 +871,7 @@ class TorqueRules:
     )
     shortest: float = _rule(
         5.0,
-        "s of motion from which on a logged torque is fitted",
+        "s of motion from which on a logged torque is fitted, and at 100 Hz as many samples",
         "ten blocks of the bootstraps",
         "test_a_torque_is_fitted_where_enough_was_logged",
     )
@@ -911,7 +913,8 @@ class BeliefRules:
 
     tolerance: float = _rule(
         0.05,
-        "relative: figures of a real machine are off from its data sheet by as much, and that is no finding",
+        "relative: figures of a real machine are off from its data sheet by as much, and that is no finding; after a "
+        "refit by half as much, whatever the residuals say",
         "half of the gains, inertias and limits refitted in 166 empty cases of another plant end within 2.5 %; "
         "doubled, a friction of the learning cases is less sure",
         "test_a_figure_within_its_tolerance_is_no_finding",
