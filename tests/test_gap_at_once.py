@@ -17,7 +17,7 @@ from dexsim.gap.compute import TimeLimit, away, map_joints, side_by_side
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
-from dexsim.gap.rules import JUDGE
+from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.search import JointSearch, Outcome
 from tests.test_gap import model
 
@@ -138,7 +138,7 @@ def test_a_joint_that_is_not_searched_again_is_judged_ahead(seconds, stopped, se
     drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None)
     case = SimpleNamespace(moved=True)
     search = SimpleNamespace(case=case, plain=lambda: ([], np.zeros(0)), whole=None)
-    loss = 0.5 * JUDGE.within**2 if settled else 2 * JUDGE.within**2
+    loss = 0.5 * SEARCH.unsettled if settled else 2 * SEARCH.unsettled
     found = SimpleNamespace(best=SimpleNamespace(members=(), fit=SimpleNamespace(loss=loss)))
     drives._judged_ahead(search, found)
     assert judged == (["answer", "plain"] if ahead else [])

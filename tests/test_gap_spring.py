@@ -17,7 +17,7 @@ from dexsim.gap.effects.catalogue import EFFECTS, nested
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run, conditions
-from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.hypotheses import named
 from dexsim.gap.search.search import JointSearch, JointSelection, Member, Trial
 
@@ -184,7 +184,7 @@ def test_what_pulls_alike_is_asked_for_beside_another_effect():
     assert not nested("coulomb_friction", "payload")
     assert grown(better=True) == (("joint_spring", "backlash"), [("joint_spring",)])
     assert grown(better=False)[0] == ("coulomb_friction",)
-    assert grown(better=True, left=0.5 * JUDGE.within**2) == (("coulomb_friction",), [])  # little is left
+    assert grown(better=True, left=0.5 * SEARCH.unsettled) == (("coulomb_friction",), [])  # little is left
 
 
 UNEVEN, LEVEL = 0.9, 0.01  # of friction by direction, N.m

@@ -365,7 +365,7 @@ class Drives(Steps):
             if found is not None
             and search.case.moved
             and search.case.joint not in self.unknown_controllers
-            and found.best.fit.loss > JUDGE.within**2
+            and found.best.fit.loss > SEARCH.unsettled
             and not any(m.effect.couples for m in found.best.members)
         }
         near, several = {k: search.case for k, (search, _) in left.items()}, list(left.values())
@@ -557,7 +557,7 @@ def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outc
 
 def _unsettled(found: Outcome) -> bool:
     """Whether a joint's search is looked at again with what was found in the others."""
-    return bool(found.best.members) or found.best.fit.loss > JUDGE.within**2
+    return bool(found.best.members) or found.best.fit.loss > SEARCH.unsettled
 
 
 def _other(search: JointSearch, found: Outcome) -> bool:

@@ -15,7 +15,7 @@ from dexsim.gap import compute
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
-from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
+from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
@@ -79,7 +79,7 @@ class JointSelection(JointScan):
                 ):  # the fit without it had stopped short: what is missing is looked for anew
                     continue
                 self.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
-            if enough and self.gain(best, current) < SEARCH.least:
+            if enough and self.gain(best, current) < SEARCH.clear:
                 break
             if not self._earns(best, current):
                 # a pair may be there where neither of its halves is seen alone
@@ -115,7 +115,7 @@ class JointSelection(JointScan):
         best = current
         for fork in forks:
             loss = self._left(fork).sum() / len(self.blocks)
-            if loss < JUDGE.within**2 or self.deadline.over():
+            if loss < SEARCH.unsettled or self.deadline.over():
                 continue
             listed = self._shortlist(self.scan(fork), shortlist, loss, fork.members)
             if not listed:
@@ -414,7 +414,7 @@ class JointSelection(JointScan):
         """The members that are confused with an effect replaced by a law of it that training has less exactly
         (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it."""
         mine = self._left(current).sum()
-        if mine < JUDGE.within**2 * len(self.blocks):
+        if mine < SEARCH.unsettled * len(self.blocks):
             return current
         best = current
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]

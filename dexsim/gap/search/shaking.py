@@ -19,7 +19,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.plant.columns import Param, expand, neutral_of
-from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, thin
 from dexsim.gap.search.search import JointSearch
 
@@ -163,11 +163,11 @@ def _starts(member: Member) -> list[tuple[float, ...]]:
 def answered(search: JointSearch, found: Outcome) -> Outcome:
     """What the search of a joint found; where it rings by itself and that is hardly followed, the effect that makes it
     ring as measured in the place of what was found, if any does by at least `SEARCH.least` more."""
-    followed = bool(found.best.members) and found.best.fit.loss < JUDGE.within**2
+    followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
     if followed or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by
     shaking = Shaking(search, found.none)
-    if not shaking.loud.any():
+    if shaking.loud.sum() < SEARCH.shaking:
         return found
     before = shaking.of(found.best)
     asked = [e for e in CATALOGUE if e.rings and (search.allowed is None or e.id in search.allowed)]
@@ -212,7 +212,7 @@ def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict
     if not fitted.loud.any():
         return False
     shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
-    if not shaking.loud.any():
+    if shaking.loud.sum() < SEARCH.shaking:
         return False
     before, after = (shaking.of(t).sum() for t in (outcome.none, outcome.best))
     return bool(after < (1 - SEARCH.least) * before)
