@@ -590,12 +590,19 @@ def test_unusable_recordings_are_a_verdict(rig, tmp_path, what):
     )
 
 
-def test_some_missing_samples_are_said_not_fatal(rig, tmp_path):
+@pytest.mark.parametrize(
+    "allowed",
+    [
+        pytest.param({"command_delay", "lag"}, id="few"),
+        pytest.param(None, id="all", marks=pytest.mark.slow),
+    ],
+)
+def test_some_missing_samples_are_said_not_fatal(rig, tmp_path, allowed):
     def change(r):
         r.states.position.value[50:60] = np.nan
 
-    few = replace(changed(rig, tmp_path, change), allowed={"command_delay", "lag"})
-    assert run(few).data["verdict"] != "unusable"
+    asked = replace(changed(rig, tmp_path, change), allowed=allowed)
+    assert run(asked).data["verdict"] != "unusable"
 
 
 def test_model_range_in_the_wrong_unit_is_said(rig, tmp_path):

@@ -96,10 +96,16 @@ def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
     assert gain < 0.3 * real
 
 
-def test_touch_asks_for_the_same_presses_with_a_load_cell(tmp_path):
-    paths, rig, servo = press_rig.record(tmp_path / "rig", 2, 4.0, seed=6, load_cell=False, stiffness=4500.0)
-    few = {"tactile_gain", "contact_stiffness"}
-    d = diagnose(Settings(paths, tmp_path / "out", None, str(rig), str(servo), allowed=few), say=lambda _: None)
+@pytest.mark.parametrize(
+    ("allowed", "seconds"),
+    [
+        pytest.param({"tactile_gain", "contact_stiffness"}, 4.0, id="few"),
+        pytest.param(None, 6.0, id="all", marks=pytest.mark.slow),
+    ],
+)
+def test_touch_asks_for_the_same_presses_with_a_load_cell(allowed, seconds, tmp_path):
+    paths, rig, servo = press_rig.record(tmp_path / "rig", 2, seconds, seed=6, load_cell=False, stiffness=4500.0)
+    d = diagnose(Settings(paths, tmp_path / "out", None, str(rig), str(servo), allowed=allowed), say=lambda _: None)
     written = save(d, tmp_path / "out")
     n = d.data["next_recording"]
     assert n and "load cell" in n["why"] and tmp_path / "out" / "next_recording.mcap" in written

@@ -72,15 +72,35 @@ def pages(tmp_path_factory):
     return {name: s.out / "report.html" for name, s in out.items()}
 
 
+@pytest.fixture(scope="module")
+def page_of_all(tmp_path_factory):
+    """The page of touch where every effect was tried."""
+    folder = tmp_path_factory.mktemp("all")
+    paths, model, servo = press_rig.record(folder, 2, 5.0, gains={54: 0.4, 66: 0.0})
+    s = Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False)
+    save(diagnose(s, say=lambda _: None), s.out)
+    return s.out / "report.html"
+
+
 @pytest.mark.parametrize("name", ["joint", "touch", "unusable"])
 @pytest.mark.parametrize("width", [1120, 560])
 def test_page_renders_in_a_browser(pages, browser, name, width):
-    browser.show(pages[name].as_uri(), width, 1400)
+    renders(pages[name], browser, width, name != "unusable")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1120, 560])
+def test_page_of_every_effect_of_touch_renders_in_a_browser(page_of_all, browser, width):
+    renders(page_of_all, browser, width, True)
+
+
+def renders(page, browser, width, figures):
+    browser.show(page.as_uri(), width, 1400)
     seen = browser.js(PROBE)
     assert seen["inner"] == width and seen["width"] <= width  # nothing sticks out sideways
     assert seen["first"] < 420  # the verdict is read without scrolling
     assert seen["fetched"] == 0 and not browser.log
-    if name != "unusable":
+    if figures:
         assert len(seen["figures"]) >= 4 and all(w > 60 and h > 15 and parts > 2 for w, h, parts in seen["figures"])
         assert not seen["long"], seen["long"]
 
