@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
+import contextlib
 import sys
-from pathlib import Path
 
+import forked
 import pytest
 
-ROOT = Path(__file__).parents[1]
 
-
-def kills(*args: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "tests.kills", *args], cwd=ROOT, capture_output=True, text=True, timeout=600
-    )
+def kills(*args: str):
+    return forked.run("tests.kills", *args)
 
 
 @pytest.mark.slow
@@ -23,16 +19,20 @@ def test_recordings_survive():
     assert done.returncode == 0 and '"kills": 4, "lost": 0' in done.stdout, done.stdout + done.stderr
 
 
+def spoiled(*args: str) -> None:
+    """With a writer that does not write beside its place."""
+    from dexsim import files
+    from tests import kills
+
+    files.beside = contextlib.contextmanager(lambda path: (yield path))
+    sys.exit(kills.main(list(args)))
+
+
 @pytest.mark.slow
 def test_what_is_lost_is_told():
-    """A writer that does not write beside its place is found out."""
-    spoiled = (
-        "import sys, contextlib; sys.path.insert(0, '.'); from dexsim import files; from tests import kills;"
-        "files.beside = contextlib.contextmanager(lambda path: (yield path)); sys.exit(kills.main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", spoiled, "count=12", "kinds=write", "seed=1"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1 and '"lost": 0' not in done.stdout, done.stdout + done.stderr
+    program = forked.Forked(spoiled, "count=12", "kinds=write", "seed=1")
+    out, err = program.communicate(600)
+    assert program.returncode == 1 and '"lost": 0' not in out, out + err
 
 
 @pytest.mark.slow
