@@ -534,6 +534,7 @@ for dz in (0.0, 0.02, -0.03):
 """
 
 
+@pytest.mark.slow
 def test_simulated_camera_sees_the_objects_height(made, monkeypatch):
     """In a process of its own: OpenGL is chosen before MuJoCo is imported."""
     import subprocess

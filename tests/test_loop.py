@@ -339,6 +339,7 @@ def test_presses_are_the_realitys_sensor(tmp_path):
     assert 0.014 < late * 1e-3 < 0.032  # hysteresis leads, the wait for a reading lags
 
 
+@pytest.mark.slow
 def test_fast_moves_reach_a_speed_limit_and_stay_clear_of_the_ends():
     """On the late hand, which the moves know nothing of: ten joints run at their speed limit for a while, and none far
     past its targets."""
