@@ -87,6 +87,7 @@ P_OWN = INDEX["own_payload"]
 P_GEARLOAD, P_GEARBACK, P_GEARPOWER, P_GEARUNIT = (
     INDEX[f"gear_load_{n}"] for n in ("friction", "friction_backdriven", "power", "unit")
 )
+SETTLES = 4.0  # x the lag: what was asked for longer ago is out of the torque but for 2 %
 PRESSED = 5e-3  # s in which the load comes to press a gear's flanks; that of the same step would be a loop
 XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
@@ -217,7 +218,9 @@ class State:  # of the joint
     taken: f64  # share of the dry friction that is taken up
     integral: f64  # the controller's integral term
     since: f64  # s, since it was taken
-    fresh: f64  # 1 before its first step (a bool's padding is copied with it, at the price of a division)
+    # 1 before its first step, 2 where its torque is known by then (a bool's padding is copied with it, at the price of a
+    # division)
+    fresh: f64
     older: f64  # what the age of its position makes of the torque that the loop asks for
     borne: f64  # torque that the gear hands to the joint, as its friction feels it
 
@@ -807,9 +810,9 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     t = opened(t, v_drive, p, n)
     if not n.enabled:
         x.integral = zero
-    if x.fresh != zero:
+    if x.fresh == f64(1.0):
         x.last = t.now
-        x.fresh = zero
+    x.fresh = zero
     before = x.last
     x.last = before + p.lag * (t.now - before)
     t.end = before + p.lag * (t.end - before)
@@ -881,6 +884,22 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
     return x
 
 
+@wp.func
+def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, p: Guess):
+    """Steps of dt [s] before t [s] in which a command changed that the drive's lag still holds some of; k, last: the
+    command from which on to look, and the end of the run's."""
+    begin = t - p.delay - f64(SETTLES) * c.params[h, P_LAG]
+    kk = int(k)
+    while kk + 1 < last and acts_at(c, kk + 1, p) <= begin:
+        kk += 1
+    if kk + 1 >= last:
+        return 0
+    since = t - p.delay - acts_at(c, kk + 1, p)
+    if since <= f64(0.0):
+        return 0
+    return int(wp.ceil(since / dt)) + 1
+
+
 @cache
 def plant_kernel() -> wp.Kernel:
     """The kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and guess;
@@ -901,11 +920,23 @@ def plant_kernel() -> wp.Kernel:
         t = c.window_t[w]
         p = guess(c, h, dt)
         x = begun(c, h, g0, warm, p)
+        lead = int(0)
+        if warm == 0:
+            lead = asked_before(c, h, k, c_end, t, dt, p)
+            t -= f64(lead) * dt
         on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
         after = shown(x.q, p)  # at the end of the step
-        for i in range(c.window[w, 1]):
-            g = g0 + i
-            if i <= warm and warm > 0:
+        for j in range(c.window[w, 1] + lead):
+            i = j - lead
+            g = g0 + wp.max(i, 0)
+            if i <= 0 and lead > 0:  # where it is measured first, only the drive's torque goes on
+                torque = x.last
+                x = begun(c, h, g0, warm, p)
+                if j > 0:
+                    x.last = torque
+                    x.fresh = f64(2.0)
+                after = shown(x.q, p)
+            if i >= 0 and i <= warm and warm > 0:
                 x = held(c, h, g, i == warm, x, p)
                 if i == 0:
                     x.qm = x.q
@@ -915,7 +946,7 @@ def plant_kernel() -> wp.Kernel:
                     after = shown(x.qm, p)
             reported = after
             n = Now()
-            n.held = i < warm
+            n.held = i < warm or i < 0
             end = t + dt - p.delay
             while k + 1 < c_end and acts_at(c, k + 1, p) <= end - dt:
                 k += 1
