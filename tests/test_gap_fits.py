@@ -91,3 +91,30 @@ def test_an_interval_holds_what_a_size_trades_with_a_belief():
     out = stretched(tight, f, 1.0)
     assert out[0, 1] - 4e-4 == pytest.approx(half[0]) and 4e-4 - out[0, 0] == pytest.approx(half[0])
     assert np.allclose(out[1], [0.275, 0.325])  # halved, as ever
+
+
+@pytest.mark.parametrize("lag, ago", [(0.1, 0.03), (0.03, 0.02), (0.0, 0.03)])
+def test_a_recording_that_begins_after_a_change_of_command_begins_with_what_the_lag_still_holds(lag, ago):
+    """The same motion from its begin, and from `ago` s after a step of its command on: the torque that the lag had not
+    given yet is not there at once."""
+    step, size = 0.5, 0.05
+    weightless = replace(plant_run("a", 0, 1.5, {}, noisy=False), gravity=np.zeros(3))
+    t_cmd, t = np.arange(0.0, 1.5, 0.01), np.arange(0.0, 1.4, 0.005)
+    cmd = np.where(t_cmd < step - 1e-9, 0.0, size)[:, None]
+    whole = replace(weightless, cmd_t=t_cmd, cmd=cmd, t=t, q=np.zeros((len(t), 1)), qs=None)
+
+    def simulated(run):
+        run.qs = None
+        run.smooth()
+        plant = build(model(), [run])[0].plant
+        params = plant.base()[None].copy()
+        params[..., INDEX["lag"]] = lag
+        return plant.simulate(params, plant.windows(None))[0][0]
+
+    for _ in range(3):  # the series are those of the motion itself
+        whole.q = simulated(whole)[:, None].copy()
+    on = t >= step + ago
+    part = replace(whole, t=t[on], q=whole.q[on], qs=None)
+    error = simulated(part) - part.q[:, 0]
+    soon = part.t < step + ago + 0.2  # a loop with a lag may swing up what is left
+    assert np.sqrt(np.mean(error[soon] ** 2)) < 0.05 * size

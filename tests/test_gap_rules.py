@@ -16,7 +16,7 @@ from test_gap_least import Judged, judged
 
 from dexsim.gap import diagnosis as diagnosing
 from dexsim.gap import locate, rules
-from dexsim.gap.compute import Deadline
+from dexsim.gap.compute import Deadline, TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
@@ -587,7 +587,8 @@ def test_a_stand_in_is_offered_where_much_is_left():
         drives = SimpleNamespace(outcomes=[(SimpleNamespace(joint="j"), SimpleNamespace(polish=lambda t: t),
                                             SimpleNamespace(best=None, none=None))],
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
-                                 w=SimpleNamespace(runs=[], settings=SimpleNamespace(seed=0)))  # fmt: skip
+                                 w=SimpleNamespace(runs=[], limit=TimeLimit(),
+                                                   settings=SimpleNamespace(seed=0)))  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(handed_on, "fit_stand_in", lambda *_: SimpleNamespace(text="a torque stands in"))
             Drives.stand_in(drives, d)

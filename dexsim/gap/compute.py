@@ -194,6 +194,8 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None
 # A limit of time, and a wish to end, that every search asks between its steps: what is best by then is the answer.
 
 JUDGING = 0.2  # of the limit: what is left for judging, the replay and the page
+PAGE = 0.04  # of the limit: what is left for the page
+GRACE = 0.04  # of the limit: by which a step of a search may be late; then its fits end where they are
 LONGER = 2.0  # times what it had: what a search that ended early must have more for it to begin anew
 
 
@@ -204,6 +206,7 @@ class TimeLimit:
     def __init__(self, seconds: float | None = None):
         self.seconds, self._start, self._stop = seconds, time.monotonic(), threading.Event()
         self.cut: set[str] = set()  # joints whose search ended early
+        self.left_out: list[str] = []  # what there was no time for, in sentences
 
     def stop(self) -> None:
         """Ends what is under way at its next step."""
@@ -219,6 +222,20 @@ class TimeLimit:
         if self.stopped:
             return 0.0
         return float("inf") if self.seconds is None else (1 - JUDGING) * self.seconds - (time.monotonic() - self._start)
+
+    def rest(self) -> float:
+        """s until all but the page is to be done; infinite without a limit."""
+        if self.seconds is None:
+            return float("inf")
+        return (1 - PAGE) * self.seconds - (time.monotonic() - self._start)
+
+    def spent(self, share: float) -> bool:
+        """Whether this share (0..1) of the limit is over."""
+        return self.seconds is not None and time.monotonic() - self._start > share * self.seconds
+
+    def leave_out(self, what: str) -> None:
+        """Notes for the page what there was no time for, a sentence's begin."""
+        self.left_out.append(f"{what} (the limit of {self.seconds:g} s)")
 
     def share(self, joint: str, of: float) -> Deadline:
         """The deadline of one joint's search that gets `of` (0..1) of what is left."""
@@ -238,3 +255,9 @@ class Deadline:
         if self.limit is not None:
             self.limit.cut.add(self.joint)
         return True
+
+    def passed(self) -> bool:
+        """Whether what is over by more than `GRACE` is to end within a step, too."""
+        if self.limit is None or self.limit.seconds is None:
+            return False
+        return time.monotonic() > self.until + GRACE * self.limit.seconds

@@ -3,6 +3,7 @@ through their steps here, joint by joint, judged on recordings kept out; its tou
 
 from __future__ import annotations
 
+import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -50,7 +51,7 @@ def diagnose(
     w = Inquiry(s, say, progress, s.time_limit or TimeLimit(s.limit))
     read_files(w)
     to_runs(w)
-    touch = Touch(w.readable, w.m, w.held_names, s.seed, s.allowed, progress)
+    touch = Touch(w.readable, w.m, w.held_names, s.seed, s.allowed, progress, w.limit)
     touch.run()
     w.notes += touch.result.notes
     w.clock.lap("touch")
@@ -68,11 +69,21 @@ def diagnose(
         w.clock.lap("stand-in")
     drives.confirm(d)
     w.clock.lap("replay in the engine that trains")
-    if s.next_recording:
-        plan_next(d, s, w.m, drives.outcomes, w.readable)
-        w.clock.lap("next recording")
+    _next(d, w, drives.outcomes)
+    d.notes[:0] = w.limit.left_out
     d.shares = w.clock.shares
     return d
+
+
+def _next(d: Diagnosis, w: Inquiry, outcomes: Sequence[tuple[Case, JointSearch, Outcome]]) -> None:
+    """What to record next, where that was asked for and there is time for it."""
+    if not w.settings.next_recording:
+        return
+    if w.limit.spent(1 - PLANNING):
+        w.limit.leave_out("no next recording is planned")
+        return
+    plan_next(d, w.settings, w.m, outcomes, w.readable)
+    w.clock.lap("next recording")
 
 
 def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
@@ -89,8 +100,8 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
     touch.report(d)
     d.data["unexplained"]["not_considered"] = left_out
     d.lengths = w.lengths
-    if w.settings.next_recording:
-        plan_next(d, w.settings, w.m, (), w.readable)
+    _next(d, w, ())
+    d.notes[:0] = w.limit.left_out
     d.shares = w.clock.shares
     return d
 
@@ -101,11 +112,17 @@ __all__ = ["Diagnosis", "Settings", "diagnose", "save"]
 # -- the drives -------------------------------------------------------------------------------------------------------
 
 Answers = list[tuple[JointSearch, Outcome | None]]
+# shares of a limit of time: that the model along the motion may take; that must be left for stand-ins, and for plans of
+# a replay or a recording; and of what is left then the replay's
+MODELLING, STANDING_IN, PLANNING, REPLAYING = 0.2, 0.1, 0.07, 0.5
+MUCH = 20.0  # s of all joints' recordings for each second of a limit: the model along less is not worth a look
 
 
 class Drives(Steps):
     """The drives of a mechanism. w: what is asked and has been read; felt: touch, which is judged before: a joint is
     judged where nothing is touched."""
+
+    modelling = 0.0  # s that the model along the motion took
 
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
@@ -187,6 +204,8 @@ class Drives(Steps):
         w, s = self.w, self.w.settings
         count = len(w.runs[0].joints)
         w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
+        self._within_the_limit()
+        begun = time.monotonic()
         self.cases = refined_cases(self.mj_model, w.runs, s.device, _step(w.runs), s.joints)
         self.left_out = conclude.not_considered(self.cases, self.felt, s.allowed)
         w.notes += cannot_be_seen(s.allowed, self.left_out) + conclude.not_fitted(self.cases)
@@ -197,6 +216,7 @@ class Drives(Steps):
                     f"joints: none of {', '.join(sorted(s.joints))} is in the recordings "
                     f"({', '.join(w.runs[0].joints)})"
                 )
+        self.modelling = time.monotonic() - begun
         w.clock.lap("model along the motion")
         group = conditions(w.runs)
         drives = [json.dumps(plain(r.servo.to_dict()), sort_keys=True) for r in w.runs]
@@ -206,6 +226,31 @@ class Drives(Steps):
         self.noise = Noise(*kept_out.floor(w.runs, self.cases), kept_out.floors(w.runs, self.cases)[0])
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
 
+    def _within_the_limit(self) -> None:
+        """Leaves out recordings, evenly, whose model along the motion would take more than its share of the limit of
+        time: by how long one of them takes."""
+        w, s = self.w, self.w.settings
+        seconds = sum(r.duration for r in w.runs)
+        if w.limit.seconds is None or len(w.runs) < 3 or seconds * len(w.runs[0].joints) < MUCH * w.limit.seconds:
+            return
+        ranked, tried = sorted(w.runs, key=lambda r: r.duration), time.monotonic()
+        for run in (ranked[0], ranked[len(ranked) // 2]):  # kernels are compiled, or read, with the first
+            begun = time.monotonic()
+            refined_cases(self.mj_model, [copy.copy(run)], s.device, _step(w.runs), s.joints)
+            took = time.monotonic() - begun
+        whole = took * seconds / run.duration
+        room = min(w.limit.left(), MODELLING * w.limit.seconds - (time.monotonic() - tried))
+        share = room / max(whole, 1e-9)
+        kept = _evenly(w.runs, set(w.held), share)
+        if len(kept) == len(w.runs):
+            return
+        w.limit.leave_out(
+            f"{len(w.runs) - len(kept)} of {len(w.runs)} recordings are left out: the model along all of them would "
+            f"take {whole:.0f} s"
+        )
+        w.held = [i for i, k in enumerate(kept) if k in w.held]
+        w.runs = [w.runs[k] for k in kept]
+
     # -- search
     # ----------------------------------------------------------------------------------------------------------------
     def search(self) -> None:
@@ -214,6 +259,9 @@ class Drives(Steps):
         w = self.w
         self._left: float = len(self.cases)  # joints that are still to be searched: they share the time
         linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
+        if linked and 2 * self.modelling > w.limit.left():
+            w.limit.leave_out("the joints' motion is not refined by what the others were fitted to")
+            linked = False
         if linked:
             first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
             begun = [t for t in first if t is not None]
@@ -270,6 +318,8 @@ class Drives(Steps):
         search, case = self._begun(k, tell), self.cases[k]
         if len(search.long.window) == 0:
             return search, None
+        if self.w.limit.seconds is not None and case.moved:
+            search.plain()  # what all else is held against has its time before anything else
         if case.moved and case.joint not in self.unknown_controllers:
             found = shaking.answered(search, search.run())
         else:
@@ -317,11 +367,12 @@ class Drives(Steps):
         for k, answer in zip(cut, renewed, strict=True):
             answers[k] = answer
 
-    def _time_for(self, searches: Iterable[JointSearch]) -> bool:
-        """Whether what is left of the limit is as much as these searches took: they would begin anew, and in less time
-        end before where they did."""
+    def _time_for(self, searches: Iterable[JointSearch], first: float = 0.0) -> bool:
+        """Whether what is left of the limit is as much as these searches took, and `first` s before: they would begin
+        anew, and in less time end before where they did."""
         took = [x.took for x in searches]
-        return min(1.0, workers(self.w.settings.device, len(took)) / len(took)) * self.w.limit.left() >= max(took)
+        lanes = min(1.0, workers(self.w.settings.device, len(took)) / len(took))
+        return lanes * (self.w.limit.left() - first) >= max(took)
 
     def _coupled_by(self, trials: Sequence[Trial]) -> None:
         """The cases once more, with the others' motion as these trials have it."""
@@ -339,7 +390,9 @@ class Drives(Steps):
             and _unsettled(found)
         ]
         found = [x for _, x in answers if x is not None]
-        if len(unsettled) < 2 or len(found) < len(answers) or not self._time_for(answers[k][0] for k in unsettled):
+        if len(unsettled) < 2 or len(found) < len(answers) or not self._time_for(
+            (answers[k][0] for k in unsettled), self.modelling
+        ):
             return
         self._coupled_by(_moved_by(self.mj_model, [search.case.joint for search, _ in answers], found))
         unsettled = [
@@ -371,6 +424,8 @@ class Drives(Steps):
         near, several = {k: search.case for k, (search, _) in left.items()}, list(left.values())
         by = compute.each(len(left), lambda i: None if w.limit.left() <= 0 else self._dragger(*several[i]))
         pulled = [(k, case) for k, case in zip(left, by, strict=True) if case is not None]
+        if pulled and not self._time_for(left[k][0] for k, _ in pulled):
+            return
         for k, case in pulled:
             self.cases[k] = case
         self._left = len(pulled)
@@ -454,24 +509,35 @@ class Drives(Steps):
 
     def stand_in(self, d: Diagnosis) -> None:
         """Stand-ins for joints of which something is left that no effect explains."""
-        p = self.parts
+        p, limit, longest, late = self.parts, self.w.limit, 0.0, []
         for case, search, outcome in self.outcomes:
             if d.joints[case.joint]["after"] < JUDGE.unexplained * self.noise.floor:
                 continue
+            if limit.spent(1 - STANDING_IN) or limit.rest() < 2 * longest:
+                late.append(case.joint)
+                continue
+            begun = time.monotonic()
             claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
             trial = search.polish(outcome.best if claimed else outcome.none)
             found = handed_on.fit_stand_in(
                 case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed
             )
+            longest = max(longest, time.monotonic() - begun)
             if found is not None:
                 d.standins.append(found)
                 d.notes.append(found.text)
+        if late:
+            limit.leave_out(f"no stand-in is fitted to {', '.join(late)}")
 
     def confirm(self, d: Diagnosis) -> None:
         """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the
         sentence says so."""
         w, s, p = self.w, self.w.settings, self.parts
         if s.replay == "none":
+            return
+        room = REPLAYING * w.limit.rest()  # comparisons with the search's own plant, and what comes next, need time too
+        if w.limit.spent(1 - PLANNING):
+            w.limit.leave_out("not replayed in the engine that trains")
             return
         cases, finer = (
             [case for case, _, _ in self.outcomes],
@@ -489,7 +555,11 @@ class Drives(Steps):
                 s.device,
                 s.replay,
                 finer=finer,
+                room=room,
             )
+        except full_model.NoTime:
+            w.limit.leave_out("not replayed in the engine that trains")
+            return
         except UserError as error:
             d.notes.append(f"not replayed in the engine that trains: {error}")
             return
@@ -528,6 +598,26 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
         for e in sorted(asked or ())
         if e in left_out
     ]
+
+
+def _evenly(runs: Sequence[Run], held: set[int], share: float) -> list[int]:
+    """Which runs to keep, evenly of those held out and of the others, that share (0..1) of their time; one of each at
+    least."""
+    if share >= 1:
+        return list(range(len(runs)))
+    kept: list[int] = []
+    for group in ([k for k in range(len(runs)) if k not in held], sorted(held)):
+        room = share * sum(runs[k].duration for k in group)
+        count = len(group)
+        while count > 1 and sum(runs[k].duration for k in _spread(group, count)) > room:
+            count -= 1
+        kept += _spread(group, count)
+    return sorted(kept)
+
+
+def _spread(group: Sequence[int], count: int) -> list[int]:
+    """`count` of a group, evenly."""
+    return [group[i] for i in np.unique(np.linspace(0, len(group) - 1, count).astype(int))] if group else []
 
 
 def _at_rest(runs: Sequence[Run]) -> bool:

@@ -205,6 +205,9 @@ class Inquiry:
         return not self.runs or bool(self.settings.held_out and len(self.held) == len(self.runs))
 
 
+READING = 0.25  # of a limit of time: for reading; what is not read by then is left out
+
+
 class NothingToJudge(Exception):
     """A part of which nothing can be said, and why."""
 
@@ -262,14 +265,20 @@ def read_files(w: Inquiry) -> None:
         )
     paths = [*w.settings.recordings, *(w.settings.held_out or [])]
     w.names = _unique_names(paths)
-    for path in paths:
+    w.recordings, unread = [None] * len(paths), []
+    for turn, i in enumerate(_in_turn(len(w.settings.recordings), len(paths))):
+        path = paths[i]
+        if turn > 1 and w.limit.spent(READING):
+            unread.append(w.names[path])
+            continue
         try:
             r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints, hand=w.m.hand)
             r.path = Path(w.names[path])
-            w.recordings.append(r)
+            w.recordings[i] = r
         except UserError as error:
             w.failures.append(str(error))
-            w.recordings.append(None)
+    if unread:
+        w.limit.leave_out(f"{len(unread)} of {len(paths)} recordings are not read: {', '.join(sorted(unread))}")
     w.clock.lap("reading and audit")
     w.lengths = {r.path.name: r.duration for r in w.recordings if r is not None}
     _copies(w.recordings[: len(w.settings.recordings)], w.recordings[len(w.settings.recordings) :])
@@ -328,6 +337,14 @@ def to_runs(w: Inquiry) -> None:
     w.failures += [f"{name}: {joint}: {why}" for (name, joint), why in out.items()] if not w.runs else []
     if w.failures and w.runs and len(w.held) < len(w.runs):
         w.say(f"  left out: {'; '.join(w.failures)}")
+
+
+def _in_turn(fitted: int, count: int) -> list[int]:
+    """Numbers of the recordings, the first `fitted` of them and those kept out in turn, each evenly: wherever one
+    stops, there is of both."""
+    share = [(i + 0.5) / fitted for i in range(fitted)]
+    share += [(i + 0.5) / (count - fitted) for i in range(count - fitted)]
+    return sorted(range(count), key=lambda i: (share[i], i))
 
 
 def _unique_names(paths: Sequence[Path]) -> dict[Path, str]:

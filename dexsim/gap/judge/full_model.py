@@ -11,8 +11,9 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -45,6 +46,11 @@ TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 MOST = 8.0  # s of what was kept out that is replayed: a step of the engine is a turn of Python
+PILOT, LEAST = 0.1, 1.0  # s that are replayed to see how long it takes, and at least
+
+
+class NoTime(Exception):
+    """Less can be replayed in the time that there is than would say anything."""
 
 
 @dataclass
@@ -439,10 +445,12 @@ def confirm(
     replay: str = "mujoco",
     timestep: float = STEP,
     finer: Sequence[Case] = (),
+    room: float = math.inf,
 ) -> Confirmation | None:
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over
-    what was kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None
-    where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+    what was kept out. finer: the cases with the plants in which the errors of the search's own plant are judged; room:
+    s that it may take, by a pilot: of each recording less is replayed where it would take longer. None where nothing
+    can be replayed. Raises UserError where the model or a drive does not serve, NoTime."""
     device = "cpu" if replay == "mujoco" else device
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if not cases or not len(windows[0].window):
@@ -454,15 +462,23 @@ def confirm(
     parts = [model_of(m, cases, h) for h in hypotheses]
     worlds = [[w for i, w in enumerate(worlds_of(m, runs, cases, h, windows[0])) if i in use] for h in hypotheses]
     plain = [i for i, (_, changed) in enumerate(parts) if not changed]
+    groups = ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]
+    most = math.inf
+    if room < math.inf:
+        run = lambda s: free_runs(parts[0][0], m.joints, _until(worlds[0], s), device, timestep, replay)  # noqa: E731
+        most = _affordable(run, room, len(groups), len(parts) + timestep / TASKS)
+        worlds = [_until(x, most) for x in worlds]
     found: dict[int, list[np.ndarray]] = {}
-    for group in ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]:
+    for group in groups:
         q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, replay)
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
 
     def told(case: Case, ws: Windows) -> np.ndarray:
         """[n] bool: samples of the windows replayed, in recordings that tell of this joint."""
-        return np.isin(ws.sample_window, use) & ~np.isin(ws.run[ws.sample_window], list(case.plant.left_out))
+        t = case.plant.t[ws.sample_row] - ws.window_t[ws.sample_window]
+        left_out = np.isin(ws.run[ws.sample_window], list(case.plant.left_out))
+        return np.isin(ws.sample_window, use) & (t <= most) & ~left_out
 
     def error(q: list[np.ndarray], step: float, case: Case, ws: Windows) -> tuple[np.ndarray, np.ndarray]:
         """(simulated position, squared error) [n] of one joint at its samples."""
@@ -512,6 +528,27 @@ def confirm(
         at_tasks_step,
         simulated,
     )
+
+
+def _until(worlds: Sequence[World], most: float) -> list[World]:
+    """The worlds, for so many s at most."""
+    return [replace(w, duration=min(w.duration, most)) for w in worlds]
+
+
+def _affordable(run: Callable[[float], Any], room: float, groups: int, times: float) -> float:
+    """s of each recording that can be replayed in `room` s, by how long `run` (s that are replayed) takes for one
+    hypothesis: `times` as often in all, in `groups` engines and one more. Raises NoTime."""
+    took = []
+    for pilot in (PILOT, 2 * PILOT):
+        begun = time.monotonic()
+        run(pilot)
+        took.append(time.monotonic() - begun)
+    each = max(took[1] - took[0], 0.1 * took[1]) / PILOT
+    fixed = max(took[1] - 2 * PILOT * each, 0.0)
+    most = (room - sum(took) - (groups + 1) * fixed) / (times * each)
+    if most < LEAST:
+        raise NoTime
+    return most
 
 
 def agree(engine: float, plant: float, floor: float, before: float) -> bool:

@@ -218,8 +218,8 @@ class State:  # of the joint
     taken: f64  # share of the dry friction that is taken up
     integral: f64  # the controller's integral term
     since: f64  # s, since it was taken
-    # 1 before its first step, 2 where its torque is known by then (a bool's padding is copied with it, at the price of a
-    # division)
+    # 1 before its first step, 2 where its torque is known by then (a bool's padding is copied with it, at the price of
+    # a division)
     fresh: f64
     older: f64  # what the age of its position makes of the torque that the loop asks for
     borne: f64  # torque that the gear hands to the joint, as its friction feels it

@@ -11,7 +11,7 @@ recorded, and is otherwise at most its limit; gravity and the other joints' pull
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,6 +29,7 @@ from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
 GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside what is believed
+AT_ONCE = 49  # guesses that are simulated together: between them there is a look at the clock
 ITERATIONS = 8  # of the fit from each guess
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
@@ -122,10 +123,14 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
 
 
 def fitted(
-    case: Case, train: Sequence[int], span: dict | None = None, seed: int = 0
+    case: Case,
+    train: Sequence[int],
+    span: dict | None = None,
+    seed: int = 0,
+    passed: Callable[[], bool] = lambda: False,
 ) -> tuple[list[Param], np.ndarray] | None:
-    """The plain model of a joint, fitted on runs `train` (span: part of each run, s): its parameters and their values
-    [P]. None where there is nothing to fit."""
+    """The plain model of a joint, fitted on runs `train` (span: part of each run, s; passed: whether time is up, the
+    best by then is taken): its parameters and their values [P]. None where there is nothing to fit."""
     windows = case.plant.windows(WINDOW, list(train), span=span)
     if not len(windows.window):
         return None
@@ -136,6 +141,7 @@ def fitted(
         case.plant,
         subset(windows, pick),
         Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)),
+        passed,
     )
     return params, _fitted(fitter, params, np.random.default_rng(seed))
 
@@ -185,7 +191,11 @@ def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np
     safe = np.where(spread, low, 1.0)
     guesses = np.where(spread, safe * (np.where(spread, high, 2.0) / safe) ** share, low + (high - low) * share**2)
     guesses = np.concatenate([start[None], guesses])
-    loss = fitter.loss(fitter.residuals(params, guesses))
+    loss = np.full(len(guesses), np.inf)
+    for i in range(0, len(guesses), AT_ONCE):
+        if i and fitter.passed():
+            break
+        loss[i : i + AT_ONCE] = fitter.loss(fitter.residuals(params, guesses[i : i + AT_ONCE]))
     order = np.argsort(loss)[:BEST]
     fits = [
         fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3)

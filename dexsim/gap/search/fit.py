@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,10 +70,12 @@ class Fitted:
 
 
 class Fitter:
-    """Fits parameter sets of one joint on given windows."""
+    """Fits parameter sets of one joint on given windows. passed: whether time is up: a fit then ends where it is."""
 
-    def __init__(self, plant: JointPlant, windows: Windows, residuals: Residuals):
-        self.plant, self.w, self.r = plant, windows, residuals
+    def __init__(
+        self, plant: JointPlant, windows: Windows, residuals: Residuals, passed: Callable[[], bool] = lambda: False
+    ):
+        self.plant, self.w, self.r, self.passed = plant, windows, residuals, passed
         self.q = plant.q[windows.sample_row]
         tau = plant.torque[windows.sample_row]
         self.use_torque = residuals.sigma_torque > 0 and bool(np.isfinite(tau).any())
@@ -167,6 +170,8 @@ class Fitter:
         low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
         centre, believed = np.array([p.start for p in params], float), prior_weight(params)
         for _ in range(rounds):
+            if self.passed():
+                break
             span = high - low
             J = f.jacobian * span
             k = self.r.huber
@@ -202,6 +207,8 @@ class Fitter:
         span, centre, believed = high - low, np.array([p.start for p in params], float), prior_weight(params)
         score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: E731
         for _ in range(rounds):
+            if self.passed():
+                break
             k = self.r.huber
             w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
             J = f.jacobian * span
@@ -296,7 +303,7 @@ class Fitter:
                     jac = jac + np.outer((res - last) - jac @ moved, moved) / max(float(moved @ moved), 1e-30)
                 jac[:, ~known] = columns / (delta / span)[~known]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
-            if it >= iterations or P == 0:
+            if it >= iterations or P == 0 or self.passed():
                 break
             k = self.r.huber
             weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
@@ -342,7 +349,7 @@ class Fitter:
                 # one more Jacobian at the new point, for the intervals
                 iterations = min(iterations, it)
             known = follow.copy()
-        if exact and known.any():
+        if exact and known.any() and not self.passed():
             res, jac, s = self._slopes(params, x, delta, np.arange(P))
             jac = jac / (delta / span)
         return Fitted(

@@ -305,8 +305,8 @@ class JointHypotheses:
         self.r = Residuals(
             sigma, case.sigma_torque, sigma_q0=0.7 * sigma, sigma_v0=max(sigma / 0.02, 0.02 * case.scales.speed)
         )
-        self.scan_fitter = Fitter(plant, self.short, self.r)
-        self.fitter = Fitter(plant, self.long, self.r)
+        self.scan_fitter = Fitter(plant, self.short, self.r, self.deadline.passed)
+        self.fitter = Fitter(plant, self.long, self.r, self.deadline.passed)
         groups = sorted({conditions[r] for r in train})
         if len(groups) >= 3:
             self.fold_of = np.array([groups.index(conditions[r]) for r in self.long.run])

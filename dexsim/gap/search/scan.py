@@ -114,7 +114,7 @@ class JointLosses(JointHypotheses):
         with self._fix(trial.members):
             for number in folds:
                 on = self.fold_of != number
-                fitter = Fitter(self.case.plant, subset(self.long, on), self.r)
+                fitter = Fitter(self.case.plant, subset(self.long, on), self.r, self.deadline.passed)
                 rows = on[self.fitter.window]
                 known = {key: v[rows] for key, v in slopes_of(f).items()}
                 x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
@@ -177,7 +177,7 @@ class JointLosses(JointHypotheses):
         parts = dict(zip(np.unique(self.fold_of).tolist(), trial.folds, strict=False))
         for k, (rest, left) in enumerate(self.folded):
             r = Residuals(self.r.sigma_q, self.r.sigma_torque)
-            fitter = Fitter(plant, plant.windows(None, rest, span=self.span), r)
+            fitter = Fitter(plant, plant.windows(None, rest, span=self.span), r, self.deadline.passed)
             judge = Fitter(plant, plant.windows(None, left, span=self.span), Residuals(self.r.sigma_q))
             with self._fix(trial.members):
                 starts = np.stack([trial.fit.x, parts.get(k, trial.fit.x)])

@@ -292,7 +292,7 @@ class JointSelection(JointScan):
     def plain(self) -> tuple[list[Param], np.ndarray] | None:
         """The plain model of this joint (`baseline.fitted`), fitted once."""
         if not hasattr(self, "_plain"):
-            self._plain = baseline.fitted(self.case, self.train, self.span, self.seed)
+            self._plain = baseline.fitted(self.case, self.train, self.span, self.seed, self.deadline.passed)
         return self._plain
 
     def _from_plain(self, current: Trial) -> Trial:
@@ -624,7 +624,7 @@ class JointSearch(JointSelection):
         plant = self.whole
         whole = plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, huber=max(self.r.huber, 3.0))
-        fitter = Fitter(plant, whole, r)
+        fitter = Fitter(plant, whole, r, self.deadline.passed)
         params = trial.fit.params
         with self._fix(trial.members, plant):
             here = fitter.residuals(params, trial.fit.x[None])[0]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
@@ -49,9 +50,12 @@ class Pad:
         return self.runs[0].name
 
 
+SEARCHING = 0.5  # of a limit of time: no pad's search begins later
+
+
 class Touch(Steps):
     """The touch of all recordings. held: names of those kept out of the fit; allowed: effects that are considered, None
-    for all."""
+    for all; limit: of time."""
 
     def __init__(
         self,
@@ -61,8 +65,10 @@ class Touch(Steps):
         seed: int = 0,
         allowed: set[str] | None = None,
         progress: Callable[[int, int, str], None] | None = None,
+        limit: TimeLimit | None = None,
     ):
         self.m, self.held, self.seed, self.allowed, self.progress = m, held, seed, allowed, progress
+        self.limit = limit or TimeLimit(None)
         self.recordings = [r for r in recordings if r.tactile is not None]
         self.sensors = m.sensors
         contact = {r.path.name: s for r in recordings if (s := stretches(r))}
@@ -103,6 +109,10 @@ class Touch(Steps):
     def search(self) -> None:
         """Which effects each pad has."""
         for i, pad in enumerate(self.pads):
+            if pad.search is not None and self.limit.spent(SEARCHING):
+                pad.search = None
+                self.limit.leave_out(f"the {pad.name}'s pad is not searched")
+                continue
             if self.progress:
                 self.progress(i, len(self.pads), f"touch of the {pad.name}")
             if pad.search is not None:
