@@ -241,8 +241,8 @@ MUTATIONS = (
     Mutation(
         "a search names what removes nothing",
         "dexsim/gap/rules.py",
-        '0.12,\n        "share of the squared error on conditions left out',
-        '0.0,\n        "share of the squared error on conditions left out',
+        '0.12,\n        "share of the squared error on what was left out that',
+        '0.0,\n        "share of the squared error on what was left out that',
         "tests/test_gap_rules.py::test_an_effect_must_remove_a_least_share",
     ),
     Mutation(
@@ -255,15 +255,15 @@ MUTATIONS = (
     Mutation(
         "a touch effect that removes nothing is named",
         "dexsim/gap/rules.py",
-        '0.12,\n        "share of the squared error on presses left out',
-        '0.0,\n        "share of the squared error on presses left out',
+        '0.12,\n        "share of the squared error on what was left out that',
+        '0.0,\n        "share of the squared error on what was left out that',
         "tests/test_gap_rules_touch.py::test_a_touch_effect_must_remove_a_least_share",
     ),
     Mutation(
         "inverse dynamics name what removes nothing",
         "dexsim/gap/rules.py",
-        '0.12,\n        "of the squared residual on the quarters left out',
-        '0.0,\n        "of the squared residual on the quarters left out',
+        '0.12,\n        "share of the squared error on what was left out that',
+        '0.0,\n        "share of the squared error on what was left out that',
         "tests/test_gap_inverse.py::test_further_effects_are_named_one_after_another",
     ),
     Mutation(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import time
 from types import SimpleNamespace
@@ -315,7 +316,7 @@ def test_a_hanging_driver_is_relaxed_by_the_watchdogs_thread(made):
 
     def hang(hand, now):
         if hand.begun and now > hand.begun + 0.2 and not held:
-            time.sleep(0.8)
+            time.sleep(1.2)
             held.append((now, hand.clock.now()))
 
     hand, loop = play(
@@ -417,13 +418,16 @@ def test_a_killed_loop_leaves_its_finished_chunks(tmp_path):
     path = tmp_path / "killed.mcap"
     p = multiprocessing.get_context("fork").Process(target=record_for_ever, args=(path,))
     p.start()
-    while not path.exists():
-        time.sleep(0.01)
-    time.sleep(1.7)
+    limit, finished = time.monotonic() + 60, 0.0
+    while finished < 0.4:  # s of whole chunks, however busy the machine is
+        assert time.monotonic() < limit
+        time.sleep(0.1)
+        with contextlib.suppress(UserError):
+            finished = read(path, audit=False).duration
     p.kill()
     p.join()
     r = read(path, audit=False)
-    assert r.duration > 0.4, "all but the last half second or so"
+    assert r.duration >= finished, "all but the last half second or so"
     q = r.states.position.value[:, 0]
     np.testing.assert_allclose(q, np.arange(len(q)) * 1e-3, atol=1e-9)
     assert any(f.kind == "damage" for f in r.findings), "and it says that the end is missing"

@@ -577,11 +577,11 @@ def test_more_sockets_than_there_is_room_for_end_nothing(view, monkeypatch):
     assert loop.is_alive()
     for s in (*raw, *full):
         s.close()
-    limit = time.monotonic() + 15
+    limit = time.monotonic() + 60
     while status(view.port) != 101 or view.gate.clients > 5:
         assert time.monotonic() < limit
         time.sleep(0.1)
-    steps, limit = view.steps, time.monotonic() + 10
+    steps, limit = view.steps, time.monotonic() + 60
     while view.steps == steps and time.monotonic() < limit:
         time.sleep(0.02)
     assert loop.is_alive() and view.steps > steps
@@ -599,7 +599,7 @@ def test_a_picture_that_fails_costs_a_picture_and_a_fault_that_stays_is_told(vie
         draw(panels_too)
 
     monkeypatch.setattr(view, "_draw", failing)
-    limit = time.monotonic() + 20
+    limit = time.monotonic() + 60
     while len(calls) <= 3 and time.monotonic() < limit:
         view.run(seconds=0.5)
     assert len(calls) > 3

@@ -118,7 +118,7 @@ def test_the_first_that_ends_well_counts_and_a_gpu_joins_after_its_diagnosis(tmp
     start = time.perf_counter()
     assert (
         one.first([wait(30), wait(0.1, 1), wait(0.3)], 20.0) == 2
-        and time.perf_counter() - start < 10
+        and time.perf_counter() - start < 25
         and not one.running
     )
     assert (
