@@ -8,7 +8,8 @@
 # The packages are those of locks/, checked by their hashes; the newest that pyproject.toml allows: make train LOCK=
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
-	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && { echo $$p; break; }; done)
+	command -v $$p >/dev/null 2>&1 && \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && { echo $$p; break; }; done)
 VENV ?= .venv
 LOCK ?= locks
 PY := $(VENV)/bin/python
@@ -64,8 +65,10 @@ $(VENV)/.installed-docs: pyproject.toml $(wildcard locks/docs.txt) | $(PY)
 	@touch $@ $(VENV)/.installed
 
 $(PY):
-	@test -n "$(PYTHON)" || { echo "error: dexsim needs Python 3.11 or newer; none found (PYTHON=/path/to/python names one)"; exit 1; }
+	@test -n "$(PYTHON)" || \
+		{ echo "error: dexsim needs Python 3.11 or newer; none found (PYTHON=/path/to/python names one)"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: dexsim needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V)"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || \
-		{ rm -rf $(VENV); echo "error: $(PYTHON) cannot make a virtual environment (Debian, Ubuntu: apt-get install python3-venv)"; exit 1; }
+		{ rm -rf $(VENV); \
+		  echo "error: $(PYTHON) cannot make a virtual environment (Debian, Ubuntu: apt-get install python3-venv)"; exit 1; }

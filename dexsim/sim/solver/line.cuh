@@ -1,5 +1,5 @@
-// Part 3 of 3: the search along a direction, the loop of Newton's iterations around it, and what is left behind. Formulas and
-// decisions: mujoco_warp's _linesearch_iterative_kernel and _solve_done.
+// Part 3 of 3: the search along a direction, the loop of Newton's iterations around it, and what is left behind.
+// Formulas and decisions: mujoco_warp's _linesearch_iterative_kernel and _solve_done.
 
 struct Point { float cost, slope, curve; };  // of the cost along the search direction, less the cost at its start
 
@@ -284,7 +284,8 @@ for (;; ++iteration) {
     const float grad_dot = update_gradient();
     if (iteration) {
         const float improved = inertia_scale * improvement;
-        if (alpha == 0.0f || (improved > 0.0f && improved < tolerance) || inertia_scale * sqrtf(grad_dot) < tolerance) break;
+        if (alpha == 0.0f || (improved > 0.0f && improved < tolerance) ||
+            inertia_scale * sqrtf(grad_dot) < tolerance) break;
     }
     update_search();  // what follows is for the next iteration, and for the last criterion
     if (iteration) {

@@ -1,7 +1,7 @@
 // Part 1 of 3 of the function that solves one world (see source.py): the lanes' exchange, and what the world is.
 //
-// Lane j < NV has dof j: column j of the inertia matrix, its dry friction (a row of the constraints by itself), its entries
-// of all vectors. The other rows, limits and contacts, lie in shared memory, their Jacobian dense.
+// Lane j < NV has dof j: column j of the inertia matrix, its dry friction (a row of the constraints by itself), its
+// entries of all vectors. The other rows, limits and contacts, lie in shared memory, their Jacobian dense.
 
 constexpr int NV = $NV, STRIDE = $STRIDE, ROWS = $ROWS, SIZE = $SIZE;
 constexpr int SATISFIED = $SATISFIED, QUADRATIC = $QUADRATIC, LINEARNEG = $LINEARNEG, LINEARPOS = $LINEARPOS;
