@@ -46,11 +46,19 @@ class Forked:
     def returncode(self) -> int | None:
         return self._process.exitcode
 
-    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
-        """What it printed. Raises TimeoutExpired after `timeout` s."""
+    def wait(self, timeout: float | None = None) -> int:
+        """Its status. Raises TimeoutExpired after `timeout` s."""
         self._process.join(timeout)
         if self._process.exitcode is None:
             raise subprocess.TimeoutExpired(str(self._process), timeout)
+        return self._process.exitcode
+
+    def terminate(self) -> None:
+        self._process.terminate()
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """What it printed. Raises TimeoutExpired after `timeout` s."""
+        self.wait(timeout)
         out, err = (path.read_text() if path.exists() else "" for path in self._texts)
         return out, err
 
@@ -64,6 +72,12 @@ def run(module: str, *arguments: str, timeout: float = 600.0) -> subprocess.Comp
         os.killpg(program.pid, 9)
         raise
     return subprocess.CompletedProcess([module, *arguments], program.returncode, out, err)
+
+
+def script(path: str, *arguments: str) -> None:
+    """What `python path arguments` does; for `Forked`."""
+    sys.argv = [path, *arguments]
+    runpy.run_path(path, run_name="__main__")
 
 
 def _program(module: str, arguments: tuple[str, ...]) -> None:

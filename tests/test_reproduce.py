@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -605,8 +606,9 @@ def test_a_sitting_is_shared_by_all_rows(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_row_end_to_end(tmp_path):
-    """Train, judge in both worlds, write the table, on the CPU with a tiny budget."""
+def test_a_row_end_to_end(tmp_path, monkeypatch, capsys):
+    """Train, judge in both worlds, write the table, on the CPU with a tiny budget: first in forks, then as a shell
+    would."""
     argv = [
         sys.executable,
         "-m",
@@ -623,9 +625,15 @@ def test_a_row_end_to_end(tmp_path):
         "agent.num_steps_per_env=8",
         "agent.algorithm.num_mini_batches=2",
     ]
-    done = subprocess.run(argv, capture_output=True, text=True, cwd=ROOT, timeout=900)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(done.stdout.splitlines()[-1])["missing"] == 0
+
+    def begun(command, env, cwd, **kw):
+        return forked.Forked(forked.script, *command[command.index(sys.executable) + 1:], cwd=cwd, env=env)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "Popen", begun)
+        patch.setattr(subprocess, "run", lambda *a, **kw: SimpleNamespace(returncode=begun(*a, **kw).wait(600)))
+        assert command.main(argv[3:]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["missing"] == 0
     table, ours = (json.loads((tmp_path / name).read_text())["rows"] for name in ("rotation.json", "rotation_own.json"))
     assert table["full"]["simulation"]["steps"] == [32]  # one iteration of 8 steps in 4 worlds
     pack.main([f"out={tmp_path}", f"into={tmp_path / 'state'}"])
