@@ -26,7 +26,7 @@ from tests import hands
 def claw(tmp_path_factory) -> Hand:
     """Four fingers, the thumb first, pads of 8 x 6 taxels."""
     place = tmp_path_factory.mktemp("claw")
-    import_hand(hands.write(place / "robot"), place / "hand", Settings(pads=(8, 6)), picture=False)
+    import_hand(hands.write(place / "robot"), place / "hand", Settings(pads=(8, 6), drops=0), picture=False)
     return load_hand(place / "hand")
 
 

@@ -21,14 +21,22 @@ from dexsim.cli import stable_grasps
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.hand.places import places
-from dexsim.import_hand import command, geometry, moves, poses, shapes, taxels
+from dexsim.import_hand import command, drop_region, geometry, importing, moves, poses, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
 from dexsim.tactile.layout import hand_layout
-from dexsim.tasks import make_fingertip_grasps
+from dexsim.tasks import held_drops, make_fingertip_grasps
 from dexsim.tasks.reach import Reach
 from dexsim.tasks.stable_grasps import GraspSet
 from tests import hands
 from tests.made_hand import made_hand
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nothing_dropped():
+    """The search for where objects are held, which takes half a minute, has a test of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importing, "DROPS", 0)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -469,6 +477,86 @@ def test_absurd_figures_are_named(one_start, tmp_path):
     assert "link 'ring_far': inertia" in lines and "too small" in lines
 
 
+def test_the_best_place_of_drops_is_in_the_middle_of_those_held():
+    rng = np.random.default_rng(5)
+    place = rng.uniform([0.0, -0.045], [0.09, 0.045], (256, 2))
+    middle, start = np.array([0.06, 0.01]), np.array([0.03, -0.02])
+    held = np.linalg.norm(place - middle, axis=1) < 0.03
+    found = held_drops.Drops(place, held).best(1.0, start)
+    assert np.linalg.norm(found - middle) < 0.012
+    assert np.linalg.norm(found - start) < np.linalg.norm(middle - start)  # of those as good, the nearest to the start
+    half = held_drops.Drops(place[:128], held[:128]) + held_drops.Drops(place[128:], held[128:])
+    np.testing.assert_array_equal(half.best(1.0, start), found)
+    for alike in (np.ones(256, bool), np.zeros(256, bool)):  # nothing speaks for another
+        np.testing.assert_array_equal(held_drops.Drops(place, alike).best(1.0, start), start)
+    spread = held_drops.scattered(middle, 0.02, 64, seed=3).numpy() - middle
+    counts, *_ = np.histogram2d(*spread.T, bins=8, range=[[-0.02, 0.02]] * 2)
+    assert (counts == 1).all()
+
+
+@pytest.mark.slow
+def test_where_objects_are_held_is_found(claw, tmp_path, monkeypatch):
+    """From a place 45 mm beside the hand's middle, over no finger, back to where it holds them."""
+    monkeypatch.setattr(drop_region, "WORLDS", 32)
+    middle = places(load_hand(claw)).catch
+    wrong = shutil.copytree(claw, tmp_path / "wrong")
+    data = yaml.safe_load((wrong / "hand.yaml").read_text())
+    data["places"] = {"catch": [float(middle[0]), float(middle[1]) + 0.045, float(middle[2])]}
+    (wrong / "hand.yaml").write_text(yaml.safe_dump(data))
+    found = drop_region.search(wrong, 64)
+    assert found.catch is not None and found.middle is not None and found.drops == 32
+    assert np.linalg.norm(found.catch[:2] - middle[:2]) < 0.02, found
+    assert found.moved > 0.025 and found.catch[2] == pytest.approx(middle[2], abs=0.005)
+    assert found.held > 20 and found.middle < 10, found
+
+
+def test_where_objects_are_let_fall_is_a_guess_and_a_persons_place_stays(one_start, tmp_path, monkeypatch):
+    found = drop_region.Region(np.array([0.05, 0.004, 0.013]), 60, 64, 0.01, 50, 0.006)
+    path = hands.write(tmp_path / "robot")
+    monkeypatch.setattr(drop_region, "search", lambda folder, count: found)
+    result = import_hand(path, tmp_path / "hand", Settings(pads=None, drops=96), picture=False)
+    assert "places.catch" in result.hand["guessed"]
+    np.testing.assert_allclose(places(load_hand(tmp_path / "hand")).catch, found.catch, atol=1e-4)
+    assert result.lines[-1] == (
+        "drops    60 of 64 objects let fall within 10 mm of (50 4) mm are held, 6 mm from the middle of the cupped"
+        " pose, where 50 are"
+    )
+    file = tmp_path / "hand" / "hand.yaml"
+    text = file.read_text()
+    at = text.index("catch: [")
+    file.write_text(text[:at] + "catch: [0.07, 0.01, 0.02]" + text[text.index("]", at) + 1 :])
+    monkeypatch.setattr(drop_region, "search", None)
+    result = import_hand(path, tmp_path / "hand", Settings(pads=None, drops=96), picture=False)
+    assert "places.catch" in result.corrected and "places.catch" not in result.hand["guessed"]
+    np.testing.assert_allclose(places(load_hand(tmp_path / "hand")).catch, [0.07, 0.01, 0.02])
+
+
+def test_a_hand_that_holds_nothing_keeps_the_place_of_its_cupped_pose(one_start, tmp_path, monkeypatch):
+    none = drop_region.Region(None, 2, 48, 0.012)
+    monkeypatch.setattr(drop_region, "search", lambda folder, count: none)
+    path = hands.write(tmp_path / "robot")
+    result = import_hand(path, tmp_path / "hand", Settings(pads=None, drops=96), picture=False)
+    assert result.lines[-1].startswith("check:   2 of 48 objects let fall where the cupped pose tells were held")
+    assert "places" not in result.hand and "places.catch" not in result.hand["guessed"]
+
+
+def test_a_base_without_mass_is_said_to_need_none(one_start, tmp_path):
+    path = hands.write(tmp_path / "robot")
+    plain = import_hand(path, tmp_path / "plain", Settings(pads=None), picture=False)
+    assert not [line for line in plain.lines if line.startswith("no mass")]
+    path.write_text(path.read_text().replace('mass value="0.3"', 'mass value="0"', 1))
+    lines = import_hand(path, tmp_path / "hand", Settings(pads=None), picture=False).lines
+    assert "no mass: 'base' (the base is held fast, its mass never counts)" in lines
+    heavy, light = (load_hand(tmp_path / name).spec().compile() for name in ("plain", "hand"))
+    data = [mujoco.MjData(m) for m in (heavy, light)]
+    for m, d in zip((heavy, light), data, strict=True):
+        for _ in range(50):
+            mujoco.mj_step(m, d)
+    assert np.abs(data[0].qpos).max() > 1e-3
+    # the mass enters the solver's tolerance alone
+    np.testing.assert_allclose(data[0].qpos, data[1].qpos, atol=1e-6)
+
+
 def test_taxels_from_a_csv_and_those_inside_the_finger(claw, one_start, tmp_path):
     path = hands.write(tmp_path / "robot")
     normals = {f.name: np.array(f.normal) for f in load_hand(claw).fingers}
@@ -525,6 +613,9 @@ def test_check_tells_a_joint_that_opens_where_it_should_close(claw, tmp_path, ca
         (["a.urdf", "b.urdf", "out=x"], "2 given: a.urdf, b.urdf"),
         (["a.urdf", "out=x", "pads=8"], "pads=8: must be ROWSxCOLUMNS"),
         (["a.urdf", "out=x", "effort=-1"], "effort=-1: must be a number from 0.001"),
+        (["a.urdf", "out=x", "drops=-1"], "drops=-1: must be a whole number from 0 to 100000"),
+        (["a.urdf", "out=x", "drops=3.5"], "drops=3.5: must be a whole number"),
+        (["a.urdf", "out=x", "drops=100001"], "drops=100001: must be a whole number"),
         (["a.urdf", "out=x", "coupled=maybe"], "coupled=maybe: must be refuse or independent"),
         (["a.urdf", "out=x", "colour=red"], "'colour=red': no such setting"),
         (["a.urdf", "out=x"], "a.urdf does not exist"),
@@ -535,6 +626,18 @@ def test_arguments(argv, said, tmp_path, monkeypatch):
     with pytest.raises(UserError) as error:
         command.main(argv)
     assert said in str(error.value) and not list(tmp_path.iterdir())
+
+
+def test_check_of_the_mirror_image(claw, tmp_path, capsys, monkeypatch):
+    shown = []
+    monkeypatch.setattr(moves, "_show", lambda hand, out, seconds, film: shown.append(hand) or [])
+    for k, mirror in enumerate(("false", "true")):
+        assert moves.main([str(claw), f"out={tmp_path / str(k)}", f"hand_mirror={mirror}"]) == 0
+    plain, mirrored = capsys.readouterr().out.split("joint  ")[1:]
+    assert plain == mirrored  # joint angles keep their meaning
+    assert [hand.mirror for hand in shown] == [False, True]
+    with pytest.raises(UserError, match="hand_mirror=left: must be true or false"):
+        moves.main([str(claw), f"out={tmp_path / 'x'}", "hand_mirror=left"])
 
 
 @pytest.mark.slow

@@ -22,14 +22,15 @@ class Places:
 
 def places(hand: Hand) -> Places:
     """Those of the file, mirrored and scaled with the hand; what it leaves out from the cupped pose: on the palm, 70 %
-    of the way along the fingers to the tips of those that the opposing ones press against (the xHand's is there)."""
+    of the way along the fingers to the tips of those that the opposing ones press against (the xHand's is there).
+    `dexsim import-hand` searches for `catch` from there (`dexsim.tasks.held_drops`)."""
     given = hand.file.places
     said = np.array([1.0, -1.0 if hand.mirror else 1.0, 1.0]) * hand.scale
     tips = fingertips(hand, hand.pose("cupped"))
     along, across, _ = tips[list(hand.others)].mean(0)
     floor = np.array([0.7 * along, across, 0.0])
-    if given is None or given.catch is None:
-        floor[2] = _surface(hand, floor)
+    if given is None or None in (given.catch, given.middle, given.beside):
+        floor[2] = surface(hand, floor)
     out = {}
     for name in ("catch", "middle", "beside"):
         own = getattr(given, name) if given is not None else None
@@ -37,7 +38,7 @@ def places(hand: Hand) -> Places:
     return Places(**out)
 
 
-def _surface(hand: Hand, over: np.ndarray) -> float:
+def surface(hand: Hand, over: np.ndarray) -> float:
     """Height [m] of the palm: the highest that its collision geoms are between its centre and below a point."""
     spec = hand.spec()
     for geom in list(spec.geoms):

@@ -34,11 +34,13 @@ settings (key=default):
   coupled=refuse    joints tied by tendons, mimic or equality: refuse, or independent: a motor for each
   holes=refuse      a fingertip's mesh with a hole: refuse, or hull: take its convex hull
   packages=         folders in which package:// is looked for, separated by commas
+  drops=256         objects let fall, to find where the hand holds them; 0: told from its cupped pose alone
   picture=true      false: do not render
   PLACE=VALUE       any place of hand.yaml, e.g. palm.normal=[0,0,1] poses.cupped.j1=0.8 fingers.thumb.closes=[1,-1]
 """
-KEYS = ("out", "name", "palm", "pads", "effort", "speed", "density", "coupled", "holes", "packages", "picture")
-PLACES = ("palm.", "poses.", "fingers.", "joints.", "opposing", "handedness", "span", "force")
+MOST_DROPS = 100_000
+KEYS = ("out", "name", "palm", "pads", "effort", "speed", "density", "coupled", "holes", "drops", "packages", "picture")
+PLACES = ("palm.", "poses.", "fingers.", "joints.", "places.", "opposing", "handedness", "span", "force")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -112,6 +114,11 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
     ):
         if given.get(key):
             setattr(out, key, _number(key, given[key], low, high, unit))
+    if given.get("drops"):
+        count = given["drops"]
+        if not count.isdecimal() or not count.isascii() or int(count) > MOST_DROPS:
+            raise UserError(f"drops={count}: must be a whole number from 0 to {MOST_DROPS}")
+        out.drops = int(count)
     if given.get("packages"):
         out.packages = [Path(p.strip()).expanduser() for p in given["packages"].split(",")]
         for p in out.packages:

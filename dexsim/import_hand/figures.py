@@ -28,7 +28,7 @@ DAMPING = 0.01  # N m s/rad per N m
 @dataclass
 class Figures:
     """By joint name: effort [N m], speed [rad/s], armature [kg m2], damping [N m s/rad]; guessed: joints whose
-    effort or speed no file says; warnings: one line each."""
+    effort or speed no file says; massless: links that are taken without a mass, and why; warnings: one line each."""
 
     effort: dict[str, float]
     speed: dict[str, float]
@@ -37,6 +37,7 @@ class Figures:
     guessed_effort: list[str] = field(default_factory=list)
     guessed_speed: list[str] = field(default_factory=list)
     guessed_armature: list[str] = field(default_factory=list)
+    massless: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -73,6 +74,7 @@ def check(
                 out.guessed_armature.append(name)
             out.damping[name] = float(m.dof_damping[dof]) or DAMPING * out.effort[name]
     out.warnings += _inertias(m, tree)
+    out.massless = _massless(m, tree)
     return out
 
 
@@ -145,6 +147,23 @@ def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
             out.append(
                 f"link '{name}': its centre of mass lies {1e3 * np.linalg.norm(m.body_ipos[b]):.0f} mm off its shape"
             )
+    return out
+
+
+def _massless(m: mujoco.MjModel, tree: Tree) -> list[str]:
+    """Links with a shape and no mass that simulation takes as they are: the palm, which never moves (its base path is
+    gravity's), and what is fixed to a moving link, which carries it."""
+    out = []
+    for b in range(1, m.nbody):
+        if m.body_mass[b] > 0 or m.body_jntnum[b] or not _under(m, b, tree.palm) or not geometry.solid(m, b):
+            continue
+        on = b
+        while on != tree.palm and not m.body_jntnum[on]:
+            on = int(m.body_parentid[on])
+        why = f"fixed to '{m.body(on).name}', whose mass counts"
+        if on == tree.palm:
+            why = "the base is held fast, its mass never counts"
+        out.append(f"'{m.body(b).name}' ({why})")
     return out
 
 

@@ -17,6 +17,7 @@ from dexsim.import_hand import build, corrections, figures, folder, frame, geome
 from dexsim.import_hand.corrections import Corrections
 from dexsim.import_hand.text import yaml_text as hand_text
 
+DROPS = 256  # objects let fall to find where they are held: some 40 s of one core, with the trial
 SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's stiffness where nothing is known
 
 
@@ -24,8 +25,8 @@ SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's
 class Settings:
     """packages: where package:// is looked for; palm: body to take for the palm; coupled: "refuse" or "independent";
     density: kg/m3 of links without inertia; effort N m, speed rad/s: of joints whose file says none; pads: (rows,
-    columns), None for none, or a CSV file; holes: "refuse" or "hull"; name of the hand; said: places of hand.yaml and
-    their values."""
+    columns), None for none, or a CSV file; holes: "refuse" or "hull"; drops: objects let fall to find where the hand
+    holds them, 0: its cupped pose alone tells; name of the hand; said: places of hand.yaml and their values."""
 
     packages: Sequence[Path] = ()
     palm: str | None = None
@@ -35,6 +36,7 @@ class Settings:
     speed: float | None = None
     pads: tuple[int, int] | Path | None = (8, 6)
     holes: str = "refuse"
+    drops: int = field(default_factory=lambda: DROPS)
     name: str | None = None
     said: dict[str, Any] = field(default_factory=dict)
 
@@ -120,6 +122,8 @@ def import_hand(
             f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2"
             " per N m"
         )
+    if known.massless:
+        tell(f"no mass: {', '.join(known.massless)}")
     for text in known.warnings:
         tell(f"check:   {text}")
 
@@ -158,6 +162,9 @@ def import_hand(
                 (stage / f"skin_{finger}.obj").write_text(build.hull_obj(skin), encoding="ascii")
         (stage / "servo.yaml").write_text(_servo(name, hand), encoding="utf-8")
         (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+        if settings.drops and not fixes.has("places.catch"):
+            _drop_region(stage, hand, settings.drops, tell)
+            (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         if picture:
             _picture(stage, tell)
         else:
@@ -455,6 +462,29 @@ def _loads(stage: Path) -> Any:
         return load_hand(stage)
     except UserError as error:  # the name of the folder that is only being written helps nobody
         raise UserError(str(error).replace(str(stage / folder.HAND), folder.HAND).replace(str(stage), ".")) from None
+
+
+def _drop_region(stage: Path, hand: dict[str, Any], drops: int, tell: Callable[[str], None]) -> None:
+    """Search for where objects are let fall, and write it into the content of hand.yaml, as a guess."""
+    from dexsim.import_hand import drop_region
+
+    try:
+        found = drop_region.search(stage, drops)
+    except UserError as error:
+        tell(f"check:   nothing could be let fall into it, to find where it is held: {error}")
+        return
+    if found.catch is None:
+        tell(f"check:   {found.held} of {found.drops} objects let fall where the cupped pose tells were held, and no"
+             " more elsewhere: see the picture")  # fmt: skip
+        return
+    hand["places"] = (hand.get("places") or {}) | {"catch": _list(np.round(found.catch, 4))}
+    hand["guessed"] = sorted([*hand["guessed"], "places.catch"], key=_rank(hand))
+    x, y = 1e3 * found.catch[:2]
+    than = "the middle of the cupped pose"
+    if found.middle is not None:
+        than = f"{1e3 * found.moved:.0f} mm from {than}, where {found.middle} are"
+    tell(f"drops    {found.held} of {found.drops} objects let fall within {1e3 * found.within:.0f} mm of ({x:.0f}"
+         f" {y:.0f}) mm are held, {than}")  # fmt: skip
 
 
 def _picture(stage: Path, tell: Callable[[str], None]) -> None:

@@ -16,11 +16,12 @@ from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import folder, picture
 from dexsim.import_hand.frame import tip_at
 
-USAGE = """usage: dexsim import-hand check FOLDER [out=FOLDER] [seconds=1] [film=true]
+USAGE = """usage: dexsim import-hand check FOLDER [out=FOLDER] [seconds=1] [film=true] [hand_mirror=true]
 
 Move each joint of a hand through its range, from the open pose and back, and say what it does: how far it takes its
 fingertip, whether a joint that should close the finger does, and where links touch. Writes check.png, each joint at
-both its limits; with film=true also check.mp4 (seconds: of each joint's move).
+both its limits; with film=true also check.mp4 (seconds: of each joint's move). FOLDER may be a hand that comes with
+dexsim (xhand; then with out=); hand_mirror=true checks its mirror image.
 """
 STEPS = 25  # poses each way
 RATE = 12  # pictures a second
@@ -97,11 +98,11 @@ def main(argv: Sequence[str]) -> int:
     if not argv or any(a in ("-h", "--help", "help") for a in argv):
         print(USAGE, end="")
         return 0 if argv else 2
-    where, given = argv[0], {"out": "", "seconds": "1", "film": "false"}
+    where, given = argv[0], {"out": "", "seconds": "1", "film": "false", "hand_mirror": "false"}
     for text in argv[1:]:
         key, equals, value = text.partition("=")
         if not equals or key not in given:
-            raise UserError(f"'{text}': expected out=FOLDER, seconds=NUMBER or film=true")
+            raise UserError(f"'{text}': expected out=FOLDER, seconds=NUMBER, film=true or hand_mirror=true")
         given[key] = value
     try:
         seconds = float(given["seconds"])
@@ -109,7 +110,9 @@ def main(argv: Sequence[str]) -> int:
         seconds = 0.0
     if not 0.2 <= seconds <= 20:
         raise UserError(f"seconds={given['seconds']}: must be a number from 0.2 to 20, of each joint's move")
-    hand = load_hand(where)
+    if given["hand_mirror"] not in ("true", "false"):
+        raise UserError(f"hand_mirror={given['hand_mirror']}: must be true or false")
+    hand = load_hand(where, given["hand_mirror"] == "true")
     out = Path(given["out"] or hand.folder).expanduser()
     film = given["film"] == "true"
     outputs.claim(out, "out=", folder.SHOWN[: 1 + film])

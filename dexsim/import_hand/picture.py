@@ -1,4 +1,5 @@
-"""The picture of a hand that was read: palm's frame, joints and tips, open and cupped, collision shapes, pads."""
+"""The picture of a hand that was read: palm's frame, joints and tips, where objects are let fall, open and cupped,
+collision shapes, pads."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from dexsim import files
 from dexsim.hand import Hand
+from dexsim.hand.places import places
 from dexsim.tactile.layout import load_layout
 from dexsim.view.stills import Shot, render
 
@@ -84,6 +86,8 @@ def draw(hand: Hand, path: Path) -> None:
         if k < 6:
             _frame(axes, shot, 0.35 * radius)
             _tips(axes, shot, hand, model, d)
+        if k < 3:
+            _catch(axes, shot, hand)
         if k == 0:
             _joints(axes, shot, hand, model, d)
         if k > 6:
@@ -104,6 +108,13 @@ def _frame(axes: Any, shot: Shot, length: float) -> None:
             continue
         axes.annotate("", ends[k + 1], ends[0], arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8})
         axes.text(*ends[k + 1], name, fontsize=7, color=colour, weight="bold", clip_on=True)
+
+
+def _catch(axes: Any, shot: Shot, hand: Hand) -> None:
+    """A cross on the palm where objects are let fall over it."""
+    at = shot.project(places(hand).catch[None])[0]
+    axes.plot(*at, "x", ms=7, mew=1.8, color="#e64bd0")
+    axes.text(at[0] + 6, at[1] + 4, "catch", fontsize=7, color="#e64bd0", weight="bold", clip_on=True)
 
 
 def _tips(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData) -> None:
