@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("chain")
-    assert import_hand([str(hands.write(place / "robot")), f"out={place / 'hand'}", "drops=64"]) == 0
+    assert import_hand([str(hands.write(place / "robot")), f"out={place / 'hand'}", "drops=0"]) == 0
     assert (place / "hand" / "picture.png").stat().st_size > 20_000
     return place / "hand"
 
