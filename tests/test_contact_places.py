@@ -28,10 +28,23 @@ def poses_of(model: mujoco.MjModel, cases: list[dict]) -> bench.Poses:
     )
 
 
+def neighbours(poses: bench.Poses, n: int) -> bench.Poses:
+    """Each pose and n more whose numbers differ from its by at most a unit in the last place of a float32: what another
+    rounding makes of the first is what this one makes of some of these."""
+    rng = np.random.default_rng(0)
+    out = poses[np.repeat(np.arange(len(poses.pos)), n + 1)]
+    for x in (out.pos, out.rot):
+        near, turn = x.astype(np.float32), rng.integers(-1, 2, x.shape)
+        turn[:: n + 1] = 0
+        x[:] = np.where(turn == 0, near, np.nextafter(near, np.where(turn > 0, np.float32(9), np.float32(-9))))
+    return out
+
+
 @pytest.mark.parametrize("kind", CASES)
-def test_places_that_were_off_are_nearest_points(kind):
+def test_places_that_were_off_are_nearest_points_and_so_are_those_of_poses_beside_them(kind):
     model, _, _ = bench.scene(kind)
-    poses = poses_of(model, CASES[kind])
+    beside = 4
+    poses = neighbours(poses_of(model, CASES[kind]), beside)
     n = len(poses.pos)
     worlds = bench.Worlds(model, n, "cpu", "hand")
     worlds.put(poses)
@@ -40,7 +53,8 @@ def test_places_that_were_off_are_nearest_points(kind):
     for i in range(n):
         want, normal, _ = places.exact(model, poses, i)
         assert abs(dist[i] - want) < 3e-8
-        assert places.error(model, poses, i, normal, at[i]) < 3e-7, CASES[kind][i]
+        off = places.error(model, poses, i, normal, at[i])
+        assert off < (3e-7 if i % (beside + 1) == 0 else 1e-6), (i % (beside + 1), CASES[kind][i // (beside + 1)])
 
 
 @pytest.mark.parametrize("kind", [k for k in CASES if k.split("-")[1] in ("fingertip", "cylinder")])

@@ -65,6 +65,12 @@ def furthest(half: wp.vec3, u: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def stands_off(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3) -> float:
+    """How far [m] the body is beyond the cylinder along the unit direction u: see gjk.separation."""
+    return wp.dot(u, R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * u))) + p - furthest(half, u))
+
+
+@wp.func
 def none() -> Nearest:
     s = Nearest()
     s.g = wp.vec3(FAR, 0.0, 0.0)
@@ -279,14 +285,11 @@ def from_cylinder(
 @wp.struct
 class Way:
     """A way out of an overlap past a feature of the body. found: 0 if there is none. u: unit direction from the
-    cylinder to the body. depth [m]: how far the feature must go along it. placed: whether it says where. q [m]: halfway
-    between the furthest points of both, where these are single."""
+    cylinder to the body. depth [m]: how far the feature must go along it."""
 
     found: int
     u: wp.vec3
     depth: float
-    placed: int
-    q: wp.vec3
 
 
 @wp.func
@@ -295,10 +298,7 @@ def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
     w = Way()
     w.found = 1
     w.u = u
-    y = furthest(half, u)
-    w.depth = wp.dot(u, y - a)
-    w.q = y - 0.5 * w.depth * u
-    w.placed = wp.where(wp.abs(u[2]) > LEVEL and wp.abs(u[0]) + wp.abs(u[1]) > LEVEL, 1, 0)
+    w.depth = wp.dot(u, furthest(half, u) - a)
     return w
 
 
@@ -314,8 +314,6 @@ def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
         below = wp.abs(a[2]) <= half[1]
     w = way(half, u, a)
     w.found = wp.where(below, 1, 0)
-    w.q = a + 0.5 * w.depth * u
-    w.placed = 1
     return w
 
 
@@ -344,15 +342,14 @@ def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
     angle = 0.5 * (low + high)
     w = way(half, wp.cos(angle) * c + wp.sin(angle) * s, a)
     beside = wp.cross(w.u, wp.vec3(0.0, 0.0, 1.0))
+    single = wp.abs(w.u[2]) > LEVEL and wp.abs(w.u[0]) + wp.abs(w.u[1]) > LEVEL
     across = e
     if wp.abs(w.u[2]) <= LEVEL and wp.abs(wp.dot(e, beside)) > LEVEL:
         across = beside  # a whole line of the side is furthest: where that and the edge cross
-        w.placed = 1
+        single = True
     at = wp.dot(furthest(half, w.u) - a, across) / wp.dot(e, across)
-    if w.placed != 0:
-        w.q = a + at * e + 0.5 * w.depth * w.u
-        if at < -LEVEL or at > length + LEVEL:
-            w.found = 0  # past its ends
+    if single and (at < -LEVEL or at > length + LEVEL):
+        w.found = 0  # past its ends
     return w
 
 
@@ -428,16 +425,6 @@ def widest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, first: wp.vec3i
     if most == 0.0:
         return first
     return out
-
-
-@wp.func
-def on_line(u: wp.vec3, x: wp.vec3) -> wp.vec3:
-    """x moved to above the line of the side that is furthest along u; not where u is not square with the axis."""
-    flat = wp.sqrt(u[0] * u[0] + u[1] * u[1])
-    if wp.abs(u[2]) > LEVEL or flat == 0.0:
-        return x
-    beside = wp.vec3(-u[1] / flat, u[0] / flat, 0.0)
-    return x - wp.dot(x, beside) * beside
 
 
 @wp.func

@@ -28,6 +28,10 @@ ROUNDED = wp.constant(2.0e-8)
 """What rounding makes of a distance [m], at most."""
 DOUBT = wp.constant(1.0e-6)
 """A search that gets no nearer, although a corner promises more than this [m], goes on: the bodies may overlap."""
+STEP = wp.constant(1.0e-5)
+"""How far [m] bodies that touch are moved apart to tell where."""
+LEAST = wp.constant(4.0e-9)
+"""A direction by which two cores are further apart by less than this [m] tells nothing new."""
 LOOKS = 24
 """Most looks for a nearer corner. Searches end by themselves; the worst of a million random poses took 17."""
 
@@ -181,6 +185,14 @@ def begin(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.v
 
 
 @wp.func
+def away(p: wp.vec3) -> wp.vec3:
+    """A way out (from A to B) where nothing better is known: along the line of centres."""
+    if wp.dot(p, p) > 0.0:
+        return -wp.normalize(p)
+    return wp.vec3(0.0, 0.0, 1.0)
+
+
+@wp.func
 def outermost(
     a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3
 ) -> int:
@@ -194,9 +206,12 @@ def outermost(
 
 @wp.func
 def enclose(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
-    """A simplex that goes through the origin, with corners added until it has four. One corner alone stays what it
-    is."""
+    """A simplex that goes through the origin, with corners added until it has four."""
     s = simplex
+    if s.n == 1:
+        s.i1 = outermost(a, b, vertex, R, p, away(p), s.p0)
+        s.p1 = difference(a, b, vertex, R, p, s.i1)
+        s.n = 2
     if s.n == 2:
         e = s.p1 - s.p0
         across = wp.cross(e, wp.vec3(1.0, 0.0, 0.0))
@@ -257,6 +272,17 @@ def distance(
     return s
 
 
+@wp.func
+def nearest_of_b(b: Core, vertex: wp.array(dtype=wp.vec3), i: wp.vec3i, l: wp.vec3) -> wp.vec3:
+    """The weighted mean of B's corners named by i (-1: none), in B's frame [m]."""
+    q = l[0] * corner(b, vertex, i[0] >> 16)
+    if i[1] >= 0:
+        q += l[1] * corner(b, vertex, i[1] >> 16)
+    if i[2] >= 0:
+        q += l[2] * corner(b, vertex, i[2] >> 16)
+    return q
+
+
 @wp.struct
 class Crossing:
     """found: 1 if an edge of A lies across an edge of B. q: the point on B's edge; v: from there to A's; both in B's
@@ -313,24 +339,69 @@ def crossing(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: 
 
 
 @wp.func
-def touching(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3) -> wp.vec4:
-    """Normal (from A to B, in B's frame) and distance [m] of cores that touch with a corner, or whose enclosing corners
-    are flat.
+def separation(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3) -> float:
+    """How far apart [m] the cores are along the unit direction u from A to B. No direction's exceeds their distance, or
+    minus their depth if they overlap; that of the best one is it."""
+    i = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
+    return -wp.dot(u, difference(a, b, vertex, R, p, i))
 
-    There the difference of positions has no direction. So A is moved away by a little, along the line of centres, and
-    the distance found is corrected by what that move must have added to it.
+
+@wp.struct
+class Touch:
+    """normal: from A to B; q: B's nearest point [m]; both in B's frame. dist [m]: negative if they overlap. i: names of
+    the nearest corners, as `NarrowPhase.simplex`."""
+
+    normal: wp.vec3
+    dist: float
+    q: wp.vec3
+    i: wp.vec3i
+
+
+@wp.func
+def touching(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, about: wp.vec3) -> Touch:
+    """The contact of cores that are hardly apart or hardly overlap, near the way out `about` (a unit vector).
+
+    The difference of their positions has no direction, and a plane that they lie on both sides of need not go through
+    where they touch. So A is moved out along the way by a little. What of convex bodies is nearest is the same then if
+    the way is among the normals of the place where they touch, and else is off by at most the move times what the way
+    is off: nearest points of a convex body lie no further apart than what they are nearest to. It tells a better way;
+    the best is kept, by `separation`, and moved along the next time.
     """
-    away = wp.vec3(0.0, 0.0, 1.0)
-    if wp.dot(p, p) > 0.0:
-        away = wp.normalize(p)
-    step = float(1.0e-5)
-    for _try in range(3):
-        s = distance(a, b, vertex, R, p + step * away, wp.vec3i(-1, -1, -1), 1.0)
+    t = Touch()
+    t.normal = about
+    t.dist = separation(a, b, vertex, R, p, about)
+    lowest = support(b, vertex, -about)
+    t.q = corner(b, vertex, lowest)
+    t.i = wp.vec3i(support(a, vertex, wp.transpose(R) * about) | (lowest << 16), -1, -1)
+    step = float(STEP)
+    tries = int(0)
+    while tries < 3:  # not known in advance: the search is compiled once
+        out = step * t.normal
+        s = distance(a, b, vertex, R, p - out, wp.vec3i(-1, -1, -1), 1.0)
         d = wp.length(s.v)
         if s.inside == 0 and d > OVERLAP:
-            n = -s.v / d
-            return wp.vec4(n[0], n[1], n[2], d + step * wp.dot(n, away))
-        step = 10.0 * step
-    n = -away
-    i = support(a, vertex, wp.transpose(R) * n) | (support(b, vertex, -n) << 16)
-    return wp.vec4(n[0], n[1], n[2], -wp.dot(n, difference(a, b, vertex, R, p, i)))
+            t.i = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
+            t.q = nearest_of_b(b, vertex, t.i, wp.vec3(s.l0, s.l1, s.l2))
+            v = s.v
+            c = crossing(a, b, vertex, R, p - out, s)
+            if c.found != 0:
+                t.q = c.q
+                v = c.v
+                d = wp.length(v)
+            # as bodies are, unmoved; where that is not along what the search has, and not by rounding, it is better
+            gap = -v - out
+            ways = wp.where(wp.length(gap - (wp.dot(gap, v) / (d * d)) * v) > ROUNDED, 2, 1)
+            done = int(1)
+            for j in range(ways):
+                u = wp.where(j == 0, -v / d, wp.normalize(gap))
+                apart = separation(a, b, vertex, R, p, u)
+                if apart > t.dist + LEAST:
+                    done = int(0)
+                if apart > t.dist - LEAST:
+                    t.dist = apart
+                    t.normal = u
+            tries += 3 * done
+        else:
+            step = 10.0 * step
+        tries += 1
+    return t

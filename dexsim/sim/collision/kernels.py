@@ -11,9 +11,19 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from dexsim.sim.collision.cylinder import from_cylinder, on_line, rounder
+from dexsim.sim.collision.cylinder import from_cylinder, furthest, rounder, stands_off
 from dexsim.sim.collision.epa import Facet, penetration
-from dexsim.sim.collision.gjk import OVERLAP, crossing, distance, touching
+from dexsim.sim.collision.gjk import (
+    LEAST,
+    OVERLAP,
+    ROUNDED,
+    STEP,
+    away,
+    crossing,
+    distance,
+    nearest_of_b,
+    touching,
+)
 from dexsim.sim.collision.shapes import (
     BOX,
     CAPSULE,
@@ -22,11 +32,12 @@ from dexsim.sim.collision.shapes import (
     SPHERE,
     Core,
     Prism,
-    corner,
     corners,
     radius_of,
-    support,
 )
+
+SHALLOW = wp.constant(3.0e-6)
+"""Of an overlap less deep than this [m], what is nearest is looked for with the bodies moved apart."""
 
 # Each product and sum rounded by itself, as on a CPU. Fused, a cross product of parallel edges is no longer zero but
 # what one of its two products lost by rounding: a direction out of nothing, by which flat simplices were taken to
@@ -229,17 +240,6 @@ def two(pairs: Pairs, mat: Materials, k: int) -> Two:
 
 
 @wp.func
-def nearest_of_b(pairs: Pairs, b: Core, i: wp.vec3i, l: wp.vec3) -> wp.vec3:
-    """The weighted mean of B's corners named by i (-1: none), in B's frame [m]."""
-    q = l[0] * corner(b, pairs.hull, i[0] >> 16)
-    if i[1] >= 0:
-        q += l[1] * corner(b, pairs.hull, i[1] >> 16)
-    if i[2] >= 0:
-        q += l[2] * corner(b, pairs.hull, i[2] >> 16)
-    return q
-
-
-@wp.func
 def add(
     pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3, v: wp.vec3, normal: wp.vec3, dist: float
 ):
@@ -291,7 +291,7 @@ def apart(
         deep[j] = k
         enclosing[j] = wp.where(s.inside != 0, wp.vec4i(s.i0, s.i1, s.i2, s.i3), wp.vec4i(-1, -1, -1, -1))
     elif d < cutoff:
-        q = nearest_of_b(pairs, t.b, names, wp.vec3(s.l0, s.l1, s.l2))
+        q = nearest_of_b(t.b, pairs.hull, names, wp.vec3(s.l0, s.l1, s.l2))
         v = s.v
         c = crossing(t.a, t.b, pairs.hull, t.R, t.p, s)
         if c.found != 0:
@@ -322,16 +322,18 @@ def overlapping(
         f = Facet()
         if corners4[0] >= 0:
             f = penetration(t.a, t.b, pairs.hull, t.R, t.p, corners4)
-        if f.found != 0:
+        if f.found != 0 and f.depth > SHALLOW:
             names = wp.vec3i(f.i0, f.i1, f.i2)
             pairs.simplex[pairs.world[k], home] = names
-            q = nearest_of_b(pairs, t.b, names, wp.vec3(f.l0, f.l1, f.l2))
+            q = nearest_of_b(t.b, pairs.hull, names, wp.vec3(f.l0, f.l1, f.l2))
             add(pairs, mat, out, k, t, q, f.depth * f.normal, f.normal, -f.depth)
         else:
-            h = touching(t.a, t.b, pairs.hull, t.R, t.p)
-            normal = wp.vec3(h[0], h[1], h[2])
-            q = corner(t.b, pairs.hull, support(t.b, pairs.hull, -normal))
-            add(pairs, mat, out, k, t, q, -h[3] * normal, normal, h[3])
+            about = away(t.p)
+            if f.found != 0:
+                about = f.normal
+            h = touching(t.a, t.b, pairs.hull, t.R, t.p, about)
+            pairs.simplex[pairs.world[k], home] = h.i
+            add(pairs, mat, out, k, t, h.q, -h.dist * h.normal, h.normal, h.dist)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
@@ -372,49 +374,66 @@ def beside_cylinder(
     p = wp.transpose(mat_c) * (pairs.geom_xpos[world, other] - pairs.geom_xpos[world, geom])
     cutoff = margin + gap + radius
     home = pairs.slot[geoms[0], geoms[1]]
-    s = from_cylinder(half, b, pairs.hull, R, p, pairs.simplex[world, home], cutoff)
-    pairs.simplex[world, home] = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
-    dist = wp.length(s.g)
+    first = pairs.simplex[world, home]
+    normal = wp.vec3(0.0)
+    middle = wp.vec3(0.0)
+    dist = float(0.0)
+    out_by = wp.vec3(0.0)
+    step = float(STEP)
+    tries = int(0)
+    while tries < 4:  # not known in advance: the search is compiled once
+        s = from_cylinder(half, b, pairs.hull, R, p + out_by, first, wp.where(tries == 0, cutoff, 1.0))
+        d = wp.length(s.g)
+        done = int(0)
+        first = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
+        if tries == 0:
+            pairs.simplex[world, home] = first
+            if d > 0.0:
+                dist = d
+                normal = s.g / d
+                middle = s.x - 0.5 * s.g
+                done = int(1)
+            else:
+                # they overlap, or nearly: the prism and the body, in the body's frame
+                a = Prism()
+                a.half = half
+                to_b = wp.transpose(R)
+                f = Facet()
+                t = distance(a, b, pairs.hull, to_b, -(to_b * p), wp.vec3i(-1, -1, -1), cutoff)
+                if t.inside != 0:
+                    f = penetration(a, b, pairs.hull, to_b, -(to_b * p), wp.vec4i(t.i0, t.i1, t.i2, t.i3))
+                normal = -away(p)
+                if f.found != 0:
+                    normal = R * f.normal
+                    w = rounder(half, b, pairs.hull, R, p, normal, wp.vec3i(f.i0 >> 16, f.i1 >> 16, f.i2 >> 16))
+                    if w.found != 0:
+                        normal = w.u
+                elif wp.length(t.v) > OVERLAP:
+                    normal = -wp.normalize(R * t.v)
+                dist = stands_off(half, b, pairs.hull, R, p, normal)
+                middle = furthest(half, normal) + 0.5 * dist * normal
+        elif d > 0.0:
+            # moved out along a normal of the place where they overlap or touch, they have it there (see gjk.touching)
+            done = int(1)
+            g = s.g - out_by
+            straight = wp.dot(g, s.g) / (d * d)
+            shallow = dist > -SHALLOW
+            ways = wp.where(shallow and wp.length(g - straight * s.g) > ROUNDED, 2, 1)
+            for j in range(ways):
+                u = wp.where(j == 0, s.g / d, wp.normalize(g))
+                along_u = stands_off(half, b, pairs.hull, R, p, u)
+                if along_u > dist + LEAST:
+                    done = int(0)
+                if along_u > dist + wp.where(shallow, -LEAST, LEAST):
+                    dist = along_u
+                    normal = u
+            middle = s.x - out_by - 0.5 * dist * normal
+        else:
+            step = 10.0 * step
+        out_by = (step - wp.min(dist, 0.0)) * normal
+        tries = wp.where(done == 1, 4, tries + 1)
     if dist >= cutoff:
         return
-    middle = s.x - 0.5 * s.g
-    normal = s.g
-    if dist > 0.0:
-        normal = s.g / dist
-    else:
-        # they overlap, or nearly: the prism and the body, in the body's frame
-        a = Prism()
-        a.half = half
-        to_b = wp.transpose(R)
-        f = Facet()
-        t = distance(a, b, pairs.hull, to_b, -(to_b * p), wp.vec3i(-1, -1, -1), cutoff)
-        if t.inside != 0:
-            f = penetration(a, b, pairs.hull, to_b, -(to_b * p), wp.vec4i(t.i0, t.i1, t.i2, t.i3))
-        if f.found != 0:
-            q = nearest_of_b(pairs, b, wp.vec3i(f.i0, f.i1, f.i2), wp.vec3(f.l0, f.l1, f.l2))
-            normal = R * f.normal
-            # the prism's side is a facet, not a line; its other places are as right as any
-            middle = on_line(normal, R * q + p) + 0.5 * f.depth * normal
-            dist = -f.depth
-            w = rounder(half, b, pairs.hull, R, p, normal, wp.vec3i(f.i0 >> 16, f.i1 >> 16, f.i2 >> 16))
-            if w.found != 0:
-                normal = w.u
-                middle = w.q
-                if w.placed == 0:
-                    middle = on_line(w.u, R * q + p) + 0.5 * w.depth * w.u
-                dist = -w.depth
-        elif t.inside == 0 and wp.length(t.v) > OVERLAP:
-            names = wp.vec3i(t.i0, wp.where(t.n > 1, t.i1, -1), wp.where(t.n > 2, t.i2, -1))
-            q = nearest_of_b(pairs, b, names, wp.vec3(t.l0, t.l1, t.l2))
-            dist = wp.length(t.v)
-            normal = -(R * t.v) / dist
-            middle = R * (q + 0.5 * t.v) + p
-        else:
-            h = touching(a, b, pairs.hull, to_b, -(to_b * p))
-            n = wp.vec3(h[0], h[1], h[2])
-            normal = R * n
-            dist = h[3]
-            middle = R * (corner(b, pairs.hull, support(b, pairs.hull, -n)) - 0.5 * h[3] * n) + p
     pos = mat_c * (middle - (0.5 * radius) * normal) + pairs.geom_xpos[world, geom]
     along = mat_c * wp.where(first_is, normal, -normal)
     write(mat, out, pairs.room, geoms, pairs.id[k], world, margin, gap, dist - radius, pos, along)
