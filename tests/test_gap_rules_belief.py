@@ -11,6 +11,7 @@ import numpy as np
 from dexsim.gap.effects import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
+from dexsim.gap.plant.case import quiet_noise
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.search import hypotheses
 from dexsim.gap.search.fit import disbelief
@@ -51,6 +52,22 @@ def test_sensors_have_zeros():
     by = {p.key: p for p in hypotheses._of_the_sensors(case)}
     assert 1.5e-3 < by["zero"].high < 3e-3 and 0.015 < by["effort_zero"].high < 0.03
     assert by["zero"].low == -by["zero"].high and by["effort_zero"].low == -by["effort_zero"].high
+
+
+def restless(loud: float, share: float, speed: float = 0.0) -> float | None:
+    """What `quiet_noise` says of 100 half seconds of a joint that swings slowly, with noise of 1 mrad: in a share of
+    them, here and there, `loud` times as much, and while moving faster by `speed` rad/s."""
+    t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
+    on = (np.arange(5000) // 50 * 37) % 100 < 100 * share
+    way = 0.3 * np.sin(0.4 * t) + np.cumsum(0.01 * speed * on)
+    return quiet_noise([(t, way + noise * np.where(on, loud, 1.0))], 0.0)
+
+
+def test_a_joint_that_rings_is_not_noisy():
+    quiet = restless(8.0, 0.15)
+    assert quiet is not None and np.allclose([quiet, restless(50.0, 0.7) or 0.0], 1e-3, rtol=0.1)
+    assert restless(3.5, 0.15) is None and restless(8.0, 0.07) is None
+    assert restless(8.0, 0.15, speed=1.0) is None  # readings whose times vary are noisier where it moves faster
 
 
 def test_a_belief_weighs_some_samples():

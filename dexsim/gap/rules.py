@@ -981,6 +981,18 @@ class BeliefRules:
         "as `gives` at a radius of 25 mm",
         "test_what_holds_a_joint_gives_a_little",
     )
+    rings: float = _rule(
+        5.0,
+        "x the noise where a joint moves as fast or faster: what it shakes by beyond it is motion, not noise",
+        "of 158 joints (hands, other plants, benches, a real pendulum) only the four that ring meet it and `ringing`",
+        "test_a_joint_that_rings_is_not_noisy",
+    )
+    ringing: float = _rule(
+        0.1,
+        "share of half seconds in which a joint must ring for its noise to be told by the others",
+        "as `rings`",
+        "test_a_joint_that_rings_is_not_noisy",
+    )
     zero: float = _rule(
         2.0,
         "counts by which the zeros of two encoders may differ",

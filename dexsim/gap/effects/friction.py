@@ -97,7 +97,8 @@ class StribeckFriction(Effect):
 
     def variants(self, s: Scales) -> list[Variant]:
         peak = param("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
-        v_s = param("v_s", "stribeck_speed", "set", 0.003 * s.speed, 0.35 * s.speed, 0.1 * s.speed, "rad/s")
+        # up to the fastest that was seen, by which the peak is gone to a third: beyond, it is sliding friction
+        v_s = param("v_s", "stribeck_speed", "set", 0.003 * s.speed, s.peak_speed, 0.1 * s.speed, "rad/s")
         starts = tuple((a * s.tau, b * s.speed) for a in (0.03, 0.08, 0.2, 0.45) for b in (0.02, 0.08, 0.25))
         return [Variant((peak, v_s), starts, laws=(("exponential in speed", (("stribeck_exponent", 1.0),)),))]
 

@@ -19,10 +19,13 @@ from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
 from dexsim.gap.read import Run, local_polynomial
-from dexsim.gap.rules import SEARCH
+from dexsim.gap.rules import BELIEF, SEARCH
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
+BESIDE = 3  # neighbours on each side by which a sample's noise is told
+HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples, of a part of a recording that may ring by itself
+FEW = 2  # parts that may be quieter by accident than what is usual
 REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
 
 
@@ -67,9 +70,19 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
     # steps of an encoder that are not all alike
     if not quantum and np.mean(changes == 0.0) > REPEATS and (changes > 1e-7).any():
         quantum = float(np.quantile(changes[changes > 1e-7], 0.1))
-    if len(x) < 9:
+    if len(x) < 2 * BESIDE + 3:
         return max(quantum / np.sqrt(12), 1e-9), quantum
-    k = 3
+    miss = _misfit(t, x)
+    # a robust mean: what the parabola cannot follow is not noise
+    cut = 4 * np.median(np.abs(miss)) + 1e-12
+    rms = float(np.sqrt(np.mean(np.minimum(miss**2, cut**2))))
+    return max(rms, quantum / np.sqrt(12), 1e-9), quantum
+
+
+def _misfit(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """[S - 2 BESIDE] by what each sample x [S] at t [S] s misses a local cubic through its neighbours without it, of
+    the noise's own size."""
+    k = BESIDE
     index = np.arange(k, len(x) - k)[:, None] + np.r_[-k:0, 1 : k + 1]
     dt = t[index] - t[k:-k, None]
     scale = max(float(np.median(np.diff(t))) * k, 1e-9)
@@ -77,11 +90,33 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
     normal = np.einsum("smd,sme->sde", basis, basis) + 1e-9 * np.eye(4)
     c = np.linalg.solve(normal, np.einsum("smd,sm->sd", basis, x[index])[..., None])[..., 0]
     lever = np.linalg.inv(normal)[:, 0, 0]
-    miss = (x[k:-k] - c[:, 0]) / np.sqrt(1 + lever)
-    # a robust mean: what the parabola cannot follow is not noise
-    cut = 4 * np.median(np.abs(miss)) + 1e-12
-    rms = float(np.sqrt(np.mean(np.minimum(miss**2, cut**2))))
-    return max(rms, quantum / np.sqrt(12), 1e-9), quantum
+    return (x[k:-k] - c[:, 0]) / np.sqrt(1 + lever)
+
+
+def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray]], quantum: float) -> float | None:
+    """Standard deviation of the measurement noise of a joint that rings by itself, from half seconds in which it does
+    not; None where it does not ring. signals: times [S] s and positions [S], of recordings.
+
+    A joint that rings faster than its readings misses any smooth curve as noise does, and sample by sample the two
+    cannot be told apart. But a sensor is not noisier at one time than at another but by how fast it moves (readings'
+    times vary): a joint rings where it is louder by far (`BELIEF.rings`) than where it moves as fast or faster, and
+    does so often (`BELIEF.ringing`)."""
+    levels, speeds = [], []
+    for t, x in signals:
+        if len(x) < 2 * BESIDE + 3:
+            continue
+        miss, mid, q = np.abs(_misfit(t, x)), t[BESIDE:-BESIDE], x[BESIDE:-BESIDE]
+        part = ((mid - mid[0]) / HALF_SECOND).astype(int)
+        for on in (part == k for k in range(part[-1] + 1)):
+            if on.sum() >= FEWEST_SAMPLES:
+                levels.append(max(float(np.median(miss[on])) / 0.6745, quantum / np.sqrt(12), 1e-9))
+                speeds.append(abs(float(np.polyfit(mid[on] - mid[on].mean(), q[on], 1)[0])))
+    level = np.array(levels)[np.argsort(speeds)]
+    # of the parts as fast or faster a few are needed to say what is usual there
+    usual = [np.partition(level[i:], FEW)[FEW] for i in range(len(level) - FEW)]
+    if not usual or np.mean(level[: len(usual)] > BELIEF.rings * np.array(usual)) <= BELIEF.ringing:
+        return None
+    return float(np.median(level[level < 2 * np.quantile(level, 0.1)]))
 
 
 def demand(
@@ -265,6 +300,8 @@ def _case(
     estimates = [noise(run.t, run.q[:, j]) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
+    quiet = quiet_noise([(runs[i].t, runs[i].q[:, j]) for i in told], quantum)
+    sigma = min(sigma, quiet) if quiet is not None else sigma
 
     def series(name: str) -> np.ndarray:
         each = [np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]]) for i in range(len(runs))]
