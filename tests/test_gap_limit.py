@@ -169,8 +169,9 @@ def test_what_is_replayed_ends_with_it():
     assert [w.duration for w in full_model._until(worlds, 1.5)] == [0.5, 1.5]
 
 
-@pytest.mark.parametrize("spent", [0.5, 1 - PLANNING + 0.01])
-def test_no_replay_and_no_plan_in_the_last_moment(spent, clock, monkeypatch):
+@pytest.mark.parametrize("spent, seconds", [(0.5, 200.0), (1 - PLANNING + 0.01, 2000.0), (0.5, 100.0)])
+def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeypatch):
+    """A plan is one call that nothing ends: it is begun where a minute is left."""
     asked = []
 
     def confirm(*_, room, **__):
@@ -181,24 +182,22 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, clock, monkeypatch):
     monkeypatch.setattr(diagnosis, "plan_next", lambda *_: asked.append("plan"))
     drives = object.__new__(Drives)
     settings = SimpleNamespace(replay="mujoco", device="cpu", next_recording=True)
-    limit = TimeLimit(100.0)
+    limit = TimeLimit(seconds)
     w = drives.w = SimpleNamespace(
         limit=limit, runs=[], settings=settings, m=None, readable=[], clock=SimpleNamespace(lap=lambda _: None)
     )
     drives.parts = SimpleNamespace(test=[1], span_test=None)
     drives.outcomes, drives.noise = [], SimpleNamespace(floor=1.0)
     drives._hypotheses = lambda d: []
-    clock[0] = 100 * spent
+    clock[0] = seconds * spent
     drives.confirm(SimpleNamespace(notes=[]))
     diagnosis._next(SimpleNamespace(), w, [])
-    if spent < 1 - PLANNING:
-        assert asked == [pytest.approx(diagnosis.REPLAYING * limit.rest()), "plan"] and not limit.left_out
-    else:
-        assert not asked
-        assert [x.split(" (")[0] for x in limit.left_out] == [
-            "not replayed in the engine that trains",
-            "no next recording is planned",
-        ]
+    replayed, planned = spent < 1 - PLANNING, limit.rest() > diagnosis.PLAN
+    assert planned == (seconds == 200.0)
+    assert asked == [pytest.approx(diagnosis.REPLAYING * limit.rest())] * replayed + ["plan"] * planned
+    said = ["not replayed in the engine that trains"] * (not replayed)
+    said += ["no next recording is planned"] * (not planned)
+    assert [x.split(" (")[0] for x in limit.left_out] == said
 
 
 def test_pads_wait_no_longer_than_half_of_the_limit(clock):

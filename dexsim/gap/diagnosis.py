@@ -79,7 +79,7 @@ def _next(d: Diagnosis, w: Inquiry, outcomes: Sequence[tuple[Case, JointSearch, 
     """What to record next, where that was asked for and there is time for it."""
     if not w.settings.next_recording:
         return
-    if w.limit.spent(1 - PLANNING):
+    if w.limit.rest() < PLAN:
         w.limit.leave_out("no next recording is planned")
         return
     plan_next(d, w.settings, w.m, outcomes, w.readable)
@@ -115,6 +115,7 @@ Answers = list[tuple[JointSearch, Outcome | None]]
 # shares of a limit of time: that the model along the motion may take; that must be left for stand-ins, and for plans of
 # a replay or a recording; and of what is left then the replay's
 MODELLING, STANDING_IN, PLANNING, REPLAYING = 0.2, 0.1, 0.07, 0.5
+PLAN = 60.0  # s that must be left for a plan of the next recording: one call, of 37 s on a busy machine
 MUCH = 20.0  # s of all joints' recordings for each second of a limit: the model along less is not worth a look
 
 
