@@ -21,6 +21,15 @@ def pytest_configure(config) -> None:
             signal.signal(number, signal.SIG_DFL)
 
 
+LONGEST = ("test_reproduce.py", "test_wheel.py", "test_ranks.py", "test_resume.py", "test_soak.py", "test_benchmarks.py")
+
+
+def pytest_collection_modifyitems(items) -> None:
+    """Files with tests of half a minute and more come first: a worker that has done its own takes over the last of
+    another's, and they should be short ones."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 def pytest_collection(session) -> None:
     """Until all is loaded there is no garbage to look for among it."""
     gc.disable()
