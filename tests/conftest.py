@@ -21,7 +21,7 @@ def pytest_configure(config) -> None:
             signal.signal(number, signal.SIG_DFL)
 
 
-LONGEST = ("test_reproduce.py", "test_wheel.py", "test_ranks.py", "test_resume.py", "test_soak.py", "test_benchmarks.py")
+LONGEST = [f"test_{name}.py" for name in ("reproduce", "wheel", "ranks", "resume", "soak", "benchmarks")]
 
 
 def pytest_collection_modifyitems(items) -> None:
