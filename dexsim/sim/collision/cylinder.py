@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dexsim.sim.collision.gjk import DOUBT, GAIN, LOOKS, OVERLAP
+from dexsim.sim.collision.gjk import DOUBT, GAIN, LOOKS, OVERLAP, ROUNDED
 from dexsim.sim.collision.shapes import Core, corner, corners, support
 
 STEPS = 50
@@ -280,6 +280,32 @@ def from_cylinder(
     if least > DOUBT:
         kept.g = wp.vec3(0.0)
     return kept
+
+
+@wp.func
+def beside_side(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, s: Nearest) -> Nearest:
+    """Where the nearest is an edge beside the round side: its point by the edge's own direction.
+
+    Of two positions' difference a short edge is off by 1e-4 rad seen along the axis, and where edge and axis are at a
+    small angle the place goes with that (see gjk.crossing).
+    """
+    if s.n != 2 or s.g[2] != 0.0 or (s.g[0] == 0.0 and s.g[1] == 0.0):
+        return s
+    e = R * (corner(b, vertex, s.i1) - corner(b, vertex, s.i0))
+    flat = e[0] * e[0] + e[1] * e[1]
+    if flat <= 1.0e-6 * wp.dot(e, e):
+        return s
+    t = -(s.p0[0] * e[0] + s.p0[1] * e[1]) / flat
+    x = s.p0 + t * e
+    rho = (s.p0[0] * e[1] - s.p0[1] * e[0]) / flat  # of the edge's line from the axis, in lengths of e seen along it
+    c = rho * wp.vec3(e[1], -e[0], 0.0)
+    g = c - half[0] * wp.normalize(c)
+    if t < 0.0 or t > 1.0 or wp.abs(x[2]) > half[1] or wp.length(g - s.g) > ROUNDED:
+        return s
+    n = s
+    n.x = x
+    n.g = g
+    return n
 
 
 @wp.struct

@@ -11,7 +11,7 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from dexsim.sim.collision.cylinder import from_cylinder, furthest, rounder, stands_off
+from dexsim.sim.collision.cylinder import beside_side, from_cylinder, furthest, rounder, stands_off
 from dexsim.sim.collision.epa import Facet, penetration
 from dexsim.sim.collision.gjk import (
     LEAST,
@@ -383,6 +383,7 @@ def beside_cylinder(
     tries = int(0)
     while tries < 4:  # not known in advance: the search is compiled once
         s = from_cylinder(half, b, pairs.hull, R, p + out_by, first, wp.where(tries == 0, cutoff, 1.0))
+        s = beside_side(half, b, pairs.hull, R, s)
         d = wp.length(s.g)
         done = int(0)
         first = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
