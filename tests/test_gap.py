@@ -20,6 +20,7 @@ from dexsim.gap import command, demo, locate
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
 from dexsim.gap.judge import kept_out
+from dexsim.gap.plant import case as case_of_joint
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build, noise
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
@@ -296,6 +297,26 @@ def test_rms_interval_covers():
     e = np.convolve(rng.standard_normal(len(t)), np.ones(20) / np.sqrt(20), "same")
     value, low, high = kept_out.rms_interval([e**2], [t])
     assert low < 1.0 < high and low < value < high and high - low < 0.3
+
+
+def test_a_joint_that_rings_is_judged_by_its_quiet_noise(monkeypatch):
+    runs = [plant_run("s", 0, 3.0, {})]
+    runs[0].smooth()
+    usual = build(model(), runs)[0].scales
+    for told, sigma in ((None, usual.sigma), (0.1 * usual.sigma, 0.1 * usual.sigma), (2 * usual.sigma, usual.sigma)):
+        monkeypatch.setattr(case_of_joint, "quiet_noise", lambda signals, quantum, told=told: told)
+        assert build(model(), runs)[0].scales.sigma == pytest.approx(sigma, rel=1e-9)
+
+
+def test_a_breakaway_torque_may_last_up_to_the_largest_speed():
+    runs = [plant_run("s", 0, 3.0, {})]
+    runs[0].smooth()
+    scales = build(model(), runs)[0].scales
+    assert scales.peak_speed > 0.7 * scales.speed
+    (variant,) = EFFECTS["stribeck_friction"].variants(scales)
+    (v_s,) = (p for p in variant.params if p.key == "v_s")
+    assert 0.9 * scales.peak_speed <= v_s.high <= 1.5 * scales.peak_speed
+    assert all(v_s.low <= start[1] <= v_s.high for start in variant.starts)
 
 
 def test_catalogue_is_that_of_the_specification():
