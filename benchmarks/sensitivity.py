@@ -1,7 +1,7 @@
 """Which of the figures that decide (`dexsim.gap.rules`) change an answer when they are halved or doubled.
 
-    python -m benchmarks.sensitivity [cases=a,b] [rooms=search,judge,touch,torque,belief] [factors=0.5,2] [seed=1]
-                                     [out=out/sensitivity] [only=table]
+    python -m benchmarks.sensitivity [cases=a,b] [rooms=search,judge,touch,torque,belief] [figures=search.least,...]
+                                     [factors=0.5,2] [seed=1] [out=out/sensitivity] [only=table]
 
 A dozen short recordings, each with one known thing in it (or nothing): a pendulum of `benchmarks.planted`, a pendulum
 that somebody pushes, and the press rig with its taxels; each diagnosed among a few effects, so that it takes seconds.
@@ -13,7 +13,7 @@ left of it beyond 1 (`rules.moved`).
 Of each figure and factor: in how many cases it was read, in how many the answer changed (verdict, names, sets or a
 confidence by more than 0.02; apart from those: sizes by more than 1 % or their intervals by more than 10 %), and in how
 many the first name was right before and is wrong after. Seeds are for learning. Resumable; only=table prints what there
-is. Needs os.fork (Linux, macOS).
+is; figures= moves those alone (by default all of the rooms). Needs os.fork (Linux, macOS).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from dexsim.gap.inquiry import Settings
 SECONDS = 4.0  # of a recording of a pendulum
 LONGEST = 60.0  # s of a core: a child that takes longer is ended
 CONFIDENCE, SIZE, INTERVAL = 0.02, 0.01, 0.1  # changes of an answer beyond these count
-OWN = {"cases": "", "rooms": "search,judge,touch,torque,belief", "factors": "0.5,2", "seed": "1",
+OWN = {"cases": "", "rooms": "search,judge,touch,torque,belief", "figures": "", "factors": "0.5,2", "seed": "1",
        "out": "out/sensitivity", "only": ""}  # fmt: skip
 DRY = {"coulomb_friction", "command_delay"}  # asked for beside what is planted
 
@@ -130,8 +130,8 @@ CASES: dict[str, Callable[[Path, int], tuple[Settings, str]]] = {
 class Forks:
     """Forks where a figure is read for the first time; `moved` is this process's own, (name, factor), in a child."""
 
-    def __init__(self, rooms: set[str], factors: list[float], done: set[tuple[str, float]], path: Path):
-        self.rooms, self.factors, self.done, self.path = rooms, factors, done, path
+    def __init__(self, figures: set[str], factors: list[float], done: set[tuple[str, float]], path: Path):
+        self.figures, self.factors, self.done, self.path = figures, factors, done, path
         self.moved: tuple[str, float] | None = None
         self.seen: set[str] = set()
 
@@ -140,7 +140,7 @@ class Forks:
         if self.moved or name in self.seen:
             return
         self.seen.add(name)
-        for factor in self.factors if called in self.rooms else ():
+        for factor in self.factors if name in self.figures else ():
             if (name, factor) in self.done:
                 continue
             child = os.fork()
@@ -196,7 +196,7 @@ def case(name: str, s: dict[str, Any]) -> None:
     asked, truth = CASES[name](folder / "cases" / name, s["seed"])
     path = folder / f"{name}.jsonl"
     rows = _rows(path)
-    forks = Forks(set(s["rooms"]), s["factors"], {(r["figure"], r["factor"]) for r in rows}, path)
+    forks = Forks(set(s["figures"]), s["factors"], {(r["figure"], r["factor"]) for r in rows}, path)
     with forks:
         try:
             found = answer(asked)
@@ -299,6 +299,10 @@ def settings(argv: list[str]) -> dict[str, Any]:
         s[key] = [x for x in text[key].split(",") if x] or valid
         if unknown := [x for x in s[key] if x not in valid]:
             raise UserError(f"{key}={text[key]}: {unknown[0]} is none; valid: {', '.join(valid)}")
+    known = [name for name, *_ in rules.described()]
+    s["figures"] = [x for x in text["figures"].split(",") if x] or [x for x in known if x.split(".")[0] in s["rooms"]]
+    if unknown := [x for x in s["figures"] if x not in known]:
+        raise UserError(f"figures={text['figures']}: {unknown[0]} is none; valid: {', '.join(known)}")
     if s["only"] not in ("", "table"):
         raise UserError(f"only={s['only']}: must be table, or not given")
     s["seed"] = tools.numbers(text["seed"], "seed")[0]
