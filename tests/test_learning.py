@@ -45,6 +45,36 @@ def runner(seed=3, worlds=8, **task):
     return Runner(dummy_task.make_env(cfg, worlds, "cpu", seed, "none"), cfg, {"dexsim": "test"})
 
 
+def test_first_actions_scales_the_actors_means_and_nothing_else(tmp_path):
+    def made(factor):
+        torch.manual_seed(3)
+        cfg = config() | {"first_actions": factor}
+        return Runner(dummy_task.make_env(cfg, 8, "cpu", 3, "none"), cfg, {"dexsim": "test"})
+
+    whole, near = made(1.0), made(0.01)
+    obs = whole.env.get_observations()
+    whole.alg.get_policy().eval(), near.alg.get_policy().eval()
+    a, b = whole.alg.get_policy()(obs), near.alg.get_policy()(obs)
+    assert a.abs().max() > 0.01
+    torch.testing.assert_close(b, 0.01 * a, rtol=1e-4, atol=1e-7)
+    for part in ("actor", "critic"):
+        one, other = whole.payload()[part], near.payload()[part]
+        differ = {k for k in one if not torch.equal(one[k], other[k])}
+        assert differ == ({"mlp.4.weight", "mlp.4.bias"} if part == "actor" else set())
+    checkpoint.save(tmp_path / "near.pt", near.payload())  # a resume starts where it stopped, not a hundredth of it
+    again = made(0.01)
+    again.restore(checkpoint.load(tmp_path / "near.pt"), "near.pt")
+    again.alg.get_policy().eval()
+    assert torch.equal(again.alg.get_policy()(obs), b)
+
+
+@pytest.mark.parametrize("factor", [0, -1.0, 2, "little", True, math.nan])
+def test_first_actions_must_be_a_share(factor):
+    with pytest.raises(UserError, match="first_actions.*above 0 and at most 1"):
+        cfg = config() | {"first_actions": factor}
+        Runner(dummy_task.make_env(cfg, 8, "cpu", 3, "none"), cfg, {"dexsim": "test"})
+
+
 @pytest.fixture(scope="module")
 def trained():
     made = runner()

@@ -56,6 +56,23 @@ def agent_errors() -> Iterator[None]:
         raise UserError(f"agent settings: {str(error).splitlines()[0]}") from error
 
 
+def scale_first_actions(actor: torch.nn.Module, factor: object) -> None:
+    """Multiply the actor's last linear layer by ``factor``, so that a training starts with mean actions near zero.
+
+    With rsl-rl's initial weights a training's first motion, and with it the gait that it finds, depends on the seed.
+    A factor of 0.01 is what Andrychowicz et al. (2021, "What Matters for On-Policy Deep Actor-Critic Methods?",
+    section 3.2) found best. What a checkpoint holds is loaded over it. Raises UserError unless 0 < factor <= 1.
+    """
+    if isinstance(factor, bool) or not isinstance(factor, int | float) or not 0 < factor <= 1:
+        raise UserError(f"first_actions={factor}: must be a number above 0 and at most 1, e.g. first_actions=0.01")
+    if factor == 1:
+        return
+    last = [m for m in actor.modules() if isinstance(m, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.weight.mul_(factor)
+        last.bias.mul_(factor)
+
+
 def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> MLPModel:
     """The trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from dexsim.learning import checkpoint, names, weights_and_biases
 from dexsim.learning.meter import Meter
-from dexsim.learning.ppo import agent_config, agent_errors
+from dexsim.learning.ppo import agent_config, agent_errors, scale_first_actions
 from dexsim.learning.ranks import Ranks, seed_all
 from dexsim.tasks import worlds
 
@@ -61,6 +61,7 @@ class Runner(OnPolicyRunner):
         torch.backends.cuda.matmul.allow_tf32 = bool(cfg.get("tf32", True))
         with agent_errors():
             super().__init__(env, agent_config(cfg, device, typed), log_dir=None, device=device)
+        scale_first_actions(self.alg.get_policy(), cfg.get("first_actions", 1.0))
         self.iteration, self.steps = 0, 0
         # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
         record = device.startswith("cuda") and cfg.get("graphed_update", True) and not graphed.unsupported(self.alg)
