@@ -264,4 +264,4 @@ def test_what_only_looks_like_jitter_is_not_reported():
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
     none = search.without_search().none
-    assert none.fit.loss > JUDGE.jitter_left and joint_answer.estimate_jitter(search, none) is None
+    assert none.fit.loss > JUDGE.within**2 and joint_answer.estimate_jitter(search, none) is None

@@ -512,7 +512,7 @@ class Drives(Steps):
         """Stand-ins for joints of which something is left that no effect explains."""
         p, limit, longest, late = self.parts, self.w.limit, 0.0, []
         for case, search, outcome in self.outcomes:
-            if d.joints[case.joint]["after"] < JUDGE.unexplained * self.noise.floor:
+            if d.joints[case.joint]["after"] < JUDGE.within * self.noise.floor:
                 continue
             if limit.spent(1 - STANDING_IN) or limit.rest() < 2 * longest:
                 late.append(case.joint)
@@ -624,8 +624,7 @@ def _spread(group: Sequence[int], count: int) -> list[int]:
 def _at_rest(runs: Sequence[Run]) -> bool:
     """Whether no joint moves in any run and no target changes."""
     joints = range(len(runs[0].joints))
-    moving = any(max(float(np.ptp(r.q[:, j])) for r in runs) > JUDGE.moved for j in joints)
-    return not moving and not any(max(float(np.ptp(r.cmd[:, j])) for r in runs) > JUDGE.commanded for j in joints)
+    return not any(max(float(np.ptp(x[:, j])) for r in runs for x in (r.q, r.cmd)) > JUDGE.moved for j in joints)
 
 
 def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outcome]) -> list[Trial]:

@@ -137,7 +137,7 @@ def control(found: list[Spot]) -> list[Spot]:
     for s, value in zip(found, q, strict=True):
         s.q = float(value)
     return sorted(
-        [s for s in found if s.q <= JUDGE.discovery and s.ratio > JUDGE.spot],
+        [s for s in found if s.q <= JUDGE.discovery and s.ratio > JUDGE.within],
         key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)),
     )
 

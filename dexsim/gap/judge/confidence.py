@@ -83,9 +83,7 @@ def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case)
             continue
         zero, room = neutral_of(p, case), 1e-3 * p.span
         low, high = spread[p.key]
-        if (low <= p.low + room and zero > p.low + JUDGE.at_end * p.span) or (
-            high >= p.high - room and zero < p.high - JUDGE.at_end * p.span
-        ):
+        if low <= p.low + room < zero or high >= p.high - room > zero:
             return p.key
     return ""
 
@@ -97,11 +95,9 @@ def left_over(after: float, before: float, noise: float) -> float:
 
 
 def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to
-    `JUDGE.left_free`, `1 - JUDGE.left_costs` from `JUDGE.left_span` beyond it on. What follows only half of a gap may
-    be another effect's likeness."""
-    beyond_free = (left_over(after, before, noise) - JUDGE.left_free) / JUDGE.left_span
-    return 1.0 - JUDGE.left_costs * float(np.clip(beyond_free, 0.0, 1.0))
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses that
+    share, `JUDGE.left_costs` at most. What follows only half of a gap may be another effect's likeness."""
+    return 1.0 - min(left_over(after, before, noise), JUDGE.left_costs)
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
@@ -126,14 +122,9 @@ def unresolved(without: float, after: float, quantum: float) -> str:
     )
 
 
-def kept(earned: float) -> float:
-    """Share of its confidence that a name keeps by what it earned (0 to 1) on what was kept out."""
-    return JUDGE.unearned + (1.0 - JUDGE.unearned) * earned
-
-
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
     """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
-    c = e.share * kept(e.earned) * trusted(before, after, noise)
+    c = e.share * e.earned * trusted(before, after, noise)
     if e.members > 1:  # of what the others leave it has to explain most
         c *= trusted(without, after, noise)
     return float(min(c, JUDGE.surest, JUDGE.doubted if e.reasons else 1.0))

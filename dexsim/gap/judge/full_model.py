@@ -109,7 +109,8 @@ class Confirmation:
             together = ", all joints at once," if len(self.joints) > 1 else ""
             return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
         believed = next(iter(self.errors.values()))[0]
-        if not self.missing and len(self.errors) > 1 and engine <= JUDGE.mostly * believed:
+        removed = believed - engine >= JUDGE.removed * max(believed - self.floor, 0.0)
+        if not self.missing and len(self.errors) > 1 and removed:
             return (
                 f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, "
                 "more than in the search's own plant."
@@ -553,6 +554,6 @@ def _affordable(run: Callable[[float], Any], room: float, groups: int, times: fl
 
 def agree(engine: float, plant: float, floor: float, before: float) -> bool:
     """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.within times as much, or what it
-    leaves beyond that is JUDGE.little beside the error before (the figures by which the plant absorbs its own
+    leaves beyond that is JUDGE.earns beside the error before (the figures by which the plant absorbs its own
     inaccuracy are not handed on)."""
-    return engine <= max(JUDGE.within * max(plant, floor), math.hypot(plant, JUDGE.little * before))
+    return engine <= max(JUDGE.within * max(plant, floor), math.hypot(plant, JUDGE.earns * before))

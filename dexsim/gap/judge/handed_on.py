@@ -20,7 +20,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
 from dexsim.gap.read import BLOCK, Run
-from dexsim.gap.rules import JUDGE
+from dexsim.gap.rules import BELIEF, JUDGE
 from dexsim.gap.search.search import Trial
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def on_motor(case: Case, trial: Trial) -> float:
     elasticity; 0 where nothing parts the two."""
     params, x = trial.fit.params, trial.fit.x
     share = next((float(v) for p, v in zip(params, x, strict=True) if p.columns == ("motor_share",)), 0.0)
-    if share < JUDGE.on_motor:
+    if share < BELIEF.tolerance:
         return 0.0
     row = expand(case.plant, params, x[None])[0, 0]
     parted = row[PLANT_INDEX["backlash"]] > 0.0 or row[PLANT_INDEX["softness"]] > 0.0
@@ -345,7 +345,7 @@ def fit_stand_in(
     span_test: dict[int, tuple[float, float]] | None = None,
     seed: int = 0,
 ) -> StandIn | None:
-    """The stand-in of one joint; None where it would not take JUDGE.standin off the held-out error."""
+    """The stand-in of one joint; None where it would not take JUDGE.earns off the held-out error."""
     xs, ys, parts = [], [], []
     for r in train:
         torque, on = residual_torque(case, runs, trial, r)
@@ -374,7 +374,7 @@ def fit_stand_in(
     each = lambda index, axis=-1: np.moveaxis(np.apply_along_axis(solve, axis, index.astype(int)), axis, 0)  # noqa: E731
     low, high = np.quantile(intervals.draws((np.arange(count),), each, seed, STAND_IN_DRAWS), [0.05, 0.95], axis=-1)
     before, after = _held_out(case, runs, trial, value, test, span_test)
-    if not after < (1 - JUDGE.standin) * before:
+    if not after < (1 - JUDGE.earns) * before:
         return None
     return StandIn(case.joint, value, np.minimum(low, value), np.maximum(high, value), before, after)
 

@@ -174,7 +174,7 @@ class JointAnswer:
                 "removed_high": round(gain[1], 4),
             },
         }
-        late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.jitter_left else None
+        late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.within**2 else None
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
@@ -322,7 +322,7 @@ class JointAnswer:
         spots = locate.control(locate.spots(case.joint, left * case.sigma, blocks, regimes, rng))
         self.spots, self.depends_on = (
             found,
-            [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.unexplained else [],
+            [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.within else [],
         )
 
     def curve(self) -> Curve | None:
@@ -447,11 +447,11 @@ class Jitter:
         return {"value": self.value, "low": self.low, "high": self.high, "unit": "s"}
 
 
-def certain(gain: float, value: float, beside: float, noise: float) -> bool:
-    """Whether jitter of `value` [s] is reported. gain: of the log likelihood; beside: what stays with it that is
-    correlated, to compare with the noise: where that is more, something else is missing that looks alike (an unmodelled
-    resonance does)."""
-    return not (gain < JUDGE.jitter or value < JUDGE.clocks or beside > noise)
+def certain(gain: float, beside: float, noise: float) -> bool:
+    """Whether jitter is reported. gain: of the log likelihood; beside: what stays with it that is correlated, to
+    compare with the noise: where that is more, something else is missing that looks alike (an unmodelled resonance
+    does)."""
+    return gain >= JUDGE.jitter and beside <= noise
 
 
 def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]]:
@@ -526,7 +526,7 @@ def estimate_jitter(search: JointSearch, trial: Trial) -> Jitter | None:
     )
     best, value = float(both.fun), float(np.exp(both.x[-1]))
     gain = float(none.fun) - best
-    if not certain(gain, 1e-3 * value, float(np.exp(both.x[1])), noise):
+    if not certain(gain, float(np.exp(both.x[1])), noise):
         return None
     over = lambda log: cost(both.x[:-1], np.exp(log)) - best - FALL  # noqa: E731
     middle = np.log(value)

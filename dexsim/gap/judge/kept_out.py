@@ -13,7 +13,7 @@ from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.read import BLOCK, Run, same_commands, spans
-from dexsim.gap.rules import JUDGE
+from dexsim.gap.rules import JUDGE, SEARCH
 
 # -- what is kept out -------------------------------------------------------------------------------------------------
 # What is kept out of the fit: a condition whose regimes are fitted elsewhere, and ends of recordings with regimes that
@@ -51,17 +51,17 @@ def regimes(cases: Sequence[Case]) -> dict[str, np.ndarray]:
         out[f"saturation of {c.joint} while braking"] = saturated & against & moving
         for name in ("speed", "load", "acceleration"):
             x = np.abs(m[name])
-            out[f"large {name} of {c.joint}"] = x > JUDGE.large * float(np.percentile(x, 99.8))
+            out[f"large {name} of {c.joint}"] = x > (1 - JUDGE.outer) * float(np.percentile(x, 99.8))
         if "temperature" in m:
             heat = m["temperature"]
             cold, hot = np.percentile(heat, [1, 99])
-            if hot - cold > JUDGE.warmed:
-                out[f"a warm {c.joint}"] = heat > hot - JUDGE.warm * (hot - cold)
-                out[f"a cold {c.joint}"] = heat < cold + JUDGE.warm * (hot - cold)
+            if (1 - 2 * JUDGE.outer) * (hot - cold) > SEARCH.warmth:  # between what is cold and what is warm
+                out[f"a warm {c.joint}"] = heat > hot - JUDGE.outer * (hot - cold)
+                out[f"a cold {c.joint}"] = heat < cold + JUDGE.outer * (hot - cold)
         q = m["position"]
         low, high = np.percentile(q, [0.5, 99.5])
-        out[f"{c.joint} at its upper end"] = q > high - JUDGE.ends * (high - low)
-        out[f"{c.joint} at its lower end"] = q < low + JUDGE.ends * (high - low)
+        out[f"{c.joint} at its upper end"] = q > high - 0.5 * JUDGE.outer * (high - low)
+        out[f"{c.joint} at its lower end"] = q < low + 0.5 * JUDGE.outer * (high - low)
     return out
 
 
@@ -167,7 +167,7 @@ def _ends(
 def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: Sequence[int]) -> list[str]:
     """Regimes that what is kept out visits and no fitted recording does."""
     here, there = time[:, list(test)].sum(1), time[:, list(train)].sum(1)
-    alone = (here > JUDGE.visited) & (there < JUDGE.unseen * JUDGE.visited)
+    alone = (here > JUDGE.visited) & (there < JUDGE.visited)
     return [name for name, so in zip(names, alone, strict=True) if so]
 
 

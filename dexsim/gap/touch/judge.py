@@ -11,7 +11,6 @@ from dexsim.gap.effects import Fit, PadFacts, word
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.inquiry import PadCurve
-from dexsim.gap.judge.confidence import kept
 from dexsim.gap.read import spans
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch.plant import PARAMS, contact, readings
@@ -84,7 +83,7 @@ class PadAnswer:
         taxels, parameters = self._parameters(e)
         return {
             "effect": e,
-            "confidence": round(float(min(share * kept(earned), JUDGE.surest)), 3),
+            "confidence": round(float(min(share * earned, JUDGE.surest)), 3),
             "alternatives": [{"effect": x, "confidence": round(c, 3)} for x, c in rivals[:3]],
             "indistinguishable": [e, *(x for x, _ in same)] if same else [],
             "separating_experiment": effect.experiment if same else None,
