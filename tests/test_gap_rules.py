@@ -411,7 +411,7 @@ class Refuted:
 
 
 def test_findings_that_do_not_help_are_taken_back():
-    for ratio, kept in ((0.975, True), (0.985, False)):
+    for ratio, kept in ((0.985, True), (0.995, False)):
         d = SimpleNamespace(
             joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0, "told_before": 1.0, "told_after": ratio}},
             evidence=[],
@@ -424,7 +424,7 @@ def test_findings_that_do_not_help_are_taken_back():
 
 
 def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
-    for ratio, kept in ((0.975, True), (0.985, False)):
+    for ratio, kept in ((0.985, True), (0.995, False)):
         e = doubtful(effect="deadband")
         joints = {"j": {"before": 1.0, "after": 1.0, "mae_before": 1.0, "told_before": 0.1, "told_after": 0.1 * ratio}}
         d = SimpleNamespace(joints=joints, evidence=[e], notes=[], data={"nuisance": {}})
@@ -447,8 +447,10 @@ def test_what_was_kept_out_may_side_with_neither():
 
 
 def test_what_shows_in_what_was_kept_out_alone():
-    shown = lambda before: conclude._shown_there_alone({"j": {"before": before, "sigma": 0.1, "fitted": 1.0}}, [])  # noqa: E731
-    assert shown(2.1) == ["j"] and shown(1.9) == []
+    shown = lambda before, fitted: conclude._shown_there_alone(  # noqa: E731
+        {"j": {"before": before, "sigma": 0.1, "fitted": fitted}}, []
+    )
+    assert shown(0.51, 0.49) == ["j"] and shown(0.49, 0.1) == [] and shown(2.0, 0.51) == []
 
 
 def test_many_effects_on_one_joint_are_doubted():
@@ -472,7 +474,7 @@ def test_what_stays_unexplained_costs_confidence():
 
 
 def test_a_rival_of_the_same_class_makes_a_set():
-    for share, together in ((0.055, False), (0.065, True)):
+    for share, together in ((0.045, False), (0.055, True)):
         answer = Judged(1.0, 0.1)
         answer.outcome.rivals = {"lag": [("command_delay", share)]}
         assert (len(judged(answer)["indistinguishable"]) == 2) is together, share
@@ -486,7 +488,7 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out():
 def test_an_effect_may_lose_little_where_it_does_not_act():
     """Half of the blocks gain much, the others lose a little: what a bootstrap over blocks may lose as a whole
     decides."""
-    for lost, hint in ((0.03, False), (0.08, True)):
+    for lost, hint in ((0.015, False), (0.025, True)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kept_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
             assert (judged(Judged(1.0, 0.1))["confidence"] < 0.5) is hint, lost

@@ -50,7 +50,7 @@ def rest(gains, width=0.05):
 
 def test_taxels_that_agree_speak_for_the_rest():
     assert rest([0.8] * 5) is not None and rest([0.8] * 4) is None
-    assert rest([0.91] * 12) is not None and rest([0.93] * 12) is None
+    assert rest([0.89] * 12) is not None and rest([0.91] * 12) is None
     assert rest([0.8] * 9) is not None and rest([0.8] * 3) is None
     assert rest([0.8] * 9, width=0.09) is not None and rest([0.8] * 9, width=0.11) is None
 
@@ -114,14 +114,14 @@ def test_a_pad_has_at_most_so_many_effects():
 
 
 def test_a_gain_for_every_taxel_has_a_price():
-    for one, found in ((1.4, ("tactile_delay",)), (1.6, ("tactile_gain",))):
+    for one, found in ((1.6, ("tactile_delay",)), (1.8, ("tactile_gain",))):
         loss = lambda ids, one=one: ({(): 10.0, ("tactile_delay",): one}.get(ids, 1.0),) * 2  # noqa: E731
         pair = chosen(loss, "tactile_delay", "tactile_gain")
         assert pair[:1] == found, one
 
 
 def test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken():
-    for other, found in ((1.02, "thermal"), (1.04, "tactile_delay")):
+    for other, found in ((1.01, "thermal"), (1.03, "tactile_delay")):
         loss = lambda ids, other=other: {(): (10.0, 10.0), ("tactile_delay",): (1.0, 2.0)}.get(ids, (other, 1.0))  # noqa: E731
         assert chosen(loss, "tactile_delay", "thermal")[0] == found, other
 
@@ -153,7 +153,7 @@ class Mapped(PadSearch):
 
 def test_a_gain_for_every_taxel_must_follow_clearly_better_than_one():
     gain = next(e for e in TOUCH_CATALOGUE if e.by_taxel)
-    for left, mapped in ((0.65, True), (0.75, False)):  # x what one gain leaves
+    for left, mapped in ((0.58, True), (0.6, False)):  # x what one gain leaves
         assert (Mapped(left)._try(TouchTrial((), {}), gain).gains is not None) is mapped, left
 
 
@@ -182,7 +182,7 @@ def claimed(after=0.5, share=0.0):
 
 
 def test_a_touch_rival_of_the_same_class_makes_a_set():
-    for share, together in ((0.11, False), (0.13, True)):
+    for share, together in ((0.045, False), (0.055, True)):
         assert (len(claimed(share=share)["indistinguishable"]) == 2) is together, share
 
 
@@ -193,8 +193,8 @@ def test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed():
 def test_exchanged_taxels_fit_in_the_place_of_each_other():
     """Each reading is a mix of what both places predict; `own`: its part that its own place does."""
     place = np.eye(3, 30)  # at different times
-    for own, found in ((0.635, True), (0.622, False)):
-        other = 1 - own  # what is left in the other's place: (other / own)^2 = 0.33 and 0.37 of what its own leaves
+    for own, found in ((0.57, True), (0.56, False)):
+        other = 1 - own  # what is left in the other's place: (other / own)^2 = 0.57 and 0.62 of what its own leaves
         z = np.stack([other * place[0] + own * place[1], own * place[0] + other * place[1], place[2]])
         search = SimpleNamespace(runs=[SimpleNamespace(z=z.T)], noise=0.01)
         with pytest.MonkeyPatch.context() as patch:
@@ -244,7 +244,7 @@ def test_the_gain_of_a_taxel_is_believed_to_be_one():
 
 
 def test_what_is_left_of_a_pad_has_structure():
-    for loss, left, structure in ((4.2, 2.1, True), (3.8, 2.1, False), (4.2, 1.9, False)):
+    for loss, left, structure in ((1.8, 1.4, True), (1.6, 1.4, False), (1.8, 1.2, False)):
         search = SimpleNamespace(cross=lambda _, loss=loss: np.full(10, loss), train=np.ones(10, bool))
         answer = SimpleNamespace(search=search, best=None, left=left, floor=1.0)
         assert PadAnswer.structured(answer) is structure, (loss, left)
@@ -261,19 +261,19 @@ class Recorded:
 
 
 def test_taxels_that_never_change_are_named_surely():
-    assert JUDGE.sure < judge.pressed({3: 0.0}, 1)["confidence"] < 1.0
+    assert judge.pressed({3: 0.0}, 1)["confidence"] == JUDGE.surest
     force = np.zeros((30, 1, 4, 3))
     force[:, 0, 1:, 2] = np.arange(30.0)[:, None]
     sensors = SimpleNamespace(layout=SimpleNamespace(pads=1),
                               beside=lambda f: [[j for j in range(4) if j != k] for k in range(4)])  # fmt: skip
     (found,) = judge.constant_taxels([SimpleNamespace(tactile=Recorded(force))], sensors)
-    assert found["where"]["taxels"] == ["0:0"] and JUDGE.sure < found["confidence"] < 0.95
+    assert found["where"]["taxels"] == ["0:0"] and found["confidence"] == JUDGE.sure
 
 
 def test_what_is_left_of_a_pad_goes_with_something():
     rng, n = np.random.default_rng(0), 4000
     t, load = np.arange(float(n)), rng.uniform(1.0, 2.0, n)
-    for part, said in ((0.5, True), (0.36, False)):  # correlations of about 0.48 and 0.34
+    for part, said in ((0.42, True), (0.32, False)):  # squares of correlations of about 0.16 and 0.09
         order = part * (load - 1.5) / 0.289 + np.sqrt(1 - part**2) * rng.normal(size=n)
         error = np.argsort(np.argsort(order)) / n
         run = SimpleNamespace(t=t, grid=t, z=load[:, None], depth=np.zeros(n), error=error[:, None])
@@ -288,15 +288,15 @@ def test_a_little_crosstalk_may_be_another_law():
     assert doubt(0.13) and not doubt(0.17)
 
 
-def test_a_drift_needs_time():
-    for seconds, possible in ((22.0, True), (17.0, False)):
-        search = SimpleNamespace(thermometer=False, runs=["one"], warm=seconds)
-        assert TOUCH_EFFECTS["thermal"].possible(search) is possible, seconds
+def test_a_drift_needs_a_temperature_or_a_second_recording():
+    for thermometer, runs, possible in ((True, 1, True), (False, 2, True), (False, 1, False)):
+        search = SimpleNamespace(thermometer=thermometer, runs=["one"] * runs)
+        assert TOUCH_EFFECTS["thermal"].possible(search) is possible, (thermometer, runs)
 
 
 def test_a_touch_rival_follows_about_as_well():
     other = next(e for e in TOUCH_CATALOGUE if not e.by_taxel and not touch_confusable(e.id, "tactile_delay"))
-    for left, counts in ((2.3, True), (2.7, False)):  # x what the hypothesis leaves where it was fitted
+    for left, counts in ((1.6, True), (1.8, False)):  # x what the hypothesis leaves where it was fitted
         search = Choosing(lambda ids, left=left: (1.0, left if other.id in ids else 1.0))
         current, rival, base = (search.fit(ids, {}) for ids in (("tactile_delay",), (other.id,), ()))
         search.without, search.scan, search._try = lambda *_, base=base: base, lambda *_: [other], lambda *_: None
@@ -338,8 +338,8 @@ def silent(pressed=1.0, beside=1.0, lsb=0.0, reading=0.0):
 
 
 def test_a_silent_taxel_is_pressed_and_its_neighbours_feel():
-    assert silent(pressed=0.09) == {1: 0.0} and silent(pressed=0.07) == {}
-    assert silent(beside=0.09) == {1: 0.0} and silent(beside=0.07) == {}
+    assert silent(pressed=0.055) == {1: 0.0} and silent(pressed=0.045) == {}
+    assert silent(beside=0.055) == {1: 0.0} and silent(beside=0.045) == {}
     assert silent(pressed=0.45, lsb=0.1) == {1: 0.0} and silent(pressed=0.35, lsb=0.1) == {}
 
 
@@ -348,7 +348,7 @@ def test_a_reading_that_never_changes_is_stuck():
 
 
 def test_exchanged_taxels_save_more_than_noise():
-    for size, found in ((0.08, True), (0.06, False)):  # N; each saves (2 size)^2 / 2 in the other's place
+    for size, found in ((0.06, True), (0.04, False)):  # N; less than 5 x the noise of 0.01 is not felt
         place = size * np.eye(3, 30)
         search = SimpleNamespace(runs=[SimpleNamespace(z=place[[1, 0, 2]].T)], noise=0.01)
         with pytest.MonkeyPatch.context() as patch:
@@ -358,5 +358,5 @@ def test_exchanged_taxels_save_more_than_noise():
 
 def test_neighbours_of_a_dead_taxel_feel_the_touch():
     near = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], [0, 1, 2]]
-    for share, dead in ((0.12, {0}), (0.08, set())):
+    for share, dead in ((0.17, {0}), (0.13, set())):
         assert judge._constant(np.array([0.0, share, share, share, 1.0]), near) == dead, share

@@ -26,6 +26,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from dexsim.gap.rules import TOUCH
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +35,7 @@ RATE, INNER = 90.0, 4  # readings a second; times the sensor itself runs between
 ALONG, ACROSS = (-5.0e-3, 0.0, 5.0e-3), (-11.0e-3, -5.5e-3, 0.0, 5.5e-3)  # m from the pad's middle: places
 DEPTH = (0.5e-3, 1.2e-3)  # m
 AWAY = 1.5e-3  # m above the skin between presses
-LISTED = 0.08  # `TOUCH.gain_off` of the diagnosis: it lists no gain that is less off
+LISTED = TOUCH.law  # the diagnosis lists no gain that is less off
 DRAWN = 0.25  # share of what was found by which training draws about it, at most (as for the drives)
 
 

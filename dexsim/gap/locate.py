@@ -124,7 +124,7 @@ def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:
 
 
 def control(found: list[Spot]) -> list[Spot]:
-    """Benjamini-Hochberg over all bins: those that stand at `JUDGE.discovery`, the largest first, positions before
+    """Benjamini-Hochberg over all bins: those that stand at `JUDGE.level`, the largest first, positions before
     efforts."""
     if not found:
         return []
@@ -137,7 +137,7 @@ def control(found: list[Spot]) -> list[Spot]:
     for s, value in zip(found, q, strict=True):
         s.q = float(value)
     return sorted(
-        [s for s in found if s.q <= JUDGE.discovery and s.ratio > JUDGE.within],
+        [s for s in found if s.q <= JUDGE.level and s.ratio > JUDGE.within],
         key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)),
     )
 

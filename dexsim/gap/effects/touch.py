@@ -169,7 +169,7 @@ class TactileDrift(TouchEffect):
     words_beside = {"of": "taxels"}
 
     def possible(self, search: PadSearch) -> bool:
-        return search.thermometer or len(search.runs) >= 2 or search.warm >= TOUCH.one_run
+        return search.thermometer or len(search.runs) >= 2
 
     def begin(self, search: PadSearch) -> list[dict[str, float]]:
         return [{"drift": x / search.warm} for x in (0.15, -0.15)]

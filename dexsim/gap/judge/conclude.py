@@ -140,10 +140,10 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
         joint = a.case.joint
         mine = [f for f in findings if joint in f["where"]["joints"] and not EFFECTS[f["effect"]].effort_only]
         v = d.joints[joint]
-        if not mine or v["after"] < JUDGE.helps * v["before"]:
+        if not mine or _less(v["after"], v["before"]):
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
-        elsewhere = v["told_after"] < JUDGE.helps * v["told_before"]  # but for moments that nothing follows
+        elsewhere = _less(v["told_after"], v["told_before"])  # but for moments that nothing follows
         if reason or elsewhere:
             for e in d.evidence:
                 if e.joint == joint and not EFFECTS[e.effect].effort_only:
@@ -163,6 +163,11 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
         } | nuisances(joint, a.none)
         v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
     return refuted
+
+
+def _less(a: float, b: float) -> bool:
+    """Whether an error (rms) is less than another, the squares of which do not tie."""
+    return a**2 < (1 - SEARCH.tie) * b**2
 
 
 def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> None:
@@ -241,13 +246,13 @@ def _verdict(
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
-    """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing
-    (a limit, a sag) shows there alone, and what is kept out must not be fitted."""
+    """Joints without a finding of which what was kept out is missed by far more than the noise, and what was fitted is
+    not: what is missing (a limit, a sag) shows there alone, and what is kept out must not be fitted."""
     found = {j for f in findings for j in f["where"]["joints"]}
     return [
         j
         for j, v in joints.items()
-        if j not in found and v["before"] > max(JUDGE.far * v["sigma"], JUDGE.alone * v["fitted"])
+        if j not in found and v["before"] > JUDGE.far * v["sigma"] >= v["fitted"]
     ]
 
 
@@ -263,7 +268,7 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
         return "what was kept out is followed better from moment to moment, but not by a free run"
     if shaking.shown(search, outcome, test, span):
         return "it makes the joint ring by itself as it does in what was kept out, but no free run keeps step with that"
-    sides_with_neither = ratio < JUDGE.neutral and after < JUDGE.neutral**2 * before
+    sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
     plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= 2 * SEARCH.least
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 

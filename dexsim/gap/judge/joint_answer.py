@@ -19,7 +19,7 @@ from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.read import Run
-from dexsim.gap.rules import BELIEF, JUDGE
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Fitted, Fitter, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
 from dexsim.intervals import draws
@@ -149,7 +149,7 @@ class JointAnswer:
             evidence = max(other, evidence, key=lambda e: e.confidence)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
-        same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.set_share][:2]
+        same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.level][:2]
         alike = inseparable(mm.id, case, sorted({*self.kept.train, *self.kept.test}))
         same += [(e, 0.0) for e in alike if e not in dict(same)][: 2 - len(same)]
         signal = mm.effect.signal(case, raw, mm.variant.note)
@@ -201,7 +201,7 @@ class JointAnswer:
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
                 f"kept out, less than {100 * JUDGE.part:.0f} %"
             )
-        elif not effort_only and surely < -JUDGE.slack:
+        elif not effort_only and surely < -SEARCH.tie:
             evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(without_it)):
             (evidence.doubt if borne_out else evidence.hint)(harmed)
@@ -216,7 +216,7 @@ class JointAnswer:
             return ""
         sums = lambda *x, axis=-1: np.stack([one.sum(axis) for one in x])  # noqa: E731
         gained, of = draws(((lost - mine)[runs], lost[runs]), sums, 0, kept_out.DRAWS)
-        harms = float(np.mean(gained < -JUDGE.slack * of)) > JUDGE.harm
+        harms = float(np.mean(gained < -SEARCH.tie * of)) > JUDGE.level
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
     def _fitted(self, mm: Member, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:

@@ -12,7 +12,7 @@ from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.inquiry import PadCurve
 from dexsim.gap.read import spans
-from dexsim.gap.rules import JUDGE, TOUCH
+from dexsim.gap.rules import JUDGE, SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, contact, readings
 from dexsim.gap.touch.read import newtons
 from dexsim.gap.touch.search import PadFit, PadOutcome, PadSearch, TouchTrial
@@ -73,7 +73,7 @@ class PadAnswer:
         less = search.without(best, e) if len(best.ids) > 1 else self.none
         b, a = held_out(search, less, stage)[0], held_out(search, best, stage)[0]
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
-        same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= TOUCH.set_share][:2]
+        same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= JUDGE.level][:2]
         earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
         if earned <= TOUCH.earned:
             self.notes.append(
@@ -116,7 +116,7 @@ class PadAnswer:
         """Whether something is left that no effect explains."""
         search = self.search
         loss = float(search.cross(self.best).sum()) / max(int(search.train.sum()), 1)
-        return loss > TOUCH.structured**2 and self.left > TOUCH.structured * self.floor
+        return loss > JUDGE.within**2 and self.left > JUDGE.within * self.floor
 
     def _rest(self) -> Fit | None:
         """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where
@@ -126,13 +126,13 @@ class PadAnswer:
             return None
         moved = np.zeros(len(t.gains), bool) if t.order is None else t.order != np.arange(len(t.gains))
         width = search.gain_width(t)
-        sure = (width < TOUCH.known) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
+        sure = (width < TOUCH.law) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
         sure[list(search.silent)] = False
         if sure.sum() < TOUCH.agree:
             return None
         # one barely known counts little
         low, value, high = _quantiles(t.gains[sure], width[sure] ** -2.0, (0.05, 0.5, 0.95))
-        return (value, low, high) if abs(value - 1) > TOUCH.gain_off and high - low < abs(value - 1) else None
+        return (value, low, high) if abs(value - 1) > TOUCH.law and high - low < abs(value - 1) else None
 
     def _chord(self) -> Fit | None:
         """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are
@@ -178,7 +178,7 @@ class PadAnswer:
         assert g is not None  # of such an effect
         moved = [] if t.order is None else [int(k) for k in np.flatnonzero(t.order != np.arange(len(g)))]
         half = self.search.gain_width(t)
-        off = [int(k) for k in np.flatnonzero(np.abs(g - 1) > np.maximum(TOUCH.gain_off, half))]
+        off = [int(k) for k in np.flatnonzero(np.abs(g - 1) > np.maximum(TOUCH.law, half))]
         chosen = sorted(set(off) | set(moved))
         names = [f"{pad}:{k}" for k in chosen]
         value = [round(float(g[k]), 4) for k in chosen]
@@ -296,7 +296,7 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
     for what, parts in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
         x = np.concatenate(parts)
         c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
-        if abs(c) > TOUCH.goes_with:
+        if c**2 > SEARCH.least:
             said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
     return [x for _, x in sorted(said, reverse=True)[:2]]
 
@@ -338,18 +338,19 @@ def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[dict[
         return []
     regime = "constant while their neighbours feel a touch"
     return [
-        constant_finding([f"{f}:{k}" for k in sorted(taxels)], regime, TOUCH.constant)
+        constant_finding([f"{f}:{k}" for k in sorted(taxels)], regime, JUDGE.sure)
         for f, taxels in sorted(worst.items())
         if taxels
     ]
 
 
 def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
-    """Taxels [K] with no change although three neighbours changed by `TOUCH.touched` of the pad's largest."""
+    """Taxels [K] with no change although three neighbours changed by `TOUCH.spread` of the pad's largest: more than
+    what a touch beside them may pass on."""
     top = float(span.max())
     if top <= 0 or len(span) < len(beside):
         return set()
-    felt = span > TOUCH.touched * top
+    felt = span > TOUCH.spread * top
     return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= 3}
 
 
@@ -394,7 +395,7 @@ def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
     kinds = {"dead": [k for k, v in silent.items() if v == 0], "stuck": [k for k, v in silent.items() if v != 0]}
     said = "; ".join(f"{kind}: {', '.join(map(str, taxels))}" for kind, taxels in kinds.items() if taxels)
     regime = f"constant while they are pressed ({said})"
-    return constant_finding([f"{pad}:{k}" for k in sorted(silent)], regime, TOUCH.constant_pressed)
+    return constant_finding([f"{pad}:{k}" for k in sorted(silent)], regime, JUDGE.surest)
 
 
 def merge_constant(gain: dict, dead: dict) -> None:

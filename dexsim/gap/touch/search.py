@@ -15,7 +15,7 @@ from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_c
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read import BLOCK
-from dexsim.gap.rules import SEARCH, TOUCH
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
@@ -117,7 +117,7 @@ class PadFit:
         p = np.concatenate([readings(r, self.base) for r in self.runs])
         step = max(r.lsb for r in self.runs)
         still = np.ptp(z, axis=0) <= max(0.5 * step, 1e-9)
-        least = max(TOUCH.felt * self.noise, TOUCH.felt_counts * step)
+        least = max(JUDGE.far * self.noise, 2 * BELIEF.zero * step)  # the reading's own zero, and its neighbours'
         pressed = p.max(0) > least
         # the object may touch beside where the joints say: neighbours on both sides must feel it
         near = [
@@ -125,7 +125,7 @@ class PadFit:
             for beside in self.runs[0].beside
         ]
         pressed &= np.array(near)
-        stuck = still & (z[0] > TOUCH.stuck * step)
+        stuck = still & (z[0] > BELIEF.zero * step)
         return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
 
     def _samples(self, held: set[str]) -> list[Sample]:
@@ -427,11 +427,11 @@ class PadSearch(PadFit):
 
             def priced(t: TouchTrial, had: bool = current.gains is not None) -> float:
                 """A gain for every taxel must do clearly better than one number."""
-                return self.cross(t).sum() * (1.0 if t.gains is None or had else TOUCH.map_price)
+                return self.cross(t).sum() * (1.0 if t.gains is None or had else JUDGE.within**2)
 
             least = min(map(priced, good))
             current = min(
-                (t for t in good if priced(t) <= (1 + TOUCH.close) * least), key=lambda t: self.size(t.res) * priced(t)
+                (t for t in good if priced(t) <= (1 + SEARCH.tie) * least), key=lambda t: self.size(t.res) * priced(t)
             )
         current = self._drop(current, trials)
         if current.ids and current.gains is None:  # the numbers, to their end
@@ -509,8 +509,8 @@ class PadSearch(PadFit):
             )
             if self.scale_known:
                 tries.append(self._common(current, 60))
-            # a map where one number does not: a third less error, beside the price of its 120 numbers
-            if len(tries) == 2 and self.size(tries[0].res) > TOUCH.map_better * self.size(tries[1].res):
+            # a map where one number does not follow: nearer than this they follow alike
+            if len(tries) == 2 and JUDGE.within**2 * self.size(tries[0].res) > self.size(tries[1].res):
                 tries = tries[1:]
             return tries[0]
         starts = sorted(
@@ -559,8 +559,8 @@ class PadSearch(PadFit):
         out, used = np.arange(K), set()
         gain = own[:, None] + own[None] - left - left.T
         # each of the two must fit the other's place far better than its own
-        fits = left < TOUCH.swapped * own[:, None]
-        good = fits & (left.T < TOUCH.swapped * own[None]) & (gain > TOUCH.exchange * self.noise**2)
+        fits = JUDGE.within**2 * left < own[:, None]
+        good = fits & (JUDGE.within**2 * left.T < own[None]) & (gain > (JUDGE.far * self.noise) ** 2)
         pairs = sorted(((gain[i, j], i, j) for i, j in zip(*np.nonzero(np.triu(good, 1)), strict=True)), reverse=True)
         for _, i, j in pairs:
             if i not in used and j not in used:
@@ -623,7 +623,7 @@ class PadSearch(PadFit):
                 if t.gains is None:
                     again = self.fit(t.ids, start, None, t.gains, t.order, 160)
                     t = again if self.size(again.res) < self.size(t.res) else t
-            if t is not None and (self.size(t.res) < TOUCH.rival * self.size(current.res) or alike):
+            if t is not None and (self.size(t.res) < JUDGE.within**2 * self.size(current.res) or alike):
                 self.cross(t)
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[self.cross(t) for _, t in others], self.cross(base)])
