@@ -105,7 +105,7 @@ def test_touch_is_doubted_alike():
 def test_weigh_takes_every_doubt_into_account():
     assert confidence.weigh(evidence(), 10.0, 1.0, 10.0, 1.0) == 0.99
     assert confidence.weigh(evidence(reasons=["x"]), 10.0, 1.0, 10.0, 1.0) == DOUBTED
-    assert confidence.weigh(evidence(), 10.0, 8.0, 10.0, 1.0) == pytest.approx(0.5)  # over half stays
+    assert confidence.weigh(evidence(), 10.0, 7.0, 10.0, 1.0) == pytest.approx(0.5)  # half of the square stays
     # next to nothing of what the first one left
     assert confidence.weigh(evidence(members=2), 20.0, 4.0, 4.5, 1.0) < 0.6
     assert confidence.weigh(evidence(earned=0.3), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)

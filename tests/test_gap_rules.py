@@ -470,7 +470,7 @@ def test_a_trifle_beside_another_effect_is_doubted():
 
 def test_what_stays_unexplained_costs_confidence():
     keeps = lambda share: confidence.trusted(100.0, np.sqrt(share) * 100.0, 0.0)  # noqa: E731
-    assert keeps(0.0) == 1.0 and keeps(0.3) == pytest.approx(0.7) and keeps(0.45) > 0.5 and keeps(0.8) == 0.5
+    assert keeps(0.0) == 1.0 and keeps(0.15) == pytest.approx(0.75) and keeps(0.25) > 0.5 and keeps(0.35) == 0.5
 
 
 def test_a_rival_of_the_same_class_makes_a_set():

@@ -247,7 +247,8 @@ class JudgeRules:
     )
     removed: float = _rule(
         0.3,
-        "share of the gap between error and floor that names must remove to count as a part of the answer",
+        "share of the gap between error and floor that names must remove to count as a part of the answer; of the "
+        "squared error, from which on what stays costs a name `left_costs` of its confidence",
         "what `partly_explained` says (docs/reference/files.md)",
         "test_what_counts_as_a_part_of_the_answer",
     )
@@ -309,9 +310,9 @@ class JudgeRules:
     )
     left_costs: float = _rule(
         0.5,
-        "share of its confidence that a name loses at most by the share of the squared error that stays unexplained",
-        "of names that leave up to a twentieth 149 of 216 are true, up to a half 51 of 150, beyond it 6 of 72 "
-        "(four sets of cases of another plant)",
+        "share of its confidence that a name loses at most by what stays unexplained",
+        "of names that leave up to 0.05 of the squared error 149 of 216 are true, up to 0.3 (`removed`) 41 of 92, beyond "
+        "it 16 of 130 (four sets of cases of another plant)",
         "test_what_stays_unexplained_costs_confidence",
     )
     one_load: float = _rule(

@@ -95,9 +95,10 @@ def left_over(after: float, before: float, noise: float) -> float:
 
 
 def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses that
-    share, `JUDGE.left_costs` at most. What follows only half of a gap may be another effect's likeness."""
-    return 1.0 - min(left_over(after, before, noise), JUDGE.left_costs)
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses
+    `JUDGE.left_costs` where that is `JUDGE.removed` or more, evenly less below. What follows only half of a gap may be
+    another effect's likeness."""
+    return 1.0 - JUDGE.left_costs * min(left_over(after, before, noise) / JUDGE.removed, 1.0)
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
