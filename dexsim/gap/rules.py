@@ -311,8 +311,8 @@ class JudgeRules:
     left_costs: float = _rule(
         0.5,
         "share of its confidence that a name loses at most by what stays unexplained",
-        "of names that leave up to 0.05 of the squared error 149 of 216 are true, up to 0.3 (`removed`) 41 of 92, beyond "
-        "it 16 of 130 (four sets of cases of another plant)",
+        "of names that leave up to 0.05 of the squared error 149 of 216 are true, up to 0.3 (`removed`) 41 of 92, "
+        "beyond it 16 of 130 (four sets of cases of another plant)",
         "test_what_stays_unexplained_costs_confidence",
     )
     one_load: float = _rule(
@@ -417,7 +417,8 @@ class JudgeRules:
         0.1,
         "of its large speed: from there on a joint moves, where braking is told from rest, a recording begins in "
         "motion, or a torque is fitted while its joint moves",
-        "by judgement: the 3 learning cases that read it (effort, empty, friction) answer the same from 0.05 to 0.2",
+        "between 0.04, which a count of 12 bits over two samples at 100 Hz is of 2 rad/s, and 0.3, slower than which "
+        "a joint that swings evenly is a fifth of its time",
         "test_regimes_of_a_motion",
     )
     slides: float = _rule(
