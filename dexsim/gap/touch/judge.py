@@ -74,7 +74,8 @@ class PadAnswer:
         b, a = held_out(search, less, stage)[0], held_out(search, best, stage)[0]
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= JUDGE.level][:2]
-        earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
+        judged = np.isfinite(a)  # what nothing kept out shows is doubted
+        earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if judged else JUDGE.doubted
         if earned <= TOUCH.earned:
             self.notes.append(
                 f"{e} on the {self.name}'s pad earned its place in training but not on what was kept out; not claimed"
