@@ -269,8 +269,8 @@ MUTATIONS = (
     Mutation(
         "a torque that takes nothing off is offered",
         "dexsim/gap/rules.py",
-        '0.10,\n        "share of the held-out error that a stand-in',
-        '0.0,\n        "share of the held-out error that a stand-in',
+        '0.1,\n        "share of the error kept out that a name must cost',
+        '0.0,\n        "share of the error kept out that a name must cost',
         "tests/test_gap_rules.py::test_a_stand_in_must_take_a_least_share_off",
     ),
 )
