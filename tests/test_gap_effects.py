@@ -233,6 +233,36 @@ class Cable(Effect):
     def parameters(self, fit):
         return {"stiffness": fit.entry("stiffness", "N.m/rad3")}
 '''
+WORN = '''
+
+class Worn(Effect):
+    """A gear worn at one side of its turn: its dry friction varies with the position, k (1 + sin q) / 2."""
+
+    id = "worn_gear"
+    words = "has a gear that rubs at one side of its turn"
+    shows = "at one side of its range"
+    experiment = "slow constant speed over the whole range"
+    demo = {"wear": 0.1}
+
+    def variants(self, s):
+        return [Variant((param("friction", "wear", "set", 0.0, 2.0, 0.0, "N.m"),), ((0.02,), (0.1,), (0.3,)))]
+
+    def signal(self, case, values, note):
+        return 1.0 + np.sin(case.regimes["position"])
+
+    def parameters(self, fit):
+        return {"friction": fit.entry("friction", "N.m")}
+'''
+RUBS = '''WEAR = INDEX["wear"]
+
+
+@wp.func
+def worn(friction: Any, q: Any):
+    """Dry friction [N.m] of a gear that is worn at one side of its turn, q [rad]: friction (1 + sin q) / 2."""
+    return type(q)(0.5) * friction * (type(q)(1.0) + wp.sin(q))
+
+
+'''
 LAW = '''PULL = INDEX["cable"]
 
 
@@ -246,7 +276,14 @@ ADDED = (
     (
         "actuator/columns.py",
         "    # Torque of nothing that is known",
-        '    Column("cable", "N.m/rad3", 0.0, 0.0, 1e3, 0.05, "a cable that pulls home", feature="cable"),\n',
+        '    Column("cable", "N.m/rad3", 0.0, 0.0, 1e3, 0.05, "a cable that pulls home", feature="cable"),\n'
+        '    Column("wear", "N.m", 0.0, 0.0, 1e3, 0.02, "dry friction at one side of the turn", feature="wear"),\n',
+    ),
+    ("actuator/laws.py", "@cache\ndef dry_friction(", RUBS),
+    (
+        "actuator/laws.py",
+        "        return wp.vector(steady, fading, loaded, loaded_fading)",
+        '        if wp.static("wear" in features):\n            steady += warm * worn(of[WEAR], q)\n',
     ),
     ("actuator/laws.py", "# -- what a drive adds by itself", LAW),
     (
@@ -261,7 +298,13 @@ ADDED = (
         '    if "cable" in features:\n        torque = torque - p["cable"] * q**3\n'
         '        by_position = by_position - 3 * p["cable"] * q**2\n',
     ),
+    (
+        "actuator/reference.py",
+        "    return level\n",
+        '    if "wear" in features:\n        level = level + 0.5 * p["wear"] * (1.0 + np.sin(q))\n',
+    ),
     ("gap/effects/body.py", "", CABLE),
+    ("gap/effects/friction.py", "", WORN),
 )
 TRIED = """
 import json, sys
@@ -276,8 +319,10 @@ from dexsim.gap.judge.handed_on import residual_torque
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.servos import ServoRandomizer
 
+out, effect, column, beside = Path(sys.argv[1]), *sys.argv[2:]
+
 class Drives:  # of 400 worlds
-    joints, queue, control_period, features = ("joint",), 8, 0.02, frozenset({"cable"})
+    joints, queue, control_period, features = ("joint",), 8, 0.02, frozenset({column})
     table = ServoTable.from_dict(demo.BELIEVED)
     nominal = torch.as_tensor(table.nominal(joints), dtype=torch.float32)
     params = nominal.expand(400, *nominal.shape).clone()
@@ -292,32 +337,49 @@ def judged(self):
     judge(self)
 Steps.judge = judged
 
-out = Path(sys.argv[1])
-paths, model, servo, hidden = demo.make(out, "cable_pull", seconds=5.0)
-d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={"cable_pull",
-             "payload"}), say=lambda _: None)
+paths, model, servo, hidden = demo.make(out, effect, seconds=5.0)
+d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={effect, beside}),
+             say=lambda _: None)
 save(d, out)
 row = ServoTable.from_dict(demo.BELIEVED).nominal(["joint"])[0]
-plain, pulled = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9, features={"cable"})["qfrc_applied"] for r in (row,
-             np.where(np.arange(len(row)) == reference.INDEX["cable"], 0.08, row)))
-ranges = {"servo": {"cable": [0.02, 0.06]}}
-ServoRandomizer(Drives(), Sampler(ranges, torch.Generator().manual_seed(0), 400, "cpu")).draw(torch.ones(400).bool())
-drawn = Drives.params[:, 0, reference.INDEX["cable"]]
-print(json.dumps({"hidden": hidden, "left": left, "torque": float(pulled - plain), "drawn": [float(drawn.min()),
-             float(drawn.max())], "row": ServoTable.load(out / "servo.yaml").value("joint", "cable").value}))
+without, there = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9, features={column}) for r in (row,
+                  np.where(np.arange(len(row)) == reference.INDEX[column], hidden[column], row)))
+ServoRandomizer(Drives(), Sampler({"servo": {column: [0.02, 0.06]}}, torch.Generator().manual_seed(0), 400,
+                "cpu")).draw(torch.ones(400).bool())
+drawn = Drives.params[:, 0, reference.INDEX[column]]
+print(json.dumps({"hidden": hidden, "left": left, "drawn": [float(drawn.min()), float(drawn.max())],
+    "torque": float(there["qfrc_applied"] - without["qfrc_applied"]),
+    "friction": float(there["dof_frictionloss"] - without["dof_frictionloss"]),
+    "row": ServoTable.load(out / "servo.yaml").value("joint", column).value}))
 """
+# effect, its words, its column, what else may be named, its parameter; torque and dry friction [N.m] at 1 rad of what
+# hides
+NEW = (
+    ("cable_pull", "is pulled home by a cable", "cable", "payload", "stiffness", -0.08, 0.0),
+    (
+        "worn_gear",
+        "has a gear that rubs at one side of its turn",
+        "wear",
+        "coulomb_friction",
+        "friction",
+        0.0,
+        0.05 * (1.0 + np.sin(1.0)),
+    ),
+)
 
 
 @pytest.mark.slow
 def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
-    """A copy of the package with one effect more, added in the places that CONTRIBUTING names and nowhere else (this
-    test is the fifth): it is drawn for training, planted by the engine that trains, found, sized, taken for explained,
-    written to servo.yaml and shown on the page; the servo's kernel and the NumPy reference agree on it."""
+    """A copy of the package with two effects more, a torque and a dry friction, each added in the places that
+    extending.md names and nowhere else (this test is the fifth): drawn for training, planted by the engine that trains,
+    found, sized, taken for explained, written to servo.yaml and shown on the page; the servo's kernel and the NumPy
+    reference agree on them."""
     assert {name for name, _, _ in ADDED} == {
         "actuator/columns.py",
         "actuator/laws.py",
         "actuator/reference.py",
         "gap/effects/body.py",
+        "gap/effects/friction.py",
     }
     package = tmp_path / "dexsim"
     shutil.copytree(Path(dexsim.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -326,7 +388,7 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
         old = path.read_text(encoding="utf-8") if path.is_file() else ""
         assert old.count(before) == 1 or not before, f"{name}: {before}"
         path.write_text(old.replace(before, text + before) if before else old + text, encoding="utf-8")
-    script, out = tmp_path / "tried.py", tmp_path / "out"
+    script = tmp_path / "tried.py"
     script.write_text(TRIED, encoding="utf-8")
     shutil.copy(Path(__file__).with_name("test_servo.py"), tmp_path)
 
@@ -338,11 +400,17 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
 
     compared = told("-m", "pytest", "-q", "-p", "no:xdist", "test_servo.py", "-k", "agrees and all_features")
     assert "4 passed" in compared
-    said = json.loads(told(str(script), str(out)).splitlines()[-1])
-    first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]
-    assert said["hidden"] == {"cable": 0.08} and said["torque"] == pytest.approx(-0.08, rel=1e-3)
-    assert first["effect"] == "cable_pull" and first["parameters"]["stiffness"]["value"] == pytest.approx(0.08, rel=0.1)
-    assert said["left"][1] < 0.5 * said["left"][0]  # what it explains is not left to a stand-in
-    assert said["drawn"] == [pytest.approx(0.02, abs=1e-3), pytest.approx(0.06, abs=1e-3)]
-    assert said["row"] == pytest.approx(first["parameters"]["stiffness"]["value"], rel=1e-3)
-    assert "is pulled home by a cable" in (out / "report.html").read_text(encoding="utf-8")
+    for effect, words, column, beside, parameter, torque, friction in NEW:
+        out = tmp_path / effect
+        said = json.loads(told(str(script), str(out), effect, column, beside).splitlines()[-1])
+        first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]
+        (hidden,) = said["hidden"].values()
+        found = first["parameters"][parameter]["value"]
+        assert list(said["hidden"]) == [column] and hidden > 0
+        assert said["torque"] == pytest.approx(torque, rel=1e-3, abs=1e-9)
+        assert said["friction"] == pytest.approx(friction, rel=1e-3, abs=1e-9)
+        assert first["effect"] == effect and found == pytest.approx(hidden, rel=0.1)
+        assert said["left"][1] < 0.5 * said["left"][0]  # what it explains is not left to a stand-in
+        assert said["drawn"] == [pytest.approx(0.02, abs=1e-3), pytest.approx(0.06, abs=1e-3)]
+        assert said["row"] == pytest.approx(found, rel=1e-3)
+        assert words in (out / "report.html").read_text(encoding="utf-8")

@@ -3,8 +3,8 @@
 Each column has a neutral value at which its effect is absent: neutral values with kp and kd set are an ideal PD drive.
 Units are those of a hinge; for a slide joint read m, m/s, N, N/m for rad, rad/s, N.m, N.m/rad.
 To add an effect: one `Column` here, its law in `laws.py`, which the training's kernel and the search's plant call, and
-the same law in `reference.py`, written apart; CONTRIBUTING.md has the rest. Effects that most drives do without are
-compiled in only where they are used (`Column.feature`): the usual servo does not pay for them.
+the same law in `reference.py`, written apart; docs/howto/extending.md has the rest. Effects that most drives do without
+are compiled in only where they are used (`Column.feature`): the usual servo does not pay for them.
 """
 
 from __future__ import annotations

@@ -52,20 +52,17 @@ from dexsim.actuator.columns import INDEX
 from dexsim.actuator.laws import (
     arrived,
     difference,
+    dry_friction,
     eccentricity,
     eccentricity_slope,
-    fading_friction,
-    gear_friction,
     hold,
     lag_share,
-    load_share,
     other_terms,
     parasitic_torque,
     pd,
     preslide,
     preslide_slope,
     sagging,
-    stribeck_power,
     torque_limits,
     transmission,
     transmission_damping,
@@ -96,11 +93,7 @@ KP, KD = INDEX["kp"], INDEX["kd"]
 DEADBAND = INDEX["deadband"]
 TORQUE_LIMIT, NO_LOAD_SPEED = INDEX["torque_limit"], INDEX["no_load_speed"]
 EFFICIENCY, DELAY, LAG_TIME, SUPPLY = INDEX["efficiency"], INDEX["delay"], INDEX["lag"], INDEX["supply"]
-COULOMB, ASYMMETRY = INDEX["coulomb_friction"], INDEX["friction_asymmetry"]
-STRIBECK_PEAK, STRIBECK_SPEED = INDEX["stribeck_peak"], INDEX["stribeck_speed"]
-VISCOUS = INDEX["viscous_friction"]
-LOAD, LOAD_BACK = INDEX["load_friction"], INDEX["load_friction_backdriven"]
-LOAD_OUTSIDE = INDEX["load_friction_external"]
+VISCOUS, ASYMMETRY = INDEX["viscous_friction"], INDEX["friction_asymmetry"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 SPEED_LAG, DEADBAND_KIND = INDEX["speed_lag"], INDEX["deadband_kind"]
@@ -108,7 +101,7 @@ BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
     INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
 )
 WARMTH, BRAKING = INDEX["warmth"], INDEX["braking_slope"]
-STRIBECK_EXPONENT, PRESLIDING = INDEX["stribeck_exponent"], INDEX["presliding"]
+PRESLIDING = INDEX["presliding"]
 FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (
     INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain")
 )
@@ -198,12 +191,12 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
     asks for; `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two.
     Each has the law as `laws.py` states it and takes it to the end of the step ("Integration")."""
-    play, sag, rare, braking, controller, presliding, shape, load = (
-        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape", "load")
+    play, sag, rare, braking, controller, presliding, load = (
+        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "load")
     )
     extended = bool(features & EXTENDED)
     Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
-    parasitic = parasitic_torque(features)
+    parasitic, dry = parasitic_torque(features), dry_friction(features)
 
     @wp.struct
     # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
@@ -440,25 +433,13 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     def resist(dt: real, x0: int, fresh: bool, last: real, r: Rotor, factor: real, d: Drives, w: int, j: int):
         """Friction at the motor's speed; last: its torque of the step before."""
         f = Friction()
-        f.viscous = d.params[w, j, VISCOUS]
-        peak = d.params[w, j, STRIBECK_PEAK]
-        share = load_share(last, r.v, d.params[w, j, LOAD], d.params[w, j, LOAD_BACK])
-        f.level = d.base_frictionloss[w, j] + d.params[w, j, COULOMB]
-        if wp.static(rare):
-            f.viscous = f.viscous * factor
-            peak = peak * factor
-            share = share * factor
-            f.level = d.base_frictionloss[w, j] + factor * d.params[w, j, COULOMB]
-        exponent = real(2.0)
-        if wp.static(shape):
-            exponent = d.params[w, j, STRIBECK_EXPONENT]
-        left = wp.exp(-stribeck_power(r.v / d.params[w, j, STRIBECK_SPEED], exponent))
+        f.viscous = d.params[w, j, VISCOUS] * factor
+        outside = real(0.0)
         if wp.static(load):
             outside = d.outside[w, d.dof[j]]
-            by_share = gear_friction(last, outside, share, factor * d.params[w, j, LOAD_OUTSIDE])
-            f.level += peak * left + by_share + factor * left * fading_friction(d.params[w, j], last, outside)
-        else:
-            f.level += peak * left + share * wp.abs(last)
+        level = dry(d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, last, outside, wp.static(load), factor)
+        f.level = d.base_frictionloss[w, j] + level[0]
+        f.level += level[1] + level[2] + level[3]
         f.own = f.level - d.base_frictionloss[w, j]
         if wp.static(presliding):  # a torque, taken up at the step's begin, and its line in the speed at the step's end
             give = d.params[w, j, PRESLIDING]

@@ -2,11 +2,12 @@
 search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32 and in float64; `reference.py` has the
 same laws in NumPy, written apart, as their check.
 
-Where several laws make up one quantity they are put together here, for both kernels: `parasitic_torque`, `warm_motor`,
-`fading_friction`. `of` is there a drive's row of the table, in the order of `columns.py`."""
+Where several laws make up one quantity they are put together here, for both kernels: `warm_motor`, `dry_friction`,
+`parasitic_torque`. `of` is there a drive's row of the table, in the order of `columns.py`."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
+import math
 from functools import cache
 from typing import Any
 
@@ -17,6 +18,12 @@ from dexsim.actuator.columns import INDEX
 TORQUE_LIMIT, NO_LOAD_SPEED, EFFICIENCY = (INDEX[n] for n in ("torque_limit", "no_load_speed", "efficiency"))
 THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE = (
     INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance")
+)
+COULOMB, STRIBECK_PEAK, STRIBECK_SPEED, STRIBECK_EXPONENT = (
+    INDEX[n] for n in ("coulomb_friction", "stribeck_peak", "stribeck_speed", "stribeck_exponent")
+)
+LOAD, LOAD_BACK, LOAD_OUTSIDE = (
+    INDEX[n] for n in ("load_friction", "load_friction_backdriven", "load_friction_external")
 )
 LOAD_PEAK, LOAD_PEAK_OUTSIDE, LOAD_SQUARE, LOAD_SQUARE_OUTSIDE = (
     INDEX[n] for n in ("load_stribeck", "load_stribeck_external", "load_quadratic", "load_quadratic_external")
@@ -209,12 +216,46 @@ def opposed_square(motor: Any, outside: Any, per_motor: Any, per_outside: Any):
     return out
 
 
-@wp.func
-def fading_friction(of: wp.array(dtype=Any), motor: Any, outside: Any):
-    """Dry friction [N.m] of a drive by what its gear carries, `motor` and `outside` [N.m], as far as it falls with
-    speed like the column `stribeck_peak` (`gear_friction`, `opposed_square`): at rest."""
-    friction = gear_friction(motor, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
-    friction += opposed_square(motor, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
+@cache
+def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf) -> Any:
+    """The Warp function of a drive's dry friction, as a sum of laws, for a kernel with these of `columns.FEATURES`;
+    gone: `stribeck_power` from which on nothing of the column `stribeck_peak` is left.
+
+    A further such law is a function of this file and a term of `steady` here, and in `reference.dry_friction`:
+    training, search and what a diagnosis hands on take their friction from these two. How a level of friction acts on
+    the joint, that it sticks, differs by direction or gives way first, is the kernels' own."""
+
+    @wp.func
+    def friction(of: wp.array(dtype=Any), q: Any, v: Any, motor: Any, outside: Any, carries: bool, warm: Any):
+        """Level [N.m], as four parts of a sum: what neither speed nor load changes; what falls with speed; by the load;
+        by the load and falling with speed. Four, since in finite precision a sum depends on its order, and each kernel
+        keeps its own, so that results made before can be made again bit for bit.
+
+        q, v: position [rad] of the joint and speed [rad/s] of the motor; motor: torque [N.m] of the step before;
+        outside: what the joint felt from outside then; carries: whether that, or a column of the feature `load`,
+        counts; warm: factor on all of it."""
+        steady = warm * of[COULOMB]
+        fading = type(q)(0.0)
+        share = warm * load_share(motor, v, of[LOAD], of[LOAD_BACK])
+        loaded = share * wp.abs(motor)
+        loaded_fading = type(q)(0.0)
+        exponent = type(q)(2.0)
+        if wp.static("shape" in features):
+            exponent = of[STRIBECK_EXPONENT]
+        if of[STRIBECK_PEAK] > type(q)(0.0) or carries:
+            power = stribeck_power(v / of[STRIBECK_SPEED], exponent)
+            left = type(q)(0.0)
+            if power < type(q)(gone) or carries:
+                left = wp.exp(-power)
+            if power < type(q)(gone):
+                fading = warm * of[STRIBECK_PEAK] * left
+            if carries:
+                loaded = gear_friction(motor, outside, share, warm * of[LOAD_OUTSIDE])
+                by_both = gear_friction(motor, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
+                by_both += opposed_square(motor, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
+                loaded_fading = warm * left * by_both
+        return wp.vector(steady, fading, loaded, loaded_fading)
+
     return friction
 
 

@@ -92,18 +92,32 @@ def parasitic_torque(
     return torque, by_position, np.zeros_like(v)
 
 
-def load_level(
-    p: Mapping[str, Numbers], share: Numbers, motor: Numbers, outside: Numbers, fades: Numbers
-) -> np.ndarray:
-    """Dry friction [...] N.m of a gear by its load (`laws.gear_friction`, `laws.opposed_square`).
+def dry_friction(
+    p: Mapping[str, Numbers],
+    q: Numbers,
+    v: Numbers,
+    motor: Numbers,
+    outside: Numbers = 0.0,
+    features: Collection[str] = FEATURES,
+) -> Numbers:
+    """Level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of `laws.dry_friction`.
 
-    p: columns by name; share: `load_friction` in this direction; motor, outside: torques on the gear's two sides, N.m;
-    fades: exp(-|v / stribeck_speed|^stribeck_exponent)."""
-    lost = p["load_stribeck_external"] * outside - p["load_stribeck"] * motor
-    small = np.minimum(np.abs(motor), np.abs(outside)) ** 2
-    driven, drives = np.abs(outside) > np.abs(motor), np.abs(outside) < np.abs(motor)
-    square = small * (driven * p["load_quadratic"] + drives * p["load_quadratic_external"]) * (motor * outside < 0.0)
-    return np.abs(p["load_friction_external"] * outside - share * motor) + fades * (np.abs(lost) + square)
+    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; motor, outside: torques on the gear's two sides,
+    N.m; features: those of `columns.FEATURES` that count."""
+    exponent = p["stribeck_exponent"] if "shape" in features else 2.0
+    fades = np.exp(-(np.abs(v / p["stribeck_speed"]) ** exponent))
+    share = np.where(motor * v < 0.0, p["load_friction_backdriven"], p["load_friction"])
+    level = p["coulomb_friction"] + p["stribeck_peak"] * fades
+    if "load" in features:
+        lost = p["load_stribeck_external"] * outside - p["load_stribeck"] * motor
+        small = np.minimum(np.abs(motor), np.abs(outside)) ** 2
+        driven, drives = np.abs(outside) > np.abs(motor), np.abs(outside) < np.abs(motor)
+        square = driven * p["load_quadratic"] + drives * p["load_quadratic_external"]
+        level = level + np.abs(p["load_friction_external"] * outside - share * motor)
+        level = level + fades * (np.abs(lost) + small * square * (motor * outside < 0.0))
+    else:
+        level = level + share * np.abs(motor)
+    return level
 
 
 def servo(
@@ -272,15 +286,7 @@ def servo(
     applied = applied + p["standin_constant"] + pull * q + brake * v - spring * dt * v
     damping = damping + spring * dt + np.maximum(0.0, -brake)
 
-    fraction = np.where(last * v_drive < 0.0, p["load_friction_backdriven"], p["load_friction"])
-    exponent = p["stribeck_exponent"] if "shape" in features else 2.0
-    fades = np.exp(-(np.abs(v_drive / p["stribeck_speed"]) ** exponent))
-    own = p["coulomb_friction"] + p["stribeck_peak"] * fades
-    if "load" in features:
-        own = own + load_level(p, fraction, last, outside, fades)
-    else:
-        own = own + fraction * np.abs(last)
-    own = friction_factor * own
+    own = friction_factor * dry_friction(p, q, v_drive, last, outside, features)
     level = base_frictionloss + own
     viscous = friction_factor * p["viscous_friction"]
 

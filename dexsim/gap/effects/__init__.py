@@ -3,7 +3,7 @@ diagnosis needs to know of one effect, on a joint (`Effect`) or of touch and con
 effect writes for training.
 
 Of an effect that training has no use for the columns stand in `dexsim.gap.plant.columns`, of all others in
-`dexsim.actuator.columns`; how to add one, step by step, is in CONTRIBUTING.md.
+`dexsim.actuator.columns`; how to add one, step by step, is in docs/howto/extending.md.
 """
 
 from __future__ import annotations

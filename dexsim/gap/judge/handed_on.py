@@ -12,7 +12,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, INDEX
-from dexsim.actuator.reference import load_level, parasitic_torque, torque_along
+from dexsim.actuator.reference import dry_friction, parasitic_torque, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.judge import kept_out
@@ -305,10 +305,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
     )
-    fades = np.exp(-((v / p("stribeck_speed")) ** 2))
-    share = np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction"))
-    by_load = load_level(columns, share, motor, inertia * a - needed, fades)
-    level = p("coulomb_friction") + p("stribeck_peak") * fades + by_load + case.constants.friction
+    level = dry_friction(columns, q, v, motor, inertia * a - needed) + case.constants.friction
     friction = (
         level * np.sign(v)
         + 0.5 * p("friction_asymmetry") * level

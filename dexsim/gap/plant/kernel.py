@@ -20,10 +20,9 @@ from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.laws import (
     arrived,
     difference,
+    dry_friction,
     eccentricity,
     eccentricity_slope,
-    fading_friction,
-    gear_friction,
     hold,
     lag_share,
     load_share,
@@ -33,7 +32,6 @@ from dexsim.actuator.laws import (
     preslide,
     preslide_speed,
     sagging,
-    stribeck_power,
     torque_limits,
     transmission,
     transmission_damping,
@@ -45,6 +43,7 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
+dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
 LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
@@ -55,13 +54,7 @@ CONSTS = 10  # of them
 P_KP, P_KD, P_DEADBAND, P_DELAY, P_LAG, P_SUPPLY = (
     INDEX[n] for n in ("kp", "kd", "deadband", "delay", "lag", "supply")
 )
-P_COULOMB, P_ASYM, P_PEAK, P_VS, P_VISC, P_LOAD, P_BACK = (
-    INDEX[n]
-    for n in (
-        "coulomb_friction", "friction_asymmetry", "stribeck_peak", "stribeck_speed", "viscous_friction",
-        "load_friction", "load_friction_backdriven",
-    )
-)  # fmt: skip
+P_ASYM, P_VISC = INDEX["friction_asymmetry"], INDEX["viscous_friction"]
 P_LOADOUT = INDEX["load_friction_external"]  # the first of `FEATURES["load"]`, which stand in a row
 P_OFFSET, P_SCALE = INDEX["position_offset"], INDEX["position_scale"]
 P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, P_SAG = (
@@ -97,7 +90,6 @@ P_READSCALE, P_READOFFSET = INDEX["readout_scale"], INDEX["readout_offset"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
-P_EXPONENT = INDEX["stribeck_exponent"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
@@ -168,13 +160,7 @@ class Guess:  # the columns of one guess that every step asks for
     two: bool  # rotor and link are two bodies
     give: f64  # presliding
     viscous: f64
-    coulomb: f64
-    peak: f64
-    stribeck_speed: f64
-    exponent: f64
-    load: f64  # friction's share of the load, driving, and
-    back: f64  # back-driven
-    carries: bool  # it is by the load from outside too, or falls with speed, or is by its square
+    carries: bool  # friction is by the load from outside too, or falls with speed, or is by its square
     gear_load: f64  # friction by what the gear hands to the joint, driving it, and
     gear_back: f64  # back-driven
     gear_power: f64
@@ -297,12 +283,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
-    p.coulomb = c.params[h, P_COULOMB]
-    p.peak = c.params[h, P_PEAK]
-    p.stribeck_speed = c.params[h, P_VS]
-    p.exponent = c.params[h, P_EXPONENT]
-    p.load = c.params[h, P_LOAD]
-    p.back = c.params[h, P_BACK]
     for k in range(wp.static(len(SERVO_FEATURES["load"]))):
         p.carries = p.carries or c.params[h, P_LOADOUT + k] != f64(0.0)
     p.gear_load = c.params[h, P_GEARLOAD]
@@ -585,28 +565,6 @@ def borne_friction(borne: f64, v: f64, p: Guess):
     return share * p.gear_unit * wp.pow(wp.abs(borne) / p.gear_unit, p.gear_power)
 
 
-@wp.func
-def carried_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, share: f64, p: Guess):
-    """Level [N.m] by what the gear carries on both sides (BAM's models m3 to m6)."""
-    fading = fading_friction(c.params[h], torque, outside)
-    left = wp.exp(-stribeck_power(v / p.stribeck_speed, p.exponent))
-    return gear_friction(torque, outside, share, c.params[h, P_LOADOUT]) + left * fading
-
-
-@wp.func
-def dry_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, p: Guess, n: Now):
-    """Level [N.m] at the motor's speed; torque: the motor's of the step before; outside: what the joint feels else."""
-    level = p.coulomb
-    if p.peak > f64(0.0):
-        power = stribeck_power(v / p.stribeck_speed, p.exponent)
-        if power < f64(25.0):
-            level += p.peak * wp.exp(-power)
-    share = load_share(torque, v, p.load, p.back)
-    if p.carries:
-        return (level + carried_friction(c, h, torque, outside, v, share, p)) * n.friction
-    return (level + share * wp.abs(torque)) * n.friction
-
-
 # -- the bodies --------------------------------------------------------------------------------------------------------
 
 
@@ -823,7 +781,8 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     applied = n.efficiency * t.end
     applied += beside[0]
     applied += p.bias
-    level = dry_friction(c, h, before, p.bias - load, v_drive, p, n)
+    parts = dry(c.params[h], x.q, v_drive, before, p.bias - load, p.carries, f64(1.0))
+    level = (parts[0] + parts[1] + (parts[2] + parts[3])) * n.friction
     if by_gear:
         level += borne_friction(x.borne, v_drive, p) * n.friction
     applied -= p.uneven * level
