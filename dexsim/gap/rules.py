@@ -312,7 +312,7 @@ class JudgeRules:
         0.5,
         "share of its confidence that a name loses at most by what stays unexplained",
         "of names that leave up to 0.05 of the squared error 149 of 216 are true, up to 0.3 (`removed`) 41 of 92, "
-        "beyond it 16 of 130 (four sets of cases of another plant)",
+        "beyond it 16 of 130 (four sets of cases of another plant): there only what wins every draw is no hint (`firm`)",
         "test_what_stays_unexplained_costs_confidence",
     )
     one_load: float = _rule(
@@ -468,7 +468,7 @@ class TouchRules:
     agree: int = _rule(
         5,
         "taxels with one gain from which on those that hardly felt anything are taken to have it too",
-        "the range of five holds the median of all with 94 %, of four with 87 %: the least for a 90 % interval",
+        "the range of five holds the median of all with 94 %, of four with 87.5 %: the least for a 90 % interval",
         "test_taxels_that_agree_speak_for_the_rest",
     )
     short: float = _rule(
