@@ -136,7 +136,7 @@ def row(share, price, effect="lag"):
 
 
 def test_the_short_list_asks_a_price():
-    for price, loss, tried in ((0.15, 1.5, True), (0.25, 1.5, False), (0.25, 2.5, False), (0.25, 4.0, True)):
+    for price, loss, tried in ((0.15, 1.5, True), (0.25, 1.5, False), (0.25, 1.9, True)):
         assert bool(Made()._shortlist([row(0.5, price)], 6, loss, ())) is tried, (price, loss)
 
 
@@ -271,7 +271,7 @@ def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, m
 
 def test_what_saves_much_in_hindsight_is_tried_whatever_its_price():
     for share, found in ((0.025, ()), (0.035, ("lag",))):
-        search = Selecting(lambda ids: (1.0 if ids else 2.0,) * 2, ("viscous_friction", 1.0), saved=[(share, "lag")])
+        search = Selecting(lambda ids: (1.0 if ids else 1.5,) * 2, ("viscous_friction", 1.0), saved=[(share, "lag")])
         assert search.run().best.ids == found, share
 
 
@@ -312,9 +312,9 @@ def test_neither_signal_drowns_the_other():
     assert (r.sigma_q, r.sigma_torque) == (pytest.approx(6.0), pytest.approx(3.0))
 
 
-def test_a_resting_torque_counts_as_restless_up_to_so_much():
-    r = Started(np.zeros(100), np.tile([30.0, -30.0], 50)).r  # changes by more than the bound from sample to sample
-    assert r.sigma_torque == pytest.approx(10.0)
+def test_what_a_torque_changes_by_from_sample_to_sample_is_noise():
+    r = Started(np.zeros(100), np.tile([30.0, -30.0], 50)).r
+    assert r.sigma_torque == pytest.approx(30.0 * np.sqrt(16 / 6))
 
 
 # -- the judgement of the drives
@@ -781,10 +781,9 @@ def takes_part(here: float, now: float, draft: float | None = None) -> bool:
 
 
 def test_what_cannot_follow_is_no_rival():
-    assert takes_part(1.0, 2.1) and not takes_part(1.0, 2.3)
-    assert takes_part(0.0, 0.15) and not takes_part(0.0, 0.25)
-    assert takes_part(1.0, 1.0, draft=2.8) and not takes_part(1.0, 1.0, draft=3.0)
-    assert takes_part(0.0, 0.0, draft=0.35) and not takes_part(0.0, 0.0, draft=0.45)
+    for here, least in ((2.0, 5.0), (0.1, 2.5)):  # what is left, and the least that no rival leaves
+        assert takes_part(here, 0.95 * least) and not takes_part(here, 1.05 * least)
+        assert takes_part(here, here, draft=0.95 * least) and not takes_part(here, here, draft=1.05 * least)
 
 
 def test_a_rival_that_wins_clearly_takes_the_place():
@@ -797,7 +796,7 @@ def test_a_rival_that_wins_clearly_takes_the_place():
 
 def test_a_plain_models_figure_differs_beyond_what_is_believed():
     case, plain = SimpleNamespace(scales=SimpleNamespace(nominal={"kp": 1.0})), param("kp", "kp", "set", 0.0, 10.0)
-    assert selecting._differs(plain, 1.12, case) and not selecting._differs(plain, 1.08, case)
+    assert selecting._differs(plain, 1.17, case) and not selecting._differs(plain, 1.13, case)
 
 
 def test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws():

@@ -465,7 +465,7 @@ class Drives(Steps):
         for x in self.stages[:4]:
             w.say(f"  {x.text}")
         self.by_torque = logged_torque.identify_joints(
-            cases, w.runs, p.train, p.test, w.settings.seed, self.mj_model, p.span_train, p.span_test
+            cases, w.runs, p.train, p.test, self.mj_model, w.settings.seed, p.span_train, p.span_test
         )
         self.behind = logged_torque.torque_texts(self.by_torque)
         self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
@@ -656,7 +656,7 @@ def _other(search: JointSearch, found: Outcome) -> bool:
     for trial in (found.none, found.best):
         with search._fix(trial.members):
             loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
-        if abs(loss - trial.fit.loss) > SEARCH.otherwise * trial.fit.loss:
+        if abs(loss - trial.fit.loss) > SEARCH.least * trial.fit.loss:
             return True
     return False
 

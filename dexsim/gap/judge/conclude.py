@@ -19,7 +19,7 @@ from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, wid
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.charts import number
-from dexsim.gap.rules import JUDGE, SEARCH, TORQUE
+from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, shaking
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
@@ -369,7 +369,7 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
             "after_high": None,
             "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere",
         }
-        data["verdict"] = "partly_explained" if a < TORQUE.partly * b else "unknown"
+        data["verdict"] = "partly_explained" if a < (1 - JUDGE.removed) * b else "unknown"
         data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
 

@@ -243,7 +243,7 @@ def refused(
             out[joint] = reason
         elif (
             plain is not None
-            and after > max(TORQUE.worse * plain.error, JUDGE.within * max(joints[joint]["sigma"], floor))
+            and after > max((1 + BELIEF.tolerance) * plain.error, JUDGE.within * max(joints[joint]["sigma"], floor))
             and _surely(squares, plain)
         ):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"
@@ -292,6 +292,7 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
     """By direction (1, -1): the largest dry friction [N.m] with which every motion of these runs that began at rest
     could begin; infinite where none did."""
     out = {1: np.inf, -1: np.inf}
+    gives = BELIEF.gives_slide if case.scales.slide else BELIEF.gives  # so far it moves without sliding
     plant, speed = case.plant, case.regimes["_speed"]
     for r in runs:
         rows = plant.rows(r)
@@ -300,14 +301,10 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
             continue
         drive, pull = _drive(case, r), _series(case, r, "gravity_cos") + _series(case, r, "rest")
         for way in (1, -1):
-            on = way * v > TORQUE.moving * case.scales.speed
+            on = way * v > JUDGE.slides * case.scales.speed
             edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
             for a, b in zip(edge[::2], edge[1::2], strict=True):
-                if (
-                    a == 0
-                    or t[b - 1] - t[a] < TORQUE.motion_lasts
-                    or abs(q[b - 1] - q[a]) < max(TORQUE.travel * case.scales.span, 20 * case.sigma)
-                ):
+                if a == 0 or abs(q[b - 1] - q[a]) < max(gives, 20 * case.sigma):
                     continue
                 a = max(a - 2, 0)  # the torque that set it off is from just before
                 out[way] = min(out[way], max(TORQUE.room * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))

@@ -382,9 +382,9 @@ class JointHypotheses:
         if self.scan_fitter.use_torque:  # neither signal drowns the other: what is missing shows in both
             n = self.scan_fitter.w.n
             parts = [float(np.sqrt(np.mean(x**2))) for x in (f.residual[:n], f.residual[n:][self.scan_fitter.tau_on])]
-            self.r.sigma_q *= max(1.0, SEARCH.balance * parts[0])
+            self.r.sigma_q *= max(1.0, SEARCH.apart * parts[0])
             restless = restlessness(f.residual[n:], self.scan_fitter.w.sample_window)
-            self.r.sigma_torque *= max(1.0, SEARCH.balance * parts[1], min(restless, SEARCH.restless))
+            self.r.sigma_torque *= max(1.0, SEARCH.apart * parts[1], restless)
             f = self.scan_fitter.fit(params, x0=f.x, iterations=4, lazy=True)
         if params:
             span = np.array([p.span for p in params])

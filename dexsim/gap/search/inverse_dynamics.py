@@ -23,7 +23,7 @@ from scipy.signal import butter, filtfilt
 from dexsim import intervals
 from dexsim.gap.effects.friction import LoadFriction, StribeckFriction
 from dexsim.gap.read import BLOCK, Run
-from dexsim.gap.rules import SEARCH, TORQUE
+from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
 # -- the body's torque ------------------------------------------------------------------------------------------------
 # The recorded torque of a joint beside what the model's rigid body asks for along the recorded motion, and what is left
@@ -187,16 +187,11 @@ def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0, loaded: 
     """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed;
     loaded: whether gravity's factors are among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
-    inertia = (
-        float(np.median(np.concatenate([b.inertia[:, j] for _, b, *_ in given]))) if given[0][1] is not None else 0.0
-    )
-    weights = [
-        np.abs(b.gravity[:, j]).max() / max(float(np.abs(m.u[:, j]).max()), 1e-12)
-        for m, b, *_ in given
-        if b is not None
-    ]
+    bodies = [(m, b) for m, b, *_ in given if b is not None]
+    inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b in bodies]))) if bodies else 0.0
     if loaded is None:
-        loaded = bool(weights) and max(weights) > TORQUE.heavy
+        weights = [np.abs(b.gravity[:, j]).max() / max(np.abs(m.u[:, j]).max(), 1e-12) for m, b in bodies]
+        loaded = bool(max(weights, default=0.0) > BELIEF.tolerance)
     for m, b, *rest in given:
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
         load = np.zeros_like(q) if b is None else b.torque[:, j]
@@ -236,10 +231,10 @@ def readable(run: Run, j: int) -> bool:
     return 1 / np.median(np.diff(run.t)) >= 0.97 * RATE
 
 
-def moved(run: Run, model: mujoco.MjModel | None, cutoff: float) -> tuple[Motion, Body | None]:
+def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> tuple[Motion, Body]:
     assert run.torque is not None  # as `readable` has looked
     m = motion(run.t, run.q, np.nan_to_num(run.torque), cutoff)
-    return m, None if model is None else body(model, run.gravity, run.joints, m)
+    return m, body(model, run.gravity, run.joints, m)
 
 
 def sums(X: np.ndarray, u: np.ndarray, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -391,7 +386,7 @@ def _not_weighed(d: Columns) -> list[str]:
     """Factors on gravity that these recordings tell worse than a model does (each half second one reading of it)."""
     at = {n: d.names.index(n) for n in WEIGHT if n in d.names}
     reach = {n: float(np.std(d.X[:, k])) * np.sqrt(d.blocks.max() + 1.0) for n, k in at.items()}
-    return [n for n in at if max(reach.values()) * TORQUE.weighed < misfit(d.without(list(at)))]
+    return [n for n in at if max(reach.values()) * BELIEF.tolerance < misfit(d.without(list(at)))]
 
 
 def _name(
@@ -463,9 +458,9 @@ def _kind(name: str) -> str:
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
     """Whether a coefficient can be what it is called: a lag is late, an excess is more, and what gives way is friction
-    that is there."""
+    that is there. Of a lag the first term alone is fitted, which serves up to a radian of the lowest cutoff."""
     if name == LAG:
-        return 0 < c < TORQUE.lag * abs(theta["inertia"])
+        return 0 < c < abs(theta["inertia"]) / (2 * np.pi * LEAST)
     if _kind(name) == GIVES:
         return 0 < c < 2 * theta.get("coulomb_friction", 0.0)
     if name == LOAD:

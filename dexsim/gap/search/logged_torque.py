@@ -48,18 +48,15 @@ def identify_joints(
     runs: Sequence[Run],
     train: Sequence[int],
     test: Sequence[int],
+    model: mujoco.MjModel,
     seed: int = 0,
-    model: mujoco.MjModel | None = None,
     span_train: dict[int, tuple[float, float]] | None = None,
     span_test: dict[int, tuple[float, float]] | None = None,
 ) -> list[tuple]:
     """(case, Inverse, names of the recordings that judged its further effects) of each joint whose motor torque was
-    logged in N.m, fast and long enough. Without `model` only joints that neither gravity nor others load. span_*: part
-    of each run [s from its start]."""
+    logged in N.m, fast and long enough. span_*: part of each run [s from its start]."""
     out, motions = [], {}
     for case in cases:
-        if model is None and (case.scales.gravity > TORQUE.heavy * case.scales.tau or case.scales.others):
-            continue
         use = [r for r in train if readable(runs[r], case.index)]
         judge = [r for r in test if readable(runs[r], case.index) and (r not in train or span_test is not None)]
         if not use or not case.moved:
@@ -68,7 +65,7 @@ def identify_joints(
         def at(
             cutoff: float, case: Case = case, use: list[int] = use, judge: list[int] = judge
         ) -> tuple[Columns, Columns]:
-            def piece(r: int, span: Spans | None) -> tuple[Motion, Body | None, tuple[float, float] | None]:
+            def piece(r: int, span: Spans | None) -> tuple[Motion, Body, tuple[float, float] | None]:
                 if (r, cutoff) not in motions:
                     motions[r, cutoff] = moved(runs[r], model, cutoff)
                 return *motions[r, cutoff], None if span is None else span.get(r)
@@ -136,7 +133,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
         open_ = [n for n in open_ if n not in x.refused or n == "viscous_friction"]
         if not open_ or x.value["coulomb_friction"] <= 0:
             continue
-        if x.residual > TORQUE.trusted:
+        if x.residual**2 > TORQUE.much:
             said.append(
                 f"{case.joint}: the recorded motor torque is no witness: {100 * x.residual:.0f} % of it fits no "
                 "inertia, gravity or friction"
@@ -177,9 +174,9 @@ def hand_on(
     loop does not say otherwise: what it was refitted to then is the fit's own wandering.
 
     d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run
-    over what was kept out is followed better than to `TORQUE.worse` with its own figures, or where a finding of at
-    least a half is about them; not where `stages` say that the drive itself is not as believed, since what its loop
-    does then speaks of the drive.
+    over what was kept out is followed better with its own figures, by more than `BELIEF.tolerance`, or where a finding
+    of at least a half is about them; not where `stages` say that the drive itself is not as believed, since what its
+    loop does then speaks of the drive.
     """
     strange = {x.joint for x in stages if not x.sound}
     by = {case.joint: (search, outcome) for case, search, outcome in outcomes}
@@ -220,7 +217,7 @@ def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[st
     in part: their closed loop speaks of an unknown controller, and no effect of the joint is looked for in it. Said in
     `notes`."""
     told = {case.joint for case, _, _ in given if case.told}
-    out = {x.joint for x in stages if x.joint in told and x.fit < TORQUE.follows}
+    out = {x.joint for x in stages if x.joint in told and x.fit < 1 - TORQUE.much}
     for x in stages:
         if x.joint in out:
             notes.append(
@@ -252,7 +249,7 @@ def _alike(
         float(np.sqrt(np.mean((measured - free_run(whole, params, x, windows, fixed, True)[0]) ** 2)))
         for x in (trial.fit.x, told)
     ]
-    return error[1] <= TORQUE.worse * error[0] + 0.1 * case.sigma
+    return error[1] <= (1 + BELIEF.tolerance) * error[0] + 0.1 * case.sigma
 
 
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
@@ -270,7 +267,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
             signal = effect.signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
-            confidence = min(n.share, TORQUE.surest) * (1.0 if helped > SEARCH.least else TORQUE.unhelped)
+            confidence = min(n.share, TORQUE.told if helped > SEARCH.least else JUDGE.hinted)
             out.append(
                 {
                     "effect": n.effect,
@@ -335,7 +332,7 @@ class Push:
         )
         return {
             "effect": ExternalForce.id,
-            "confidence": TORQUE.told if self.clear else TORQUE.hinted,
+            "confidence": TORQUE.told if self.clear else JUDGE.hinted,
             "alternatives": [],
             "indistinguishable": [],
             "separating_experiment": None,
@@ -375,7 +372,7 @@ def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int
         push = _of_joint([columns_of([motions[r]], j) for r in use], [r in own for r in use], rng)
         if push is not None:
             spans, slide = (
-                _spans(push[0], [runs[r] for r in use]),
+                _spans(push[0], [runs[r] for r in use], 1.0 / cutoff),
                 int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE),
             )
             if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], j, cutoff):
@@ -437,7 +434,7 @@ def _of_joint(
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
     quiet_torque = float(np.var(torque[on]))
     fits = noise**2 < TORQUE.much * quiet_torque and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
-    least = max(TORQUE.far * noise, TORQUE.least * float(np.sqrt(np.mean(torque**2))))
+    least = max(TORQUE.far * noise, np.sqrt((1 - TORQUE.fit) * np.mean(torque**2)))
     residual = [
         _beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)
     ]
@@ -456,7 +453,7 @@ def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np
     still = A.copy()
     still[:, coulomb] = 0.0
     held = u - still @ x
-    free = np.sign(held) * np.maximum(np.abs(held) - TORQUE.carries * max(float(x[coulomb]), 0.0), 0.0)
+    free = np.sign(held) * np.maximum(np.abs(held) - TORQUE.room * max(float(x[coulomb]), 0.0), 0.0)
     return np.where(moves, u - A @ x, free)
 
 
@@ -498,19 +495,22 @@ def _trimmed(
     return best
 
 
-def _spans(given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run]) -> dict[str, list[tuple[float, float]]]:
-    """Stretches by recording, in its own time."""
+def _spans(
+    given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], shortest: float
+) -> dict[str, list[tuple[float, float]]]:
+    """Stretches by recording, in its own time. shortest [s]: what the filter of the torque tells apart; neither a push
+    nor a gap in it is shorter."""
     out: dict[str, list[tuple[float, float]]] = {}
     for (t, on), run in zip(given, runs, strict=True):
         edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
         merged: list[list[float]] = []
         for a, b in zip(edge[::2], edge[1::2], strict=True):
             start, end = float(t[a] + run.t[0]), float(t[b - 1] + run.t[0])
-            if merged and start - merged[-1][1] < TORQUE.join:
+            if merged and start - merged[-1][1] < shortest:
                 merged[-1][1] = end
             else:
                 merged.append([start, end])
-        spans = [(a, b) for a, b in merged if b - a >= TORQUE.lasts]
+        spans = [(a, b) for a, b in merged if b - a >= shortest]
         if spans:
             out[run.name] = out.get(run.name, []) + spans
     return out

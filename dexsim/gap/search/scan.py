@@ -33,7 +33,7 @@ class JointLosses(JointHypotheses):
         """Left-out loss with a price on parameters."""
         return (
             float(self._left(trial).sum())
-            * (1 + SEARCH.per_parameter * sum(len(m.variant.params) for m in trial.members))
+            * (1 + SEARCH.apart * sum(len(m.variant.params) for m in trial.members))
             * self._dear(trial)
         )
 
@@ -139,7 +139,7 @@ class JointLosses(JointHypotheses):
             return False
         if old.members and further:  # what follows must matter beside what was found
             rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
-            if rms(a) - rms(b) < SEARCH.second * (rms(self.none_loss) - rms(a)):
+            if rms(a) - rms(b) < SEARCH.doubt * (rms(self.none_loss) - rms(a)):
                 return False
         # what only a few moments show (a limit, a sag) varies much between draws, and more of the error goes with it
         chance = (
@@ -389,9 +389,10 @@ class JointScan(JointLosses):
         out: list[Scanned] = []
         for row in scan:
             g, p, m, _ = row
-            if g < SEARCH.promise * SEARCH.least * min(1.0, SEARCH.rough / loss) or (
-                p > 4 * SEARCH.price and loss < SEARCH.rough
-            ):
+            # what leaves far more than noise promises a share of much
+            if g < SEARCH.apart * min(1.0, SEARCH.unsettled / loss):
+                continue
+            if p > 4 * SEARCH.price and loss < SEARCH.unsettled:
                 continue
             if seen.get(m.id, 0) >= m.effect.kinds:
                 continue

@@ -56,8 +56,8 @@ class JointSelection(JointScan):
             if not scan:
                 break
             listed = self._shortlist(scan, shortlist, loss, current.members)
-            if loss < SEARCH.rough:
-                listed = self._hinted([] if enough else listed, current.members, SEARCH.promise * SEARCH.least)
+            if loss < SEARCH.unsettled:
+                listed = self._hinted([] if enough else listed, current.members, SEARCH.apart)
             if not listed:
                 break
             drafts = self._drafts(listed, current, pool, price)
@@ -510,13 +510,13 @@ class JointSelection(JointScan):
                 if trial is None:
                     draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
                     # one that cannot follow even short stretches is no rival
-                    if draft[2].loss > SEARCH.draft * short + 2 * SEARCH.rival_noise:
+                    if draft[2].loss > SEARCH.rival * max(short, 1.0):
                         continue
                     trial = self.finish(*draft, current, quick=True)
                 self._on(0.05)
                 self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
-                if trial.fit.loss < SEARCH.rival * current.fit.loss + SEARCH.rival_noise:
+                if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
                     self.cross(trial)
                     others.append(trial)
             table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
@@ -550,7 +550,7 @@ def _differs(plain: Param, x: float, case: Case) -> bool:
     """Whether the plain model's figure is another than what is believed, as far as that is believed."""
     nominal = case.scales.nominal[plain.columns[0]]
     unit = nominal if plain.mode == "factor" else 1.0
-    return abs(x * unit - nominal) > max(BELIEF.tolerance * abs(nominal), SEARCH.differs * plain.span * unit)
+    return abs(x * unit - nominal) > max(BELIEF.tolerance * abs(nominal), SEARCH.doubt * plain.span * unit)
 
 
 FINER = 2  # steps of whole recordings, where an effect was found, in one of the windows'

@@ -478,7 +478,7 @@ class PadSearch(PadFit):
                     best = max(best, (2 * c * float(d @ clean) - c * c * dd) / max(total, 1e-12))
             found.append((1.0 if effect.by_taxel else best, effect))
         found.sort(key=lambda f: -f[0])
-        return [e for g, e in found[:most] if g > SEARCH.promise * SEARCH.least]
+        return [e for g, e in found[:most] if g > SEARCH.apart]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """The hypothesis with one effect more; None where it cannot be there."""
