@@ -256,7 +256,8 @@ class JudgeRules:
         0.5,
         "share of its confidence that a name loses at most by what stays unexplained",
         "of names that leave up to 0.05 of the squared error 149 of 216 are true, up to 0.3 (`removed`) 41 of 92, "
-        "beyond it 16 of 130 (four sets of cases of another plant)",
+        "beyond it 16 of 130 (four sets of cases of another plant): there only what wins every draw is no hint "
+        "(`firm`)",
         "test_what_stays_unexplained_costs_confidence",
     )
     one_load: float = _rule(
