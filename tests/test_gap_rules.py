@@ -60,6 +60,7 @@ def trial(loss, members=()):
 def test_every_rule_says_what_it_is_and_its_test_exists():
     for name, value, means, source, test in rules.described():
         assert value > 0 and len(means) > 10 and source, name
+        assert "judgement" not in source, f"{name}: say what speaks for its value, or take out what reads it"
         assert callable(TESTS[test]), name
 
 
