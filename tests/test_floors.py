@@ -37,6 +37,9 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
 """Parts of dexsim from the ground up. A part imports itself and lower floors only."""
 NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
 """What a part does not import though it stands lower."""
+STEPS = ("read", "locate", "plant", "search", "judge", "report")
+"""The steps of a diagnosis, each a part of `dexsim.gap` (and of `dexsim.gap.touch` what it has of them): what is
+measured goes down them, so that none imports from a later one."""
 CIRCLES: dict[frozenset[str], str] = {}
 """Circles of files that are allowed, each with its reason. None is."""
 WARP = re.compile(r"@wp\.(kernel|func|func_native|struct)\b|wp\.kernel\(")
@@ -133,6 +136,35 @@ def test_imports_run_down(graph):
             if level[theirs] >= level[own] or theirs in NEVER.get(own, ()):
                 wrong.append(f"{module} imports {other}")
     assert not wrong, "\n".join(sorted(wrong))
+
+
+def step(module: str) -> tuple[str, int] | None:
+    """The room of a step of the diagnosis, `dexsim.gap` or `dexsim.gap.touch`, and which one it is there."""
+    names = module.removeprefix("dexsim.gap.").split(".")
+    room = "dexsim.gap.touch" if names[0] == "touch" else "dexsim.gap"
+    name = names[len(names) > 1 and names[0] == "touch"]
+    return (room, STEPS.index(name)) if module.startswith("dexsim.gap.") and name in STEPS else None
+
+
+def later(graph: dict[str, set[str]]) -> list[str]:
+    """Imports of a step of the diagnosis from a later one of the same room."""
+    wrong = []
+    for module, others in graph.items():
+        for other in others:
+            mine, theirs = step(module), step(other)
+            if mine and theirs and mine[0] == theirs[0] and theirs[1] > mine[1]:
+                wrong.append(f"{module} imports {other}")
+    return sorted(wrong)
+
+
+def test_no_step_of_the_diagnosis_imports_from_a_later_one(graph):
+    there = {step(m) for m in graph}
+    assert there >= {("dexsim.gap", k) for k in range(len(STEPS))}
+    assert there >= {("dexsim.gap.touch", STEPS.index(n)) for n in ("read", "plant", "search", "judge")}
+    assert later(graph) == []
+    assert later({"dexsim.gap.search.fit": {"dexsim.gap.judge.kept_out", "dexsim.gap.plant.case"}}) == [
+        "dexsim.gap.search.fit imports dexsim.gap.judge.kept_out"
+    ]
 
 
 def test_no_circles_of_files(graph):

@@ -22,9 +22,9 @@ import dexsim.gap
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TOUCH_EFFECTS
-from dexsim.gap.judge.kept_out import free_run
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import NAMES, SERIES
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch

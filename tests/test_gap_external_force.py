@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_gap_torque_route import ARM, arm, run
 
+from dexsim.gap.judge import conclude
 from dexsim.gap.search import logged_torque
 
 SPANS = ((4.0, 6.5), (11.0, 12.5), (16.0, 18.0))
@@ -81,7 +82,7 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
         "unexplained": {"depends_on": []},
     }
     d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[])
-    logged_torque.claim_push(d, [push])
+    conclude.claim_push(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
     assert d.sentence.startswith("Joint elbow is pushed by something outside")
     assert d.data["verdict"] == "explained" and len(d.notes) == 1

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, joint_answer, kept_out
+from dexsim.gap.judge import confidence, joint_answer
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 
@@ -49,8 +49,8 @@ class Judged(JointAnswer):
 def judged(answer: Judged) -> dict:
     """The finding of an answer."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_out, "free_run", lambda *_: (answer.without, None))
-        patch.setattr(kept_out, "intervals_of", lambda *_: [])
+        patch.setattr(joint_answer, "free_run", lambda *_: (answer.without, None))
+        patch.setattr(joint_answer, "intervals_of", lambda *_: [])
         answer.judge(SimpleNamespace(table=None))
     return answer.found[0]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.judge import conclude, kept_out
+from dexsim.gap.judge import conclude
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.stage_tests import Stage
 from dexsim.gap.rules import BELIEF, JUDGE
@@ -284,7 +284,7 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
     trial = SimpleNamespace(fit=SimpleNamespace(params=[SimpleNamespace(key="kd")], x=np.array([1.0])), members=())
     for error, stand in ((1.03, True), (1.08, False)):  # with the torque's figure; 1 with the loop's own
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kept_out, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
+            patch.setattr(logged_torque, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
             search = SimpleNamespace(whole=whole)
             assert logged_torque._alike(Followed(None), search, trial, {"kd": error}, [0], None) is stand, error
 
@@ -296,7 +296,7 @@ def told(after: float) -> float:
     case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_out, "intervals_of", lambda *_: [])
+        patch.setattr(logged_torque, "intervals_of", lambda *_: [])
         (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n], full={}), ["a"])], ["j"], [], [])
     return finding["confidence"]
 

@@ -15,6 +15,7 @@ from dexsim.gap.judge import conclude, kept_out
 from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, subset
@@ -223,7 +224,7 @@ def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
     windows = case.plant.windows(None)
     error = lambda underway: np.sqrt(  # noqa: E731
         np.mean(
-            (case.plant.q[windows.sample_row] - kept_out.free_run(case, [], np.zeros(0), windows, underway=underway)[0])
+            (case.plant.q[windows.sample_row] - free_run(case, [], np.zeros(0), windows, underway=underway)[0])
             ** 2
         )
     )

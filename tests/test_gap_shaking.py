@@ -100,7 +100,7 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
         outcome = SimpleNamespace(joint="elbow", best=SimpleNamespace(fit=SimpleNamespace(loss=loss)))
         joints = {"elbow": {"after": after, "sigma": 0.001}}
         d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints=joints, outcomes=[outcome])
-        logged_torque.claim_push(d, [push])
+        conclude.claim_push(d, [push])
         assert len(d.notes) == 1
         return [f["effect"] for f in d.data["findings"]]
 

@@ -51,3 +51,13 @@ def count(value: float) -> str:
         if value >= scale:
             return f"{value / scale:.3g}{letter}"
     return f"{value:.0f}"
+
+
+def number(v: float, digits: int = 3) -> str:
+    """v with so many digits, without an exponent where a person would not write one."""
+    v = float(v)
+    if v != 0 and not 1e-4 <= abs(v) < 1e6:
+        return f"{v:.{digits}g}"
+    if abs(v) >= 10 ** (digits - 1):
+        return f"{round(v):,}"
+    return f"{v:.{digits}g}"

@@ -318,8 +318,8 @@ class Progress:
 
 def verdict(d: Diagnosis) -> str:
     """The verdict in at most ten lines."""
+    from dexsim.console.tables import number
     from dexsim.gap.judge.conclude import place
-    from dexsim.gap.report.charts import number
     from dexsim.gap.search import baseline
 
     data = d.data

@@ -505,7 +505,7 @@ class Drives(Steps):
         d.stages = [x.text for x in self.stages] + self.behind
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
         logged_torque.hand_on(self.by_torque, d, self.outcomes, p.test, p.span_test, self.stages)
-        logged_torque.claim_push(d, self.pushes)
+        conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out
 
     def stand_in(self, d: Diagnosis) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.console.tables import number
 from dexsim.gap import locate
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
@@ -18,9 +19,8 @@ from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
-from dexsim.gap.report.charts import number
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, shaking
+from dexsim.gap.search import baseline, logged_torque, shaking
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
@@ -372,6 +372,46 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
         data["verdict"] = "partly_explained" if a < (1 - JUDGE.removed) * b else "unknown"
         data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
+
+
+def _followed(d: Diagnosis, joint: str) -> bool:
+    """Whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
+    out."""
+    named = any(f["confidence"] >= JUDGE.firm and joint in f["where"]["joints"] and f["held_out"]
+                for f in d.data["findings"])  # fmt: skip
+    fitted = any(x.joint == joint and x.best.fit.loss <= JUDGE.within**2 for x in d.outcomes)
+    return named and fitted and d.joints[joint]["after"] <= JUDGE.within * d.joints[joint]["sigma"]
+
+
+def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
+    """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
+    motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was kept out,
+    by what was found of it: nothing is left that could push."""
+    followed = {p.joint for p in pushes if not p.cut and _followed(d, p.joint)}
+    d.notes += [
+        f"{joint}: its torque fits no inertia, gravity or friction, but what was found does: nothing from outside "
+        "pushes it"
+        for joint in sorted(followed)
+    ]
+    pushes = [p for p in pushes if p.joint not in followed]
+    if not pushes:
+        return
+    joints = {p.joint for p in pushes if not p.cut}
+    kept = [
+        f
+        for f in d.data["findings"]
+        if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])
+    ]
+    d.notes += [
+        f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or "
+        "its recorded torque is not its own"
+        for f in d.data["findings"]
+        if f not in kept
+    ]
+    d.data["findings"] = [p.finding() for p in pushes] + kept
+    if not any(f["held_out"] for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
+        d.data["verdict"] = "unknown"
+    d.sentence = sentence(d.data, d, d.data["noise_floor"]["position_rad"])
 
 
 # -- what is not considered -------------------------------------------------------------------------------------------

@@ -27,10 +27,10 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.handed_on import columns_beside, handed, model_changes, moved_friction, undamped
-from dexsim.gap.judge.kept_out import free_run
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX, expand
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial

@@ -15,10 +15,10 @@ from dexsim.actuator.columns import COLUMNS, INDEX
 from dexsim.actuator.reference import dry_friction, parasitic_torque, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
-from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, JUDGE
 from dexsim.gap.search.search import Trial
@@ -397,7 +397,7 @@ def _held_out(
             q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
             series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
             plant.set_series(series)
-            simulated, _ = kept_out.free_run(case, trial.fit.params, trial.fit.x, windows, fixed)
+            simulated, _ = free_run(case, trial.fit.params, trial.fit.x, windows, fixed)
             out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
     finally:
         plant.set_series(kept)

@@ -16,8 +16,9 @@ from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.inquiry import Curve
 from dexsim.gap.judge import confidence, kept_out
-from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.case import Case, intervals_of
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Fitted, Fitter, intervals, prior_weight
@@ -55,12 +56,12 @@ class JointAnswer:
         self.whole = replace(case, plant=search.whole)
         self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
         rows = self.rows = self.windows.sample_row
-        self.q_before, effort_before = kept_out.free_run(
+        self.q_before, effort_before = free_run(
             self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True
         )
         fixed = [f for mm in self.best.members for f in mm.variant.fixed]
         with_it = (
-            kept_out.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True)
+            free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True)
             if self.best.members
             else (self.q_before, effort_before)
         )
@@ -129,7 +130,7 @@ class JointAnswer:
         self.raw[mm.id] = raw
         rest = tuple(x for x in best.members if x is not mm)
         trial = without(self.search, best, mm) if rest else self.none
-        q, effort = kept_out.free_run(
+        q, effort = free_run(
             self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True
         )
         lost = (self.measured - q) ** 2
@@ -163,7 +164,7 @@ class JointAnswer:
             "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
             "where": {"joints": [case.joint], "taxels": [], "topics": []},
             "regime": mm.effect.shows,
-            "when": kept_out.intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
+            "when": intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
             "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(of_effort)}
             if of_effort is not None
@@ -342,7 +343,7 @@ class JointAnswer:
                 np.mean(
                     (
                         case.plant.q[windows.sample_row]
-                        - kept_out.free_run(case, fit.params, fit.x, windows, underway=True)[0]
+                        - free_run(case, fit.params, fit.x, windows, underway=True)[0]
                     )
                     ** 2
                 )

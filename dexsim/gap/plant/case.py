@@ -18,7 +18,7 @@ from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
-from dexsim.gap.read import Run, local_polynomial
+from dexsim.gap.read import Run, local_polynomial, spans
 from dexsim.gap.rules import BELIEF, SEARCH
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
@@ -51,6 +51,19 @@ class Case:
     factors: dict[str, tuple[float, float]] = field(default_factory=dict)
     # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
     told: bool = False
+
+
+def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int], join: float = 0.03) -> list[dict]:
+    """Stretches of time in which `active` [n] bool holds, by recording, short gaps joined; the longest 400."""
+    out: list[dict] = []
+    for r in use:
+        rows = case.plant.rows(r)
+        t, on = case.plant.t[rows], active[rows]
+        merged = spans(t, on, join)
+        out += [{"recording": runs[r].name, "start": round(float(a), 4), "end": round(float(b), 4)} for a, b in merged]
+    out.sort(key=lambda w: w["start"] - w["end"])
+    out = out[:400]
+    return sorted(out, key=lambda w: (w["recording"], w["start"]))
 
 
 def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:

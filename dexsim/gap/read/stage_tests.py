@@ -7,14 +7,17 @@ the motor at no cost; what is after it is the rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.plant.case import Case
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, TORQUE
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
 
 DRAWS = 300  # of the bootstrap
 SHIFTS = np.arange(-0.01, 0.0401, 0.002)  # s: by which a drive may act later than is believed

@@ -9,20 +9,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from dexsim.console.tables import number
 from dexsim.tactile.sensors import Sensors
 
 GRID, INK, SOFT = "#e6e9ee", "#333", "#8a94a3"
 BEFORE, AFTER, COMMAND, FLOOR = "#d1495b", "#1768ac", "#b8c0ca", "#9aa5b1"
-
-
-def number(v: float, digits: int = 3) -> str:
-    """v with so many digits, without an exponent where a person would not write one."""
-    v = float(v)
-    if v != 0 and not 1e-4 <= abs(v) < 1e6:
-        return f"{v:.{digits}g}"
-    if abs(v) >= 10 ** (digits - 1):
-        return f"{round(v):,}"
-    return f"{v:.{digits}g}"
 
 
 def _ticks(low: float, high: float, count: int = 5) -> np.ndarray:

@@ -17,6 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from dexsim import outputs
+from dexsim.console.tables import number
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.inquiry import Diagnosis
@@ -25,7 +26,7 @@ from dexsim.gap.judge.conclude import place, spoken, words_of
 from dexsim.gap.judge.full_model import TASKS
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
 from dexsim.gap.report import charts
-from dexsim.gap.report.charts import mechanism, number, pad, scale
+from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
 from dexsim.gap.touch.diagnosis import handed, save_tactile
 

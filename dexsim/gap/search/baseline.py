@@ -22,6 +22,7 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
@@ -155,8 +156,6 @@ def judged(
 ) -> Baseline | None:
     """The plain model of a joint (`fitted`) on runs `test` (span: part of each run, s). whole: the plant on which free
     runs are judged (None: the case's own). None where nothing was fitted or there is nothing to judge."""
-    from dexsim.gap.judge.kept_out import free_run
-
     here = replace(case, plant=whole or case.plant)
     kept = here.plant.windows(None, list(test), span=span)
     if plain is None or not len(kept.window):

@@ -13,6 +13,8 @@ import numpy as np
 from dexsim.gap.effects import ByTorque
 from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.plant.case import intervals_of
+from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
@@ -238,8 +240,6 @@ def _alike(
 ) -> bool:
     """Whether what was kept out is followed as well with the torque's figures as with those that the closed loop was
     refitted to."""
-    from dexsim.gap.judge.kept_out import free_run
-
     whole = replace(case, plant=search.whole)
     windows = whole.plant.windows(None, test, span=span_test)
     params, fixed = trial.fit.params, [f for m in trial.members for f in m.variant.fixed]
@@ -255,8 +255,6 @@ def _alike(
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
     """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed
     (`unknown`)."""
-    from dexsim.gap.judge.kept_out import intervals_of
-
     out = []
     for case, x, judged in given:
         for n in x.named if case.joint in unknown and judged else ():
@@ -544,45 +542,3 @@ def without_pushes(
         p.cut = True
     notes += said
     return rest, kept
-
-
-def _followed(d: Diagnosis, joint: str) -> bool:
-    """Whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
-    out."""
-    named = any(f["confidence"] >= JUDGE.firm and joint in f["where"]["joints"] and f["held_out"]
-                for f in d.data["findings"])  # fmt: skip
-    fitted = any(x.joint == joint and x.best.fit.loss <= JUDGE.within**2 for x in d.outcomes)
-    return named and fitted and d.joints[joint]["after"] <= JUDGE.within * d.joints[joint]["sigma"]
-
-
-def claim_push(d: Diagnosis, pushes: Sequence[Push]) -> None:
-    """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
-    motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was kept out,
-    by what was found of it: nothing is left that could push."""
-    followed = {p.joint for p in pushes if not p.cut and _followed(d, p.joint)}
-    d.notes += [
-        f"{joint}: its torque fits no inertia, gravity or friction, but what was found does: nothing from outside "
-        "pushes it"
-        for joint in sorted(followed)
-    ]
-    pushes = [p for p in pushes if p.joint not in followed]
-    if not pushes:
-        return
-    from dexsim.gap.judge.conclude import sentence
-
-    joints = {p.joint for p in pushes if not p.cut}
-    kept = [
-        f
-        for f in d.data["findings"]
-        if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])
-    ]
-    d.notes += [
-        f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or "
-        "its recorded torque is not its own"
-        for f in d.data["findings"]
-        if f not in kept
-    ]
-    d.data["findings"] = [p.finding() for p in pushes] + kept
-    if not any(f["held_out"] for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
-        d.data["verdict"] = "unknown"
-    d.sentence = sentence(d.data, d, d.data["noise_floor"]["position_rad"])
