@@ -61,8 +61,19 @@ def arrived(end: Any, stamp: Any, dt: Any):
 @wp.func
 def lag_share(time: Any, dt: Any):
     """Share of the way that a first-order lag, time * y' = u - y, goes from y to u in a step of dt [s]: backward
-    Euler."""
+    Euler.
+
+    A lag of second order is two of these in a row, (1 + s time / 2)^-2 in Laplace's s: half the time [s] each, so that
+    the mean delay is that of one with all of it, critically damped (G. Franklin, J. Powell, A. Emami-Naeini, Feedback
+    Control of Dynamic Systems, section 3.3)."""
     return dt / (time + dt)
+
+
+@wp.func
+def stage_before(before: Any, after: Any, share: Any):
+    """What went into a first-order lag whose output went from `before` to `after` in a step of this `lag_share`: of a
+    lag of second order the first stage, where the output of the second is known."""
+    return before + (after - before) / share
 
 
 # -- the motor ---------------------------------------------------------------------------------------------------------

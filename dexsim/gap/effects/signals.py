@@ -39,7 +39,7 @@ class CommandDelay(Effect):
 
 
 class Lag(Effect):
-    """A first-order lag of the drive's torque, or of the speed that its loop measures."""
+    """A lag of the drive's torque, of first order or of second, or of the speed that its loop measures."""
 
     id = "lag"
     words = "builds its torque up with a lag"
@@ -57,6 +57,7 @@ class Lag(Effect):
                 (param("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),),
                 ((0.003,), (0.006,), (0.012,), (0.025,), (0.06,)),
                 "drive",
+                laws=(("second order", (("lag_stages", 2.0),)),),
             )
         ]
         if s.nominal["kd"] > 0:

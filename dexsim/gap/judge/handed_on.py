@@ -12,7 +12,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, INDEX
-from dexsim.actuator.reference import dry_friction, parasitic_torque, torque_along
+from dexsim.actuator.reference import dry_friction, lagged, parasitic_torque, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.plant.case import Case
@@ -133,6 +133,8 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
+    if any(("lag_stages", 2.0) in m.variant.fixed for m in trial.members):
+        left.append(f"second order of lag@{case.joint} (training has one of first order with the same mean delay)")
     kp, kd = table.value(case.joint, "kp"), table.value(case.joint, "kd")
     assert kp.value is not None  # a table with an unknown one is refused
     lost = undamped(trial, kp.value)
@@ -295,7 +297,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     supply = s("supply") if plant.voltage else 1.0
     motor = torque_along(asked, v, p("torque_limit"), p("no_load_speed"), plant.voltage, supply)
     if p("lag") > 0:
-        motor = _lagged(t, motor, p("lag"))
+        motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
     slope = 0.05 * max(case.scales.speed, 1e-9)
     columns = {n: row[i] for n, i in INDEX.items()}
     beside, _, _ = parasitic_torque(columns, q, v)
@@ -316,15 +318,6 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
         on &= r.enabled[:, j] > 0.5
     on[:3] = on[-3:] = False
     return needed + friction - p("efficiency") * motor - beside, on
-
-
-def _lagged(t: np.ndarray, x: np.ndarray, time_constant: float) -> np.ndarray:
-    out, y = np.empty_like(x), x[0]
-    for i in range(len(x)):
-        dt = t[i] - t[i - 1] if i else 0.0
-        y += (1 - np.exp(-dt / time_constant)) * (x[i] - y)
-        out[i] = y
-    return out
 
 
 def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -79,6 +79,12 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ),
     ("readout_scale", 1.0, "1", "reported over what the encoder shows, where the loop has another encoder"),
     ("readout_offset", 0.0, "rad", "added to what is reported, where the loop has another encoder"),
+    (
+        "lag_stages",
+        1.0,
+        "1",
+        "equal first-order stages in a row that share the column `lag` between them: 1, or 2 for a lag of second order",
+    ),
     ("com_out", 0.0, "m", "centre of the added mass, out from the hinge beyond the last link's centre of mass"),
     ("com_across", 0.0, "m", "the same, along the way it turns"),
     ("gear_load_friction", 0.0, "1", "dry friction per torque that the gear hands to the joint, where it drives it"),

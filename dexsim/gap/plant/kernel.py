@@ -32,6 +32,7 @@ from dexsim.actuator.laws import (
     preslide,
     preslide_speed,
     sagging,
+    stage_before,
     torque_limits,
     transmission,
     transmission_damping,
@@ -94,6 +95,7 @@ P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedfor
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 P_MOTORSHARE = INDEX["motor_share"]
+P_STAGES = INDEX["lag_stages"]
 P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
@@ -154,7 +156,8 @@ class Guess:  # the columns of one guess that every step asks for
     beyond: bool  # the controller has more terms than the PD
     steep: f64  # braking_slope
     limit_speed: f64
-    lag: f64  # share of its way that the torque goes in a sub-step
+    lag: f64  # share of its way that the torque goes in a sub-step, in each of its stages
+    staged: bool  # there are two
     gap2: f64
     soft: f64
     two: bool  # rotor and link are two bodies
@@ -200,6 +203,7 @@ class State:  # of the joint
     qm: f64  # of the rotor, the joint's where they are one
     vm: f64
     last: f64  # motor torque
+    stage: f64  # the same before the second stage of its lag
     v_f: f64  # the speed after kd's filter
     taken: f64  # share of the dry friction that is taken up
     integral: f64  # the controller's integral term
@@ -279,7 +283,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.dt = dt / f64(ONE_BODY_STEPS)
     if p.two:
         p.dt = dt / f64(TWO_BODY_STEPS)
-    p.lag = lag_share(c.params[h, P_LAG], p.dt)
+    p.staged = c.params[h, P_STAGES] > f64(1.5)
+    p.lag = lag_share(c.params[h, P_LAG] / c.params[h, P_STAGES], p.dt)
     p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
@@ -770,7 +775,13 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         x.integral = zero
     if x.fresh == f64(1.0):
         x.last = t.now
+        x.stage = t.now
     x.fresh = zero
+    if p.staged:
+        t.now = x.stage + p.lag * (t.now - x.stage)
+        t.end = x.stage + p.lag * (t.end - x.stage)
+        t.on_loop = p.lag * t.on_loop
+        t.on_drive = p.lag * t.on_drive
     before = x.last
     x.last = before + p.lag * (t.now - before)
     t.end = before + p.lag * (t.end - before)
@@ -804,6 +815,8 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, drag, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
+    if p.staged:
+        x.stage = stage_before(before, x.last, p.lag)
     if by_gear and not n.held:
         link = wp.max(n.inertia - p.rotor, zero)
         x.borne += lag_share(f64(PRESSED), dt) * (load + link * (x.v - was) / dt - x.borne)
@@ -890,9 +903,11 @@ def plant_kernel() -> wp.Kernel:
             g = g0 + wp.max(i, 0)
             if i <= 0 and lead > 0:  # where it is measured first, only the drive's torque goes on
                 torque = x.last
+                stage = x.stage
                 x = begun(c, h, g0, warm, p)
                 if j > 0:
                     x.last = torque
+                    x.stage = stage
                     x.fresh = f64(2.0)
                 after = shown(x.q, p)
             if i >= 0 and i <= warm and warm > 0:

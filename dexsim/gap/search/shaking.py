@@ -30,6 +30,7 @@ RINGS = (0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little m
 LIMITS: tuple[dict[str, float], ...] = (  # laws of the drive's limits, which end how far it swings
     {"braking_slope": -1.0, "limit_speed": 1.0},
     {"braking_slope": -1.0, "limit_speed": 0.0},
+    {"braking_slope": 1.0, "limit_speed": 1.0},
     {},
 )
 ROUNDS, DRAWN, CLOSER, FIRST = 6, 32, 0.7, 0.35  # about the best: rounds, guesses of each, and how far they are
@@ -177,14 +178,15 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
             return found  # it is what was found by the motion itself
         for whole in effect.variants(search.case.scales):
             variant = None if whole.refines or whole.instead else search._narrow(whole)
-            if variant is None or search.deadline.over():
-                continue
-            member = Member(effect, variant)
-            lost, params, x = shaking.best(member, search.rng)
-            if effect.id not in tries or lost < tries[effect.id][0]:
-                with search._fix((member,)):
-                    fit = search.fitter.fit(params, x0=x, iterations=0)
-                tries[effect.id] = lost, Trial((member,), fit)
+            for law in [] if variant is None else [variant, *variant.by_law()]:
+                if search.deadline.over():
+                    continue
+                member = Member(effect, law)
+                lost, params, x = shaking.best(member, search.rng)
+                if effect.id not in tries or lost < tries[effect.id][0]:
+                    with search._fix((member,)):
+                        fit = search.fitter.fit(params, x0=x, iterations=0)
+                    tries[effect.id] = lost, Trial((member,), fit)
     if not tries:
         return found
     left = {e: shaking.of(t) for e, (_, t) in tries.items()}
