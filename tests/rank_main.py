@@ -1,5 +1,5 @@
 """`dexsim train` on the dummy task, for torchrun in tests: rank_main.py CONFIGS MODE [key=value ...]; `launched` does
-what torchrun does in a process that has torch loaded, and its ranks are forks of that.
+what torchrun does in a process that has torch loaded, and its ranks are forks of that: of this file, or of a program.
 
 MODE: plain; report: each rank writes what it had and learned into out=; slow: steps take time;
 fail<k>: rank k meets an error at its 60th step; bug<k>: an exception there instead.
@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import dummy_task
+import forked
 import torch
 
 from dexsim.cli import commands, train
@@ -81,14 +82,18 @@ def main(argv: list[str]) -> int:
 
 
 def one_rank(argv: list[str]) -> None:
-    """A rank that is a fork of torchrun: with the signals that a program begins with."""
+    """A rank that is a fork of torchrun: with the signals that a program begins with. argv: of `main`, or a program
+    (NAME.py) and its arguments."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    sys.exit(main(argv))
+    if argv[0].endswith(".py"):
+        forked.script(*argv)
+    else:
+        sys.exit(main(argv))
 
 
 def launched(options: list[str], argv: list[str]) -> None:
-    """`torchrun options rank_main.py argv`, but that the ranks are forks."""
+    """`torchrun options rank_main.py argv` (argv: as for `one_rank`), but that the ranks are forks."""
     from torch.distributed import run
 
     configured = run.config_from_args

@@ -165,7 +165,7 @@ def test_the_first_of_a_machine_says_what_all_find_wrong(monkeypatch, capsys):
 def learned(configs, tmp_path_factory):
     """A folder in which two ranks trained into run/, and what they printed."""
     folder = tmp_path_factory.mktemp("learned")
-    status, out, err = finish(torchrun(configs, folder, "report", "iterations=3", "out=run"))
+    status, out, err = finish(forks(configs, folder, "report", "iterations=3", "out=run"))
     assert status == 0, err
     return folder, out
 
@@ -257,28 +257,9 @@ def test_a_wrong_setting_is_said_once(configs, tmp_path):
 
 @pytest.mark.slow
 def test_two_ranks_of_the_grasp(tmp_path):
-    env = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "torch.distributed.run",
-            "--standalone",
-            "--nproc_per_node=2",
-            str(shell.ROOT / "train.py"),
-            "task=grasp",
-            "device=cpu",
-            "worlds=2",
-            "iterations=2",
-            "final_episodes=0",
-            "out=run",
-            "sim.threads=1",
-        ],
-        cwd=tmp_path,
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    small = ("task=grasp", "device=cpu", "worlds=2", "iterations=2", "final_episodes=0", "out=run", "sim.threads=1")
+    argv = [str(shell.ROOT / "train.py"), *small]
+    process = forked.Forked(rank_main.launched, list(TORCHRUN), argv, cwd=tmp_path, env={"OMP_NUM_THREADS": "1"})
+    status, out, err = finish(process, 300)
+    assert status == 0 and out.count("learned from") == 1, (out, err)
     assert checkpoint.load(tmp_path / "run" / "last.pt")["steps"] == 2 * 24 * 2 * 2
