@@ -148,6 +148,7 @@ def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
 
     assert len(found((1.0, 2.0), (2.08, 3.0))) == 1 and len(found((1.0, 2.0), (2.15, 3.0))) == 2
     assert len(found((1.0, 1.15))) == 1 and found((1.0, 1.08)) == []
+    assert found(*((k, k + 0.08) for k in np.arange(1.0, 5.0, 0.2))) == [], "a ripple of the joint's own"
 
 
 def push(clear: bool) -> float:

@@ -12,16 +12,16 @@ from dexsim.gap.rules import RULES
 
 
 def test_figures_alone_are_moved(tmp_path, monkeypatch):
-    s = sensitivity.settings(["figures=search.price,torque.late", "factors=0.5"])
+    s = sensitivity.settings(["figures=search.price,torque.fit", "factors=0.5"])
     monkeypatch.setattr(os, "fork", lambda: 1)  # as in the parent, whose children all end badly
     monkeypatch.setattr(os, "waitpid", lambda *_: (1, 1))
     with sensitivity.Forks(set(s["figures"]), s["factors"], set(), tmp_path / "rows.jsonl") as forks:
-        _ = RULES.search.price, RULES.search.least, RULES.torque.late, RULES.torque.late, RULES.judge.firm
+        _ = RULES.search.price, RULES.search.least, RULES.torque.fit, RULES.torque.fit, RULES.judge.firm
     assert [(r["figure"], r["factor"]) for r in sensitivity._rows(forks.path)] == [
         ("search.price", 0.5),
-        ("torque.late", 0.5),
+        ("torque.fit", 0.5),
     ]
-    assert forks.seen == {"search.price", "search.least", "torque.late", "judge.firm"}
+    assert forks.seen == {"search.price", "search.least", "torque.fit", "judge.firm"}
 
 
 def test_all_figures_of_the_rooms_are_moved_by_default():

@@ -497,7 +497,7 @@ def _spans(
     given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], shortest: float
 ) -> dict[str, list[tuple[float, float]]]:
     """Stretches by recording, in its own time. shortest [s]: what the filter of the torque tells apart; neither a push
-    nor a gap in it is shorter."""
+    nor a gap in it is shorter, so that the tops of a ripple are none."""
     out: dict[str, list[tuple[float, float]]] = {}
     for (t, on), run in zip(given, runs, strict=True):
         edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
