@@ -14,7 +14,8 @@ features (`cylinder_exact.py`). How often C MuJoCo was wrong is printed. Printed
 settings: percentiles of the error of the distance, of the angle of the normal and of the contact's place, and
 microseconds a pair of the narrow phase alone (of all worlds at once, cold: no pair has been there before).
  No pose is left out of the distances, and none out of the count of places that are off: each that is more than 1e-6 m
-from C MuJoCo's is held to all exact nearest points in float64 (`places.py`), of dexsim's kernels where they serve.
+from C MuJoCo's is held to all exact nearest points in float64 (`places.py`), of dexsim's kernels where they serve;
+each that is off is printed with its pose, which begins from nowhere: nothing was kept of a step before.
  Percentiles of normals and places are of poses where they are well-posed: not where overlapping bodies have two ways
 out of equal length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two roundings; of places also
 only where a corner of one body is nearest, since parallel edges and faces (`degenerate`, within 1e-3 rad or 10 um) have
@@ -358,7 +359,10 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
     out: dict = {"poses": worlds * len(errors["mujoco"]), "reference_wrong": wrong,
                  "whose": "dexsim's kernels" if kind in OURS else "MuJoCo-Warp's closed form or search"}  # fmt: skip
     count = {k: sum(j[k] for j in judged) for k in ("off", "ill", "equal", "reference_off")}
-    out["places"] = count | {"worst_m": max(j["worst"] for j in judged)}
+    out["places"] = count | {
+        "worst_m": max(j["worst"] for j in judged),
+        "poses_off": [pose for j in judged for pose in j["poses_off"]],
+    }
     for setting, parts in errors.items():
         r = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
         out[setting] = {"contacts": int(np.isfinite(r["dist"]).sum()), "missed": int(r["missed"].sum()),
@@ -402,6 +406,8 @@ def main(argv: list[str]) -> dict:
             f" {held['ill']} by less than the pose leaves open, at worst {held['worst_m']:.3g} m; {held['equal']} of"
             f" several nearest points another than C MuJoCo's; C MuJoCo's off: {held['reference_off']}"
         )
+        for pose in held["poses_off"]:
+            print(f"    off by {pose['off_m']:.3g} m: {json.dumps(pose)}")
         for setting in (s for s in SETTINGS if s in r):
             s = r[setting]
             print(

@@ -147,16 +147,28 @@ def errors(model: mujoco.MjModel, poses, i: int, normals: list[np.ndarray], at: 
     return min(error(model, poses, i, n, at) for n in normals)
 
 
+def described(model: mujoco.MjModel, poses, i: int, got: tuple) -> dict:
+    """Pose i as a case of tests/contact_places.json, whose numbers a float32 has exactly, and what was answered there:
+    distance [m], how much more than exact that is [m], normal from A to B, place [m]."""
+    dist, normal, _ = exact(model, poses, i)
+    return {
+        "meshes": [model.mesh(m).name if m >= 0 else None for m in poses.mesh[i]],
+        **{k: [float(np.float32(v)) for v in getattr(poses, k)[i].ravel()] for k in ("pos", "rot", "size")},
+        "dist": float(got[0][i]), "dist_error": float(got[0][i] - dist), "exact_normal": normal.tolist(),
+        "normal": got[1][i].tolist(), "place": got[2][i].tolist(),
+    }  # fmt: skip
+
+
 def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarray) -> dict:
     """Of all contacts whose place is more than 1e-6 m from C MuJoCo's (want): how many have more than one nearest
     point, and both are right (`equal`); how many answers are off, how many of C MuJoCo's are (`reference_off`), and how
     many of the answers are no further off than the pose is ill-conditioned (`ill`). worst [m]: of all answers. exact:
-    the exact places where C MuJoCo's is off, by pose.
+    the exact places where C MuJoCo's is off, by pose. poses_off: each answer that is off, by `described`.
 
     depth [n] in m: along the answers' normals. Of an overlap with two ways out of one length (to `LEVEL`) the place on
     either is right.
     """
-    out: dict = {"equal": 0, "off": 0, "ill": 0, "reference_off": 0, "worst": 0.0, "exact": {}}
+    out: dict = {"equal": 0, "off": 0, "ill": 0, "reference_off": 0, "worst": 0.0, "exact": {}, "poses_off": []}
     apart = np.linalg.norm(want[2] - got[2], axis=1)
     near = np.isfinite(got[0])
     other = (want[0] < 0) & (np.abs(depth + want[0]) < LEVEL) & (np.linalg.norm(want[1] - got[1], axis=1) > 1e-3)
@@ -175,6 +187,9 @@ def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarr
             places = np.array([at, *(exact(model, others, j)[2] for j in range(CHANGED))])
             ill = np.linalg.norm(places[:, None] - places[None], axis=-1).max() >= mine
             out["ill" if ill else "off"] += 1
+            if not ill:
+                told = described(model, poses, int(i), got)
+                out["poses_off"].append(told | {"off_m": mine, "exact_place": at.tolist()})
         elif theirs <= LIMIT:
             out["equal"] += 1
     rest = apart[near & (apart <= LIMIT)]

@@ -11,7 +11,7 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from dexsim.sim.collision.cylinder import beside_side, from_cylinder, furthest, rounder, stands_off
+from dexsim.sim.collision.cylinder import FAR, beside_side, from_cylinder, furthest, rounder, stands_off
 from dexsim.sim.collision.epa import Facet, penetration
 from dexsim.sim.collision.gjk import (
     LEAST,
@@ -411,7 +411,18 @@ def beside_cylinder(
                         normal = w.u
                 elif wp.length(t.v) > OVERLAP:
                     normal = -wp.normalize(R * t.v)
-                dist = stands_off(half, b, pairs.hull, R, p, normal)
+                # A cap is a facet of so many corners that the polytope is lost at it at times, on another way out that
+                # is hardly longer; but the caps' ways are known.
+                dist = float(-FAR)
+                about = normal
+                tried = int(0)
+                while tried < 3:
+                    u = wp.where(tried == 0, about, wp.vec3(0.0, 0.0, wp.where(tried == 1, 1.0, -1.0)))
+                    along_u = stands_off(half, b, pairs.hull, R, p, u)
+                    if along_u > dist + LEAST:
+                        dist = along_u
+                        normal = u
+                    tried += 1
                 middle = furthest(half, normal) + 0.5 * dist * normal
         elif d > 0.0:
             # moved out along a normal of the place where they overlap or touch, they have it there (see gjk.touching)
