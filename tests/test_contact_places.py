@@ -14,9 +14,9 @@ from benchmarks import places
 
 # All of 4.4 million contacts with one nearest point whose place was more than 1e-6 m off: a facet 1e-4 rad across left
 # out, a face near its corner taken for its edge or its edge for it, the prism's chord for the rim. Then crossing edges,
-# a tilted facet and parallel faces, where a first mending was wrong; then overlaps whose way out through a cap is hardly
-# shorter than another, which was taken (the first of these only with the sines and cosines of a GPU). Kind: meshes,
-# places, rotations, sizes, how far.
+# a tilted facet and parallel faces, where a first mending was wrong; then overlaps whose way out through a cap is
+# hardly shorter than another, which was taken (the first of these only with the sines and cosines of a GPU). Kind:
+# meshes, places, rotations, sizes, how far.
 FILE = Path(__file__).with_name("contact_places.json")
 CASES = json.loads(FILE.read_text())
 
