@@ -368,6 +368,7 @@ def test_catalogue_is_that_of_the_specification():
 PLANTED = [
     ("coulomb_friction", {"coulomb_friction": 0.06}, "torque", 0.06),
     ("viscous_friction", {"viscous_friction": 0.03}, "coefficient", 0.03),
+    ("viscous_friction", {"thinning_friction": 0.12, "thinning_speed": 0.6}, "at_rest", 0.12),
     ("command_delay", {"delay": 0.02}, "delay", 0.02),
     ("gain_mismatch", {"kp": 1.4}, "kp_factor", 0.7),
     ("deadband", {"deadband": 0.03}, "width", 0.03),
@@ -401,7 +402,7 @@ def check_planted(effect, changes, key, value, seconds=3.0):
 # a deadband's fits, begun again from several places, take 45 s; the others 6
 @pytest.mark.parametrize(
     ("effect", "changes", "key", "value"),
-    [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
+    [pytest.param(*p, id=f"{p[0]} {p[2]}", marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
 )
 def test_planted_effect_is_named_and_sized(effect, changes, key, value):
     check_planted(effect, changes, key, value, 4.0 if effect == "deadband" else 2.0)

@@ -9,7 +9,7 @@ import pytest
 from test_gap import SERVO, model, motion
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.plant.case import _true, build
+from dexsim.gap.plant.case import build, true_motion
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read import Run
 from dexsim.gap.search.search import JointSearch
@@ -104,7 +104,7 @@ def test_a_motion_as_it_is_from_what_an_encoder_shows():
     ) = 1.1, 0.03, 0.08, -0.05
     shown = 1.1 * q + 0.03 + 0.08 * np.sin(q) - 0.05 * (np.cos(q) - 1)
     speed = np.gradient(shown, t)
-    x, v, a = _true((t, shown, speed, np.gradient(speed, t)), row)[1:]
+    x, v, a = true_motion((t, shown, speed, np.gradient(speed, t)), row)[1:]
     assert (
         np.abs(x - q).max() < 1e-4
         and np.abs(v - 3.5 * np.cos(5 * t))[5:-5].max() < 2e-3

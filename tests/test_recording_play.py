@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from dexsim.actuator.table import ServoTable
+from dexsim.assets import xhand
 from dexsim.cli import recorded as replay_cli
 from dexsim.cli import start
 from dexsim.errors import UserError
@@ -300,6 +301,32 @@ def test_a_play_in_another_world_does_not_tell_its_drives(tmp_path):
         said.append(yaml.safe_load(read(recorder.save(tmp_path / f"{len(said)}.mcap")[0]).meta["servo"])["joints"])
         recorder.detach()
     assert said[1] == {"*": {"kp": 3.25}} and said[0]["mid_joint1"]["kp"] > 2.0  # its own: 4.0, randomized
+
+
+def test_a_play_is_recorded_as_its_encoders_show_it(tmp_path):
+    """An eccentric encoder's position and speed, as the policy has them."""
+    from worlds import grasp_env
+
+    from dexsim.recording.tap import PlayRecorder
+
+    servo = ServoTable.load(CONFIGS / "servo" / "xhand.yaml")
+    for joint in xhand.JOINTS:
+        servo.set(joint, "eccentric_sin", 0.2)
+        servo.set(joint, "eccentric_cos", 0.1)
+    servo.save(tmp_path / "servo.yaml")
+    env = grasp_env(f"servo_file={tmp_path / 'servo.yaml'}", worlds=1)
+    recorder = PlayRecorder(env, 1, {})
+    env.reset_all()
+    seen = []
+    for _ in range(6):
+        env.step(0.3 * torch.ones(1, 12))
+        seen.append([x.numpy().copy() for x in (env.q[0], env.qd[0], env.engine.t.qpos[0, env.joint_q])])
+    states = read(recorder.save(tmp_path / "p.mcap")[0]).states
+    for k, (q, qd, _) in enumerate(seen[:-1]):
+        row = (k + 1) * env.decimation  # the state after step k is the one before the first physics step of k + 1
+        np.testing.assert_allclose(states.position.value[row], q, atol=1e-6)
+        np.testing.assert_allclose(states.velocity.value[row], qd, atol=1e-4)
+    assert max(np.abs(q - true).max() for q, _, true in seen) > 0.02
 
 
 def test_a_play_is_recorded_as_it_was(played):

@@ -330,6 +330,25 @@ def test_endings(env):
     assert ends["tipped"].tolist() == [False, False, True, False]
 
 
+def test_while_learning_a_cube_may_not_go_as_far():
+    """`termination.training` ends an episode of a training; an evaluation goes by `distance`."""
+    env = make("task.termination.training=0.03")
+    env.reset_all()
+    pose = torch.cat([env.home, env.object_pose[:, 3:]], 1)
+    pose[0, 0] += 0.031
+    pose[1, 0] += 0.029
+    pose[2, 0] += env.task["termination"]["distance"] + 0.001
+    put(env, pose)
+    assert env.terminated()["dropped"].tolist() == [True, False, True, False]
+    assert "0.03 m" in dict(env.describe()["terminations"])["dropped"]
+    env.end_curriculum()
+    assert env.terminated()["dropped"].tolist() == [False, False, True, False]
+    for wrong in ("0", "-0.01", "0.11"):
+        with pytest.raises(UserError, match="task.termination.training"):
+            make(f"task.termination.training={wrong}")
+    assert not make("task.termination.training=null").terminated()["dropped"].any()
+
+
 def test_quaternion_jumps_and_six_does_not():
     """A cube turned once round, its goal turning with it: the same relative rotation, but the quaternion's sign
     jumps."""

@@ -11,8 +11,8 @@ import warp as wp
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, laws
 from dexsim.actuator.columns import INDEX
+from dexsim.actuator.reference import measured_position, torque_along, viscous
 from dexsim.actuator.reference import servo as servo_reference
-from dexsim.actuator.reference import torque_along
 from dexsim.gap import demo
 from dexsim.gap.judge.full_model import World, free_runs
 from dexsim.gap.plant.batch import JointPlant, nominal_row
@@ -273,6 +273,31 @@ def test_stribeck_exponent(motion, exponent):
     assert min(abs(a - ends[exponent]) for n, a in ends.items() if n != exponent) > 0.03  # a law of its own each
 
 
+SPRING = {"softness": 0.01, "rotor": 0.3 * INERTIA, "rebound": 0.5}
+
+
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+@pytest.mark.parametrize("more", [{}, SPRING])
+@pytest.mark.parametrize("half", [0.4, 3.0])
+def test_thinning_friction(motion, more, half):
+    """A link that coasts: I v' = -(b + a / (1 + |v| / v_h)) v, also where its motor is joined to it by a spring."""
+    b, a = 0.004, 0.03
+    columns = COAST | {"viscous_friction": b, "thinning_friction": a, "thinning_speed": half} | more
+    q = motion(columns, [0.0], [0.0], 0.25, v0=6.0)[:, 0]
+    ways = {h: coast(lambda _, v, h=h: -(b + a / (1 + v / h)) * v, 6.0, 0.25) for h in (0.4, 3.0, 1e9)}
+    assert np.abs(q - ways[half]).max() < 0.012
+    assert min(np.abs(ways[half] - w).max() for h, w in ways.items() if h != half) > 0.1  # a law of its own each
+
+
+def test_thinning_friction_is_half_gone_at_its_speed_and_linear_without():
+    row = ServoTable.from_dict({"joints": {"joint": {"viscous_friction": 0.01, "thinning_friction": 0.02,
+                                                     "thinning_speed": 3.0}}}).nominal(["joint"])[0]  # fmt: skip
+    p = {name: row[i] for name, i in INDEX.items()}
+    np.testing.assert_allclose(viscous(p, np.array([0.0, 3.0, -3.0, 9.0])), [0.03, 0.02, 0.02, 0.015])
+    assert viscous(p | {"thinning_friction": 0.0}, np.array([0.0, 7.0])).tolist() == [0.01, 0.01]
+    assert viscous(p, 3.0, features=()) == 0.01
+
+
 def sawtooth(angle):
     """By its Fourier series: rises through 0 at angle 0, drops at pi."""
     k = np.arange(1, 400)[:, None]
@@ -386,6 +411,15 @@ def test_a_gears_load_from_both_sides_is_one_law_in_servo_and_plant():
     for name in LOADED:
         without = np.abs(run_by(servo_motion, columns | LOADED | {name: 0.0}, 2.5e-4) - q).max()
         assert without > 3 * apart, name
+
+
+def test_what_the_encoder_is_off_by_is_marked_as_the_encoders():
+    """By the mark a servo knows that what is reported is no straight line in the position."""
+    q = np.linspace(-1.5, 1.5, 7)
+    neutral = {c.name: c.neutral for c in COLUMNS}
+    for c in COLUMNS:
+        shown, slope = measured_position(neutral | {c.name: min(c.neutral + c.usual, c.high)}, q)
+        assert c.encoder == (np.abs(np.diff(shown, 2)).max() > 1e-3) == (np.ptp(slope + 0.0 * q) > 1e-3), c.name
 
 
 @wp.kernel

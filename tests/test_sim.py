@@ -212,6 +212,28 @@ def test_gravity_and_mass_act_by_world(fresh):
     assert np.allclose(ball[:, 1], 0.06 / np.array([0.1, 0.2, 0.3, 0.4]) * t, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ENGINES)
+def test_armature_acts_by_world_on_a_centred_link(kind):
+    """A disc about its own axis: a = tau / (I + armature), written between steps, also after its inertia was changed.
+    C MuJoCo keeps the inertia of such a link as compiled."""
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><option timestep="0.001"/><worldbody><body><joint name="axis" axis="0 0 1" armature="0.0005"/>
+<inertial pos="0 0 0" mass="1" diaginertia="0.001 0.001 0.001"/></body></worldbody></mujoco>"""
+    )
+    e = make_engine(spec, 2, "cpu", kind, fields=("dof_armature", "body_inertia", "body_subtreemass",
+                                                  "body_invweight0", "dof_invweight0"))  # fmt: skip
+    expected = np.zeros(2)
+    for inertia in (1e-3, 4e-3):
+        e.field("body_inertia")[:, 1] = inertia
+        e.set_const()
+        for armature in ([-2e-4, 5e-4], [0.0, 3e-3]):
+            e.field("dof_armature")[:, 0] = torch.tensor(armature, dtype=e.field("dof_armature").dtype)
+            e.t.qfrc_applied[:] = 0.01
+            e.step(5)
+            expected += 5e-3 * 0.01 / (inertia + np.array(armature))
+            assert np.allclose(e.t.qvel[:, 0].double().numpy(), expected, rtol=1e-5)
+
+
 def test_friction_acts_by_world(fresh):
     """A floor tilted by 0.3 rad (through gravity): held at mu = 0.6, sliding with g (sin - mu cos) at mu = 0.1."""
     e = fresh

@@ -27,7 +27,7 @@ class Column:
 
     feature: the part of the servo's kernel that has its law and is compiled in only where a drive asks for it; empty:
     all servos have it. asks: whether a value other than the neutral one asks for that part; False where the column says
-    nothing without another one of it."""
+    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`)."""
 
     name: str
     unit: str
@@ -38,6 +38,7 @@ class Column:
     text: str
     feature: str = ""
     asks: bool = True
+    encoder: bool = False
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -149,8 +150,28 @@ COLUMNS: tuple[Column, ...] = (
     Column("position_offset", "rad", 0.0, -7.0, 7.0, 0.05, "encoder zero error, added to the measured position"),
     Column("position_scale", "1", 1.0, 0.5, 2.0, 0.1, "encoder scale: measured over true position"),
     # The same encoder, eccentric: measured = scale * q + offset + eccentric_sin * sin q + eccentric_cos * (cos q - 1).
-    Column("eccentric_sin", "rad", 0.0, -1.0, 1.0, 0.05, "encoder error, sine of the position", feature="rare"),
-    Column("eccentric_cos", "rad", 0.0, -1.0, 1.0, 0.05, "encoder error, cosine of the position - 1", feature="rare"),
+    Column(
+        "eccentric_sin",
+        "rad",
+        0.0,
+        -1.0,
+        1.0,
+        0.05,
+        "encoder error, sine of the position",
+        feature="rare",
+        encoder=True,
+    ),
+    Column(
+        "eccentric_cos",
+        "rad",
+        0.0,
+        -1.0,
+        1.0,
+        0.05,
+        "encoder error, cosine of the position - 1",
+        feature="rare",
+        encoder=True,
+    ),
     # Firmware.
     Column(
         "speed_lag",
@@ -339,6 +360,28 @@ COLUMNS: tuple[Column, ...] = (
         "the same per torque from outside squared while the motor drives a smaller one",
         feature="load",
     ),
+    # Grease that thins as it is sheared.
+    Column(
+        "thinning_friction",
+        "N.m.s/rad",
+        0.0,
+        0.0,
+        1e4,
+        0.01,
+        "what friction per speed is more at rest than viscous_friction, and less the faster it turns",
+        feature="shape",
+    ),
+    Column(
+        "thinning_speed",
+        "rad/s",
+        1.0,
+        1e-4,
+        1e3,
+        0.95,
+        "speed at which half of thinning_friction is left: thinning_friction / (1 + |speed| / thinning_speed)",
+        feature="shape",
+        asks=False,
+    ),
 )
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)
@@ -350,6 +393,9 @@ FEATURES: dict[str, tuple[str, ...]] = {
 }
 """What is compiled into a servo only where one of these columns differs from its neutral value."""
 FEATURE_OF: dict[str, str] = {name: feature for feature, names in FEATURES.items() for name in names}
+
+ENCODER: frozenset[str] = frozenset(c.name for c in COLUMNS if c.encoder)
+"""Columns of what an encoder shows beyond its scale and offset (`laws.encoder_error`)."""
 
 
 def simulated(features: frozenset[str]) -> list[int]:

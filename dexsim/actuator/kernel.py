@@ -53,10 +53,10 @@ from dexsim.actuator.laws import (
     arrived,
     difference,
     dry_friction,
-    eccentricity,
-    eccentricity_slope,
+    encoder_error,
     hold,
     lag_share,
+    lost_error,
     other_terms,
     parasitic_torque,
     pd,
@@ -66,6 +66,7 @@ from dexsim.actuator.laws import (
     torque_limits,
     transmission,
     transmission_damping,
+    viscous,
     voltage_torque,
     warm_motor,
     wind,
@@ -90,13 +91,12 @@ SNAP = 1.0e-3  # parts of a step shorter than this are rounding of the clock
 WHOLE = 1.0 - SNAP
 
 KP, KD = INDEX["kp"], INDEX["kd"]
-DEADBAND = INDEX["deadband"]
 TORQUE_LIMIT, NO_LOAD_SPEED = INDEX["torque_limit"], INDEX["no_load_speed"]
 EFFICIENCY, DELAY, LAG_TIME, SUPPLY = INDEX["efficiency"], INDEX["delay"], INDEX["lag"], INDEX["supply"]
 VISCOUS, ASYMMETRY = INDEX["viscous_friction"], INDEX["friction_asymmetry"]
+THINNING, THINNING_SPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
-ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
-SPEED_LAG, DEADBAND_KIND = INDEX["speed_lag"], INDEX["deadband_kind"]
+SPEED_LAG = INDEX["speed_lag"]
 BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
     INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
 )
@@ -191,12 +191,13 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
     asks for; `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two.
     Each has the law as `laws.py` states it and takes it to the end of the step ("Integration")."""
-    play, sag, rare, braking, controller, presliding, load = (
-        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "load")
+    play, sag, rare, braking, controller, presliding, load, shape = (
+        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "load", "shape")
     )
     extended = bool(features & EXTENDED)
     Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
     parasitic, dry = parasitic_torque(features), dry_friction(features)
+    encoder, lost = encoder_error(features), lost_error(features)
 
     @wp.struct
     # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
@@ -273,10 +274,10 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         s = Sensed()
         s.scale = d.params[w, j, SCALE]
         s.share = real(1.0)
+        error = encoder(d.params[w, j], turned)
         s.q = s.scale * turned + d.params[w, j, OFFSET]
-        if wp.static(rare):
-            s.q += eccentricity(turned, d.params[w, j, ECC_SIN], d.params[w, j, ECC_COS])
-            s.scale += eccentricity_slope(turned, d.params[w, j, ECC_SIN], d.params[w, j, ECC_COS])
+        s.q += error[0] + error[1]
+        s.scale += error[2]
         s.rate = s.scale * turning
         s.v = s.rate
         s.v_end = s.rate
@@ -316,23 +317,20 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         integral waits."""
         end = d.time[w] - d.params[w, j, DELAY] + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
-        kind = real(0.0)
         if wp.static(rare):
-            kind = d.params[w, j, DEADBAND_KIND]
             dragged = d.params[w, j, COUPLING]
             if dragged != real(0.0):
                 other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
                 target += dragged * (d.qpos[w, d.dof_q[other]] - d.home[w, other])
         u = pd(
             target - s.q,
+            lost(d.params[w, j], target, target - s.q),
             s.v,
             s.v_end,
             s.rate,
             s.scale,
             d.params[w, j, KP],
             d.params[w, j, KD],
-            d.params[w, j, DEADBAND],
-            kind,
             dt,
             real(0.0),
             s.share,
@@ -434,6 +432,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         """Friction at the motor's speed; last: its torque of the step before."""
         f = Friction()
         f.viscous = d.params[w, j, VISCOUS] * factor
+        if wp.static(shape):
+            more = d.params[w, j, THINNING]
+            f.viscous = viscous(d.params[w, j, VISCOUS], more, d.params[w, j, THINNING_SPEED], r.v) * factor
         outside = real(0.0)
         if wp.static(load):
             outside = d.outside[w, d.dof[j]]

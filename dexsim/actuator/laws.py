@@ -3,7 +3,8 @@ search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32
 same laws in NumPy, written apart, as their check.
 
 Where several laws make up one quantity they are put together here, for both kernels: `warm_motor`, `dry_friction`,
-`parasitic_torque`. `of` is there a drive's row of the table, in the order of `columns.py`."""
+`parasitic_torque`, `encoder_error`, `lost_error`. `of` is there a drive's row of the table, in the order of
+`columns.py`."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
@@ -31,21 +32,47 @@ LOAD_PEAK, LOAD_PEAK_OUTSIDE, LOAD_SQUARE, LOAD_SQUARE_OUTSIDE = (
 RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE, RIPPLE_SHAPE = (
     INDEX[n] for n in ("torque_ripple", "ripple_per_turn", "ripple_phase", "ripple_shape")
 )
+ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
+DEADBAND, DEADBAND_KIND = INDEX["deadband"], INDEX["deadband_kind"]
 
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def eccentricity(q: Any, sine: Any, cosine: Any):
-    """Error [rad] at position q [rad] of an encoder whose disk is off its axis: sine * sin q + cosine * (cos q - 1),
-    zero at q = 0. Geometry, to first order in the offset over the disk's radius."""
-    return sine * wp.sin(q) + cosine * (wp.cos(q) - type(q)(1.0))
+    """(part by sin q, part by cos q, slope) of the error [rad] at position q [rad] of an encoder whose disk is off its
+    axis: sine * sin q + cosine * (cos q - 1), zero at q = 0. Geometry, to first order in the offset over the disk's
+    radius."""
+    s = wp.sin(q)
+    c = wp.cos(q)
+    return wp.vector(sine * s, cosine * (c - type(q)(1.0)), sine * c - cosine * s)
 
 
-@wp.func
-def eccentricity_slope(q: Any, sine: Any, cosine: Any):
-    """What that encoder shows beyond a speed at position q, over the speed: the derivative of `eccentricity`."""
-    return sine * wp.cos(q) - cosine * wp.sin(q)
+@cache
+def encoder_error(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of what an encoder shows beyond scale * q + offset, as a sum of laws of the position, for a
+    kernel with these of `columns.FEATURES`.
+
+    A further such law is a function of this file and a term of `error` and `slope` here, and in
+    `reference.measured_position`; its columns are marked `encoder`. Training, search, recordings and whoever asks what
+    a position is from what is shown take the encoder from these two."""
+
+    @wp.func
+    def error(of: wp.array(dtype=Any), q: Any):
+        """(first, error, slope): first + error [rad] at position q [rad] of what the encoder turns with, and the slope
+        of that in q. Two parts, since each kernel keeps the order of its sum, as of `dry_friction`."""
+        first = type(q)(0.0)
+        error = type(q)(0.0)
+        slope = type(q)(0.0)
+        if wp.static("rare" in features):
+            if of[ECC_SIN] != type(q)(0.0) or of[ECC_COS] != type(q)(0.0):
+                off_axis = eccentricity(q, of[ECC_SIN], of[ECC_COS])
+                first = off_axis[0]
+                error += off_axis[1]
+                slope += off_axis[2]
+        return wp.vector(first, error, slope)
+
+    return error
 
 
 # -- delay and lag -----------------------------------------------------------------------------------------------------
@@ -187,6 +214,18 @@ def stribeck_power(ratio: Any, exponent: Any):
     if exponent != type(ratio)(2.0):
         power = wp.pow(wp.abs(ratio), exponent)
     return power
+
+
+@wp.func
+def viscous(high: Any, more: Any, half: Any, v: Any):
+    """Friction per speed [N.m.s/rad] of grease that thins as it is sheared, at speed v [rad/s]: high + more / (1 +
+    |v| / half), high: what is left of it at any speed, more: what is beyond that at rest, half: speed [rad/s] at which
+    half of that is left.
+
+    Cross's law of a shear-thinning fluid, with its exponent 1 (M. Cross, Rheology of non-Newtonian fluids: a new flow
+    equation for pseudoplastic systems, J. Colloid Science 20, 1965). It is nowhere negative: with the speed of a step's
+    begin here, and that of its end as the factor, it is stable whatever the step."""
+    return high + more / (type(v)(1.0) + wp.abs(v) / half)
 
 
 @wp.func
@@ -379,17 +418,50 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
 # 4th ed. 2012, chapter 17.)
 
 
+@cache
+def lost_error(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of what of its error a loop does not act on, as a sum of laws of the target and the error, for
+    a kernel with these of `columns.FEATURES`.
+
+    A further such law (another dead zone, an error that is limited, a target that is rounded) is a function of this
+    file and a term of `lost` and `slope` here, and in `reference.lost_error`: training, search and what a diagnosis
+    hands on take the error from these two."""
+
+    @wp.func
+    def lost_of(of: wp.array(dtype=Any), target: Any, e: Any):
+        """(lost, slope, acts): lost [rad] of the error e [rad] to a target [rad]; its slope in e at that target; acts:
+        0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
+
+        The deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2
+        it counts from the edge on."""
+        lost = type(e)(0.0)
+        slope = type(e)(0.0)
+        acts = type(e)(2.0)
+        kind = type(e)(0.0)
+        if wp.static("rare" in features):
+            kind = of[DEADBAND_KIND]
+        width = of[DEADBAND]
+        if kind > type(e)(1.5):
+            lost += wp.clamp(e, -width, width)
+        if wp.abs(e) < width:
+            acts = type(e)(0.0)
+            if kind > type(e)(0.5):
+                acts = type(e)(1.0)
+        return wp.vector(lost, slope, acts)
+
+    return lost_of
+
+
 @wp.func
 def pd(
     e: Any,
+    lost: Any,
     v: Any,
     v_end: Any,
     rate: Any,
     scale: Any,
     kp: Any,
     kd: Any,
-    width: Any,
-    kind: Any,
     dt: Any,
     age: Any,
     share: Any,
@@ -398,29 +470,25 @@ def pd(
     [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then
     [N.m.s/rad].
 
-    e: error of the measured position [rad]. v, v_end: measured speed that kd acts on, now and then [rad/s]; rate:
-    measured speed of the position; scale: what the encoder shows over what turns; share: of a change of speed, what
-    kd's filter passes in the step; age: of the position [s]. width, kind: the deadband (columns `deadband`,
-    `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2 it counts from the edge on. acts: 0 no
-    torque, 1 all but the error, 2 all."""
+    e: error of the measured position [rad]; lost: what of it does not count (`lost_error`). v, v_end: measured speed
+    that kd acts on, now and then [rad/s]; rate: measured speed of the position; scale: what the encoder shows over what
+    turns; share: of a change of speed, what kd's filter passes in the step; age: of the position [s]. acts: as of
+    `lost_error`."""
     now = kp * e - kd * v
     end = kp * e - kd * v_end - kp * dt * rate
     slope = scale * (kp * (dt - age) + share * kd)
-    counts = e
-    acts = type(e)(2.0)
-    if kind > type(e)(1.5):
-        inner = wp.clamp(e, -width, width)
-        now -= kp * inner
-        end -= kp * inner
-        counts = e - inner
-    if wp.abs(e) < width:
+    now -= kp * lost[0]
+    end -= kp * lost[0]
+    end += kp * dt * rate * lost[1]
+    slope -= scale * kp * (dt - age) * lost[1]
+    counts = e - lost[0]
+    acts = lost[2]
+    if acts < type(e)(1.5):
         counts = type(e)(0.0)
-        acts = type(e)(0.0)
         now = type(e)(0.0)
         end = type(e)(0.0)
         slope = type(e)(0.0)
-        if kind > type(e)(0.5):
-            acts = type(e)(1.0)
+        if acts > type(e)(0.5):
             now = -kd * v
             end = -kd * v_end
             slope = scale * share * kd

@@ -5,6 +5,7 @@ numerics, as how stiff the end of a play is."""
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,35 @@ from dexsim.actuator.columns import FEATURES, INDEX
 from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
 
 Numbers = float | np.ndarray
+
+
+def measured_position(
+    p: Mapping[str, Any], q: Any, features: Collection[str] = FEATURES, xp: Any = np
+) -> tuple[Any, Any]:
+    """(position [...] rad that an encoder shows where what it turns with is at q [...] rad, its slope in q): scale,
+    offset and all terms of `laws.encoder_error`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; xp: whose arrays these are, `numpy` or
+    `torch`: a servo says with this what its encoders report."""
+    shown, slope = p["position_scale"] * q + p["position_offset"], p["position_scale"]
+    if "rare" in features:
+        shown = shown + p["eccentric_sin"] * xp.sin(q) + p["eccentric_cos"] * (xp.cos(q) - 1.0)
+        slope = slope + p["eccentric_sin"] * xp.cos(q) - p["eccentric_cos"] * xp.sin(q)
+    return shown, slope
+
+
+def lost_error(
+    p: Mapping[str, Numbers], target: Numbers, e: Numbers, features: Collection[str] = FEATURES
+) -> tuple[Numbers, Numbers, Numbers]:
+    """(what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what acts: 0
+    no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count."""
+    kind = p["deadband_kind"] if "rare" in features else 0.0
+    inside = np.abs(e) < p["deadband"]
+    lost = np.where(np.greater(kind, 1.5), np.clip(e, -p["deadband"], p["deadband"]), 0.0)
+    slope = np.zeros_like(lost)
+    return lost, slope, np.where(inside, np.where(np.greater(kind, 0.5), 1.0, 0.0), 2.0)
 
 
 def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float) -> np.ndarray:
@@ -135,6 +165,16 @@ def dry_friction(
     return level
 
 
+def viscous(p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES) -> Numbers:
+    """Friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`.
+
+    p: columns by name; v [rad/s] of the motor; features: those of `columns.FEATURES` that count."""
+    if "shape" not in features:
+        return p["viscous_friction"]
+    half = p["thinning_speed"]
+    return p["viscous_friction"] + p["thinning_friction"] * half / (half + np.abs(v))
+
+
 def servo(
     params: np.ndarray,
     target: Numbers,
@@ -191,28 +231,22 @@ def servo(
     )
     on_rotor = two & np.asarray(loop_motor)
     turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
-    # of a speed here
-    scale = p["position_scale"] + (
-        p["eccentric_sin"] * np.cos(turned) - p["eccentric_cos"] * np.sin(turned) if rare else 0.0
-    )
+    q_m, scale = measured_position(p, turned, features)
     v_m = scale * turning
-    q_m = p["position_scale"] * turned + p["position_offset"]
     kd_blend: Numbers = 1.0
-    v_d, v_next, kind = v_m, v_m, np.zeros_like(v)
+    v_d, v_next = v_m, v_m
     if rare:
-        q_m = q_m + p["eccentric_sin"] * np.sin(turned) + p["eccentric_cos"] * (np.cos(turned) - 1.0)
         kd_blend = dt / (p["speed_lag"] + dt)
         filtered = np.where(first, turning, filtered + kd_blend * (turning - filtered))
         v_d, v_next = scale * filtered, scale * (filtered + kd_blend * (turning - filtered))
-        kind, target = p["deadband_kind"], target + p["coupling"] * dragging
+        target = target + p["coupling"] * dragging
 
-    e = target - q_m
-    dead = np.abs(e) < p["deadband"]
-    cut = np.where(kind > 1.5, p["kp"] * np.clip(e, -p["deadband"], p["deadband"]), 0.0)
-    now = p["kp"] * e - p["kd"] * v_d - cut
-    pd = p["kp"] * e - p["kd"] * v_next - p["kp"] * dt * v_m - cut
-    slope = scale * (p["kp"] * dt + kd_blend * p["kd"])
-    damped = dead & (kind > 0.5)
+    lost, bend, acts = lost_error(p, target, target - q_m, features)
+    e, heeded = target - q_m - lost, 1.0 - bend
+    now = p["kp"] * e - p["kd"] * v_d
+    pd = p["kp"] * (e - heeded * dt * v_m) - p["kd"] * v_next
+    slope = scale * (p["kp"] * heeded * dt + kd_blend * p["kd"])
+    dead, damped = np.less(acts, 1.5), np.equal(acts, 1.0)
     now = np.where(damped, -p["kd"] * v_d, np.where(dead, 0.0, now))
     pd = np.where(damped, -p["kd"] * v_next, np.where(dead, 0.0, pd))
     slope = np.where(damped, scale * kd_blend * p["kd"], np.where(dead, 0.0, slope))
@@ -238,14 +272,14 @@ def servo(
             upper, lower = np.where(v_drive < 0.0, brakes, drives), np.where(v_drive > 0.0, brakes, drives)
     if "controller" in features:
         feed = p["speed_feedforward"] * rates[0] + p["acceleration_feedforward"] * rates[1]
-        counted = np.where(dead, 0.0, np.where(kind > 1.5, e - np.clip(e, -p["deadband"], p["deadband"]), e))
+        counted = np.where(dead, 0.0, e)
         added = dt * p["integral_gain"] * counted
         asked = now + feed + integral
         waits = ((asked > upper) & (added > 0.0)) | ((asked < -lower) & (added < 0.0))
         integral = np.where(np.asarray(enabled) == 0.0, 0.0, integral + np.where(waits, 0.0, added))
-        acts, off = ~dead | damped, ~dead
-        now = now + np.where(acts, feed + integral, 0.0)
-        pd = pd + np.where(acts, feed + integral, 0.0) + np.where(off, added - dt * dt * p["integral_gain"] * v_m, 0.0)
+        fed, off = ~dead | damped, ~dead
+        now = now + np.where(fed, feed + integral, 0.0)
+        pd = pd + np.where(fed, feed + integral, 0.0) + np.where(off, added - dt * dt * p["integral_gain"] * v_m, 0.0)
         slope = slope + np.where(off, scale * dt * dt * p["integral_gain"], 0.0)
 
     inertia_drive = np.where(two, rotor_inertia, inertia)
@@ -303,20 +337,20 @@ def servo(
 
     own = friction_factor * dry_friction(p, q, v_drive, last, outside, features)
     level = base_frictionloss + own
-    viscous = friction_factor * p["viscous_friction"]
+    grease = friction_factor * viscous(p, v_drive, features)
 
     gives = ("presliding" in features) & (p["presliding"] > 0.0)
     y = v_drive * dt / np.where(gives, p["presliding"], 1.0)
     taken = np.where(gives & ~first, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
     sliding = np.where(gives, np.where(two, own, level), 0.0)
-    viscous = viscous + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (
+    grease = grease + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (
         1.0 + np.abs(y)
     )
     of_motor = of_motor - sliding * taken
 
     one = {
         "qfrc_applied": applied - 0.5 * p["friction_asymmetry"] * level - sliding * taken + damping * v,
-        "dof_damping": base_damping + viscous + damping,
+        "dof_damping": base_damping + grease + damping,
         "dof_frictionloss": np.where(gives, 0.0, level),
         "line_a": np.zeros_like(v), "line_b": np.ones_like(v),
     }  # fmt: skip
@@ -330,7 +364,7 @@ def servo(
                 on_drive,
                 on_rotor,
                 np.where(gives, 0.0, own),
-                viscous,
+                grease,
                 rotor_q,
                 v_drive,
                 rotor_inertia,
@@ -367,7 +401,7 @@ def _rotor(
     on_drive: Numbers,
     on_rotor: np.ndarray,
     own: np.ndarray,
-    viscous: np.ndarray,
+    grease: np.ndarray,
     rotor_q: np.ndarray,
     w: np.ndarray,
     rotor_inertia: np.ndarray,
@@ -387,7 +421,7 @@ def _rotor(
     stop = STOP_GAIN * gain + STOP_RATE**2 * inertia
     stiff = np.where(soft > 0.0, 1.0 / soft, stop)
     damp = 2.0 * p["rebound"] * np.sqrt(stiff * rotor_inertia * link / (rotor_inertia + link))
-    free_a = rotor_inertia / dt + viscous + on_drive
+    free_a = rotor_inertia / dt + grease + on_drive
     push = rotor_inertia / dt * w + of_motor + on_drive * w
     slides = np.abs(push) > own
     free = (

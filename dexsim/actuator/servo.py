@@ -10,7 +10,7 @@ import mujoco
 import torch
 import warp as wp
 
-from dexsim.actuator.columns import COLUMNS, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
+from dexsim.actuator.columns import COLUMNS, ENCODER, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
 from dexsim.actuator.kernel import (
     EXTENDED,
     EXTRA_SLOTS,
@@ -22,6 +22,7 @@ from dexsim.actuator.kernel import (
     send_kernel,
     servo_kernel,
 )
+from dexsim.actuator.reference import measured_position
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.sim.launches import Launches
@@ -98,9 +99,8 @@ class Servo:
             self.slots[f"stamp{k}"] = QUEUE + k
             self.slots[f"target{k}"] = QUEUE + self.queue + k
         before_play = "play" in self.features and "motor" in table.encoder("position", self.joints)
-        self.misread = before_play or bool(
-            named & {"position_offset", "position_scale", "eccentric_sin", "eccentric_cos"}
-        )
+        self._bent = bool(named & ENCODER)  # what an encoder shows may be no straight line in the position
+        self.misread = before_play or self._bent or bool(named & {"position_offset", "position_scale"})
         extended = bool(self.features & EXTENDED)
         if extended:
             self.slots |= {name: QUEUE + 2 * self.queue + i for i, name in enumerate(EXTRA_SLOTS)}
@@ -119,6 +119,7 @@ class Servo:
         self._dof, self._dof_q, self._loop_q, self._loop_dof = index(dof), index(dof_q), index(loop_q), index(loop_dof)
 
         self.params, self.state, self.torque = (wp.to_torch(a) for a in (self._params, self._state, self._torque))
+        self._by_name = {name: self.params[:, :, i] for name, i in INDEX.items()}  # views
         self.base_damping = wp.to_torch(self._base_damping)
         self.base_frictionloss = wp.to_torch(self._base_frictionloss)
         self.base_armature, self.home = wp.to_torch(self._base_armature), wp.to_torch(self._home)
@@ -244,25 +245,18 @@ class Servo:
     def velocity(self) -> torch.Tensor:
         """[N, J] velocity that the encoders report [rad/s]."""
         q, v = self._turned()
-        slope = self.column("position_scale")
-        if "rare" in self.features:
-            slope = slope + self.column("eccentric_sin") * torch.cos(q) - self.column("eccentric_cos") * torch.sin(q)
-        return slope * v
+        return measured_position(self._by_name, q, self.features, torch)[1] * v
 
     def measured(self, q: torch.Tensor) -> torch.Tensor:
         """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
-        out = self.column("position_scale") * q + self.column("position_offset")
-        if "rare" in self.features:
-            out = (
-                out + self.column("eccentric_sin") * torch.sin(q) + self.column("eccentric_cos") * (torch.cos(q) - 1.0)
-            )
-        return out
+        shown: torch.Tensor = measured_position(self._by_name, q, self.features, torch)[0]
+        return shown
 
     def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
         """The position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
         q = (reported - self.column("position_offset")) / self.column("position_scale")
-        # an eccentricity is a small part of the position: each turn wins a digit or more
-        for _ in range(6 if "rare" in self.features else 0):
+        # the error is a small part of the position: each turn wins a digit or more
+        for _ in range(6 if self._bent else 0):
             q = q + (reported - self.measured(q)) / self.column("position_scale")
         return q
 

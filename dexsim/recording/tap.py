@@ -15,6 +15,7 @@ import yaml
 
 from dexsim import outputs, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
+from dexsim.actuator.laws import encoder_error
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
@@ -26,9 +27,11 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 
 @cache
-def copy_kernel(real: type) -> wp.Kernel:
+def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel:
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
-    object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph."""
+    object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph.
+    features: of the servo, those of `columns.FEATURES`."""
+    encoder = encoder_error(features)
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_rows(
@@ -50,10 +53,13 @@ def copy_kernel(real: type) -> wp.Kernel:
         value = time[w]
         if c >= 1 and c <= joints:
             j = c - 1
+            error = encoder(params[w, j], qpos[w, q_index[j]])
             value = params[w, j, SCALE] * qpos[w, q_index[j]] + params[w, j, OFFSET]
+            value += error[0] + error[1]
         elif c > joints and c <= 2 * joints:
             j = c - 1 - joints
-            value = params[w, j, SCALE] * qvel[w, v_index[j]]
+            slope = params[w, j, SCALE] + encoder(params[w, j], qpos[w, q_index[j]])[2]
+            value = slope * qvel[w, v_index[j]]
         elif c > 2 * joints and c <= 3 * joints:
             value = torque[w, c - 1 - 2 * joints]
         elif c > 3 * joints:
@@ -111,7 +117,7 @@ class PlayRecorder:
             ]  # fmt: skip
         self._slot, self._rows = self._args[-2], self._args[-1]
         self._rows_t = wp.to_torch(self._rows)
-        self._kernel = copy_kernel(engine.real)
+        self._kernel = copy_kernel(engine.real, servo.features)
         self._servo_before, self._step = servo.before_each, env.step
         self._imu = env.task.get("perception") == "imu"  # an IMU in the object
         self._waiting: list[torch.Tensor] = []

@@ -105,6 +105,11 @@ class MujocoEngine(Engine):
             ]
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
+        # Of a body whose centre lies on its only joint's axis, C MuJoCo takes the inertia as it was compiled, armature
+        # and all (`dof_M0`), so what is written to `dof_armature` is put there too.
+        self._simple = np.flatnonzero(model.dof_simplenum) if "dof_armature" in fields else np.zeros(0, int)
+        self._inertia = b.expand("dof_M0") if len(self._simple) else np.zeros((worlds, 0))
+        self._own_inertia = self._without_armature()
         self._flags, self._disabled = int(model.opt.disableflags), b.expand("opt.disableflags")
         self._fields_wp: dict[str, wp.array] = {}
         if model.nmocap:
@@ -131,6 +136,7 @@ class MujocoEngine(Engine):
         b = self.batch
         with wp.ScopedDevice("cpu"):
             if before_each is None and self.wp.outside is None:
+                self._with_armature()
                 b.step(nstep=substeps)
             else:
                 # the sensors' contact forces are read after the last step only
@@ -177,6 +183,7 @@ class MujocoEngine(Engine):
 
     def _one_step(self) -> None:
         """One physics step of the batch, and what the dofs felt from outside in it, where that is asked for."""
+        self._with_armature()
         if self.wp.outside is None:
             self.batch.step()
             return
@@ -186,6 +193,17 @@ class MujocoEngine(Engine):
 
     def set_const(self) -> None:
         self.batch.set_const()
+        self._own_inertia = self._without_armature()
+
+    def _without_armature(self) -> np.ndarray:
+        """Inertia [N, S] of the S dofs of `_simple`, kg.m2 or kg, less their armature."""
+        i = self._simple
+        return self._inertia[:, i] - self._fields["dof_armature"][:, i] if len(i) else np.zeros((self.n, 0))
+
+    def _with_armature(self) -> None:
+        i = self._simple
+        if len(i):
+            self._inertia[:, i] = self._own_inertia + self._fields["dof_armature"][:, i]
 
     def peaks(self) -> dict[str, float]:
         return {"contacts": float(self._peak[0]), "rows": float(self._peak[1]), "nconmax": 0, "njmax": 0}

@@ -111,6 +111,8 @@ class RotateEnv(HandEnv):
              min(below, LEAST * float(min(v.shape.extents)) * v.scale) + self.rise for v in self.scene.variants],
             device=dev,
         )  # fmt: skip
+        ends = t["termination"]
+        self.farthest = torch.tensor(self.unit * (ends.get("training") or ends["distance"]), device=dev)
         trained = self.grasps.shape < len(t["objects"]["train"])
         self.poses_of = torch.nonzero(trained)[:, 0], torch.nonzero(~trained)[:, 0]
         self.judge_kept_out(False)
@@ -179,6 +181,12 @@ class RotateEnv(HandEnv):
             raise UserError(f"task.observe.last_action={t['observe']['last_action']}: must be target or step")
         if not 1 <= t["history"] <= 32:
             raise UserError(f"task.history={t['history']}: must lie in [1, 32]")
+        ends = t["termination"]
+        if ends.get("training") is not None and not 0 < ends["training"] <= ends["distance"]:
+            raise UserError(
+                f"task.termination.training={ends['training']}: must be above 0 and at most task.termination.distance,"
+                f" {ends['distance']} m, or null for that one"
+            )
         goal = t["goal"]
         if len(goal["axis"]) != 3 or not sum(float(x) ** 2 for x in goal["axis"]) > 0:
             raise UserError(f"task.goal.axis={goal['axis']}: must be three numbers, not all 0")
@@ -213,9 +221,10 @@ class RotateEnv(HandEnv):
             self.sampler.width.copy_((c["start"] + (1 - c["start"]) * self.learned / c["steps"]).clamp(max=1.0))
 
     def end_curriculum(self) -> None:
-        """From now on all ranges whole (evaluation)."""
+        """From now on all ranges whole, and the cube may go as far as `termination.distance` (evaluation)."""
         self.learned.fill_(float((self.task.get("curriculum") or {"steps": 0})["steps"]))
         self.sampler.width.fill_(1.0)
+        self.farthest.fill_(self.unit * self.task["termination"]["distance"])
 
     def memory(self) -> dict:
         names = ("goal", "home", "heading", "heading_rate", "goal_heading", "imu_tilt", "imu_past", "seen")
@@ -290,7 +299,7 @@ class RotateEnv(HandEnv):
         goal's upper face looks more than `tilt` away from the axis."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
-        away = (p - self.home).norm(dim=1) > self.unit * limit["distance"]
+        away = (p - self.home).norm(dim=1) > self.farthest
         self.dropped.copy_(away | (p[:, 2] < self.lowest[self.objects.variant]))
         self.tipped.copy_(self._tilt_from_goal() > limit["tilt"])
         self.nan_end.copy_(self.nan)
@@ -520,7 +529,7 @@ class RotateEnv(HandEnv):
             ],
             "rewards": [row for row in self.reward_rows() if row[1]],
             "terminations": [
-                ("dropped", f"centre {self.unit * limit['distance']:.3g} m from its start or below"
+                ("dropped", f"centre {float(self.farthest):.3g} m from its start or below"
                  f" {self.unit * limit['below'] + self.rise:.3g} m"),
                 ("tipped", f"{limit['tilt']} rad away from lying on its face"),
                 ("nan", "state not finite"),

@@ -51,7 +51,7 @@ class CoulombFriction(Effect):
 
 
 class ViscousFriction(Effect):
-    """Friction that grows with speed: b v."""
+    """Friction that grows with speed: b v, or (b + a / (1 + |v| / v_h)) v of grease that thins as it is sheared."""
 
     id = "viscous_friction"
     words = "has friction that grows with speed"
@@ -60,6 +60,7 @@ class ViscousFriction(Effect):
     plain = ("viscous_friction",)
     classes = ("with speed",)
     motions = ("ladder",)
+    kinds = 2
 
     def variants(self, s: Scales) -> list[Variant]:
         nominal, unit = s.nominal["viscous_friction"], s.tau / s.speed
@@ -67,16 +68,38 @@ class ViscousFriction(Effect):
         if nominal > 0.03 * unit:
             starts.append((0.5 * nominal,))
         top = max(3 * unit, 4 * nominal)
-        return [
-            Variant((param("coefficient", "viscous_friction", "set", 0.0, top, nominal, "N.m.s/rad"),), tuple(starts))
-        ]
+        line = param("coefficient", "viscous_friction", "set", 0.0, top, nominal, "N.m.s/rad")
+        # half of it lost at less would be dry friction, at far more than the fastest that was seen the line
+        half = param("half_speed", "thinning_speed", "set", 0.08 * s.speed, 3 * s.peak_speed, 0.3 * s.speed, "rad/s")
+        more, most = s.nominal["thinning_friction"], top * (1 + s.speed / half.low)
+        rest = param("at_rest", "thinning_friction", "set", 0.0, most, more, "N.m.s/rad")
+        # as much at the joint's typical speed as the line has
+        begun = tuple(
+            (more + f * unit * (1 + 1 / h), h * s.speed) for h in (0.15, 0.5) for f in (0.05, 0.1, 0.2, 0.4, 0.8)
+        )
+        return [Variant((line,), tuple(starts)), Variant((rest, half), begun, "that thins")]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return case.regimes["speed"]
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         unit = f"{fit.force}.s/{fit.length}"
-        return {"coefficient": fit.entry("coefficient", unit, add=fit.case.scales.base_damping)}
+        s = fit.case.scales
+        if "at_rest" not in fit.value:
+            return {"coefficient": fit.entry("coefficient", unit, add=s.base_damping)}
+        # the line that takes as much energy from the recorded motion, by its mean speeds between samples: smoothed ones
+        # lack the peaks, which weigh most
+        plant = fit.case.plant
+        way, time = np.diff(plant.q), np.diff(plant.t)
+        on = (plant.run_of[1:] == plant.run_of[:-1]) & (time > 0)
+        v = np.abs(way[on] / time[on])
+        share = float(np.sum(v * v / (1 + v / fit.value["half_speed"])) / max(np.sum(v * v), 1e-12))
+        line = s.base_damping + s.nominal["viscous_friction"]
+        return {
+            "coefficient": fit.entry("at_rest", unit, add=line / share, times=share),
+            "at_rest": fit.entry("at_rest", unit, add=line),
+            "half_speed": fit.entry("half_speed", f"{fit.length}/s"),
+        }
 
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of what differs by direction
         own = found.joint["viscous_friction"]

@@ -119,7 +119,8 @@ class TorqueRipple(Effect):
             period = 2 * np.pi / turns
             if not s.slide and 1.2 * s.span > period > 6 * s.sigma:
                 params = (
-                    param("amplitude", "torque_ripple", "set", 0.0, 1.2 * s.tau, 0.0, "N.m"),
+                    # as a dry friction, any that the drive can work against: a light joint's own load is far less
+                    param("amplitude", "torque_ripple", "set", 0.0, 1.2 * s.demand, 0.0, "N.m"),
                     # a gear's own periods are whole numbers a turn of the joint; those of a motor before it are many,
                     # and ranges overlap
                     param(

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim import intervals
-from dexsim.actuator.columns import COLUMNS, INDEX
-from dexsim.actuator.reference import dry_friction, lagged, parasitic_torque, torque_along
+from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
+from dexsim.actuator.reference import dry_friction, lagged, lost_error, parasitic_torque, torque_along, viscous
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
-from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.case import Case, true_motion
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
@@ -274,6 +274,9 @@ class StandIn:
         )
 
 
+KINDLESS = frozenset(FEATURES) - {"rare"}  # of the servo's features: a deadband without its kind, no torque inside it
+
+
 def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tuple[np.ndarray, np.ndarray]:
     """(torque [S] N.m that the measured motion of a run needs beyond the hypothesis, whether it can be read there [S]).
 
@@ -286,23 +289,27 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
             row[PLANT_INDEX[name]] = value
     p = lambda name: row[PLANT_INDEX[name]]  # noqa: E731
     r = runs[run]
-    q, v, a, t = r.qs[:, j], r.vs[:, j], r.as_[:, j], r.t
+    shown = r.t, r.qs[:, j], r.vs[:, j], r.as_[:, j]
+    t, q, v, a = true_motion(shown, row)
     grid = t[0] + plant.dt * np.arange(plant._grid[run + 1] - plant._grid[run])
     series = plant.series[plant._grid[run] : plant._grid[run + 1]]
     s = lambda name: np.interp(t, grid, series[:, SERIES_INDEX[name]])  # noqa: E731
     cmd = r.command_at(t - p("delay"))[:, j]
-    error = cmd - q
-    asked = p("kp") * error - p("kd") * v
-    asked = np.where(np.abs(error) < p("deadband"), 0.0, asked)
+    columns = {n: row[i] for n, i in INDEX.items()}
+    error = cmd - shown[1]
+    lost, _, acts = lost_error(columns, cmd, error, KINDLESS)
+    damped = p("kd") * shown[2]
+    asked = np.where(acts > 1.5, p("kp") * (error - lost) - damped, np.where(acts > 0.5, -damped, 0.0))
     supply = s("supply") if plant.voltage else 1.0
     motor = torque_along(asked, v, p("torque_limit"), p("no_load_speed"), plant.voltage, supply)
     if p("lag") > 0:
         motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
     slope = 0.05 * max(case.scales.speed, 1e-9)
-    columns = {n: row[i] for n, i in INDEX.items()}
     beside, _, _ = parasitic_torque(columns, q, v)
     inertia = s("inertia") * p("inertia_scale") + p("armature")
-    needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
+    turned = q - shown[1]  # the model was evaluated at the measured pose
+    gravity = s("gravity_cos") * np.cos(turned) + s("gravity_sin") * np.sin(turned)
+    needed = inertia * a + p("gravity_scale") * gravity + s("rest")
     needed += p("spring") * q + p("spring_preload")
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
@@ -311,7 +318,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     friction = (
         level * np.sign(v)
         + 0.5 * p("friction_asymmetry") * level
-        + (p("viscous_friction") + case.constants.damping) * v
+        + (viscous(columns, v) + case.constants.damping) * v
     )
     on = np.abs(v) > slope
     if r.enabled is not None:

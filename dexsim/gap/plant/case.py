@@ -12,7 +12,7 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
-from dexsim.actuator.reference import torque_along
+from dexsim.actuator.reference import measured_position, torque_along
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
@@ -589,6 +589,7 @@ def _mean(x: np.ndarray, t: np.ndarray, seconds: float) -> np.ndarray:
 
 WIDTH = 0.06  # s: of the smoothing of the difference
 EVERY = 2e-3  # s between the samples of the refined motion
+TURN = 1e-4  # rad: over which the change of an encoder's slope is taken
 PASSES = 2  # of building the cases along the motion that they show
 # of a joint's typical torque: what reaches it from the motion of others before it matters how well that is known
 COUPLED = 0.03
@@ -640,7 +641,7 @@ def refine_motion_by_fits(
     misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
-        shown = lambda j, i: _true(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]  # noqa: E731
+        shown = lambda j, i: true_motion(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]  # noqa: E731
         _refine(runs, [[shown(j, i) for i in range(len(runs))] for j in range(len(cases))])
         return build(model, runs, device=device, dt=dt)
 
@@ -654,18 +655,17 @@ def refine_motion_by_fits(
     return out
 
 
-def _true(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndarray, ...]:
+def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndarray, ...]:
     """Motion (times, q, v, a) as an encoder shows it -> as it is, by plant parameters [C]."""
     t, q, v, a = shown
-    scale, offset, es, ec = (
-        row[INDEX[k]] for k in ("position_scale", "position_offset", "eccentric_sin", "eccentric_cos")
-    )
-    x = (q - offset) / scale
+    p = {name: row[i] for name, i in INDEX.items()}
+    x = (q - p["position_offset"]) / p["position_scale"]
     for _ in range(3):
-        x = (q - offset - es * np.sin(x) - ec * (np.cos(x) - 1)) / scale
-    rate = scale + es * np.cos(x) - ec * np.sin(x)
+        x = x + (q - measured_position(p, x)[0]) / p["position_scale"]
+    rate = measured_position(p, x)[1]
+    before, after = (measured_position(p, x + step)[1] for step in (-TURN, TURN))
     speed = v / rate
-    return t, x, speed, (a + (es * np.sin(x) + ec * np.cos(x)) * speed**2) / rate
+    return t, x, speed, (a - (after - before) / (2 * TURN) * speed**2) / rate
 
 
 def _one(

@@ -131,7 +131,7 @@ DRAGGERS = 4  # joints that may drag one, of which a plant knows the motion
 SERIES_INDEX: dict[str, int] = {name: i for i, name in enumerate(SERIES)}
 
 # parameters that say what an effect is like, not how large it is
-SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")
+SHAPES = ("v_s", "half_speed", "per_turn", "phase", "rebound", "rotor")
 
 
 @dataclass(frozen=True)
@@ -225,8 +225,8 @@ def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
         for i, p in enumerate(params):
             if p.mode in modes:
                 p.apply(out, x[:, i], base)
-    lag = INDEX["stribeck_speed"]
-    out[:, :, lag] = np.maximum(out[:, :, lag], 1e-4)
+    for c in (INDEX["stribeck_speed"], INDEX["thinning_speed"]):
+        out[:, :, c] = np.maximum(out[:, :, c], 1e-4)
     for c in NOT_NEGATIVE:
         out[:, :, c] = np.maximum(out[:, :, c], 0.0)
     return out

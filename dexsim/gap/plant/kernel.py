@@ -21,11 +21,11 @@ from dexsim.actuator.laws import (
     arrived,
     difference,
     dry_friction,
-    eccentricity,
-    eccentricity_slope,
+    encoder_error,
     hold,
     lag_share,
     load_share,
+    lost_error,
     other_terms,
     parasitic_torque,
     pd,
@@ -36,6 +36,7 @@ from dexsim.actuator.laws import (
     torque_limits,
     transmission,
     transmission_damping,
+    viscous,
     voltage_torque,
     warm_motor,
     wind,
@@ -44,6 +45,8 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
+encoder = encoder_error(frozenset(SERVO_FEATURES))
+lost = lost_error(frozenset(SERVO_FEATURES))
 dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
 LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
@@ -52,10 +55,9 @@ TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
 CONSTS = 10  # of them
-P_KP, P_KD, P_DEADBAND, P_DELAY, P_LAG, P_SUPPLY = (
-    INDEX[n] for n in ("kp", "kd", "deadband", "delay", "lag", "supply")
-)
+P_KP, P_KD, P_DELAY, P_LAG, P_SUPPLY = (INDEX[n] for n in ("kp", "kd", "delay", "lag", "supply"))
 P_ASYM, P_VISC = INDEX["friction_asymmetry"], INDEX["viscous_friction"]
+P_THINS, P_THINSPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 P_LOADOUT = INDEX["load_friction_external"]  # the first of `FEATURES["load"]`, which stand in a row
 P_OFFSET, P_SCALE = INDEX["position_offset"], INDEX["position_scale"]
 P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, P_SAG = (
@@ -65,9 +67,8 @@ P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, 
         "rotor", "sag",
     )
 )  # fmt: skip
-P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
-    INDEX[n]
-    for n in ("coupling", "eccentric_sin", "eccentric_cos", "speed_lag", "bias", "feedback_delay", "limit_speed")
+P_COUPLING, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
+    INDEX[n] for n in ("coupling", "speed_lag", "bias", "feedback_delay", "limit_speed")
 )
 X = SERIES_INDEX
 XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
@@ -89,7 +90,7 @@ P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FRESH = INDEX["effort_fresh"]
 P_READSCALE, P_READOFFSET = INDEX["readout_scale"], INDEX["readout_offset"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
-P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
+P_PRESLIDE, P_BRAKING = INDEX["presliding"], INDEX["braking_slope"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
@@ -142,16 +143,11 @@ class Guess:  # the columns of one guess that every step asks for
     read_offset: f64
     scale: f64
     offset: f64
-    esin: f64
-    ecos: f64
-    round_: bool  # an eccentric encoder
     delay: f64
     dt: f64  # of a sub-step
     speed_lag: f64
     filter: f64  # share of its way that kd's filter goes in a sub-step
     age: f64
-    deadband: f64
-    deadband_kind: f64
     ki: f64
     beyond: bool  # the controller has more terms than the PD
     steep: f64  # braking_slope
@@ -163,6 +159,8 @@ class Guess:  # the columns of one guess that every step asks for
     two: bool  # rotor and link are two bodies
     give: f64  # presliding
     viscous: f64
+    thins: f64  # of it, what is less the faster it turns, and
+    thin_speed: f64  # the speed at which half of that is left
     carries: bool  # friction is by the load from outside too, or falls with speed, or is by its square
     gear_load: f64  # friction by what the gear hands to the joint, driving it, and
     gear_back: f64  # back-driven
@@ -266,14 +264,9 @@ def guess(c: Recorded, h: int, dt: f64):
     p.read_scale = c.params[h, P_READSCALE]
     p.read_offset = c.params[h, P_READOFFSET]
     p.offset = c.params[h, P_OFFSET]
-    p.esin = c.params[h, P_ESIN]
-    p.ecos = c.params[h, P_ECOS]
-    p.round_ = p.esin != f64(0.0) or p.ecos != f64(0.0)
     p.delay = c.params[h, P_DELAY]
     p.speed_lag = c.params[h, P_SPEEDLAG]
     p.age = c.params[h, P_AGE]
-    p.deadband = c.params[h, P_DEADBAND]
-    p.deadband_kind = c.params[h, P_DEADKIND]
     p.ki = c.params[h, P_KI]
     p.steep = c.params[h, P_BRAKING]
     p.limit_speed = c.params[h, P_LIMITSPEED]
@@ -288,6 +281,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
+    p.thins = c.params[h, P_THINS]
+    p.thin_speed = c.params[h, P_THINSPEED]
     for k in range(wp.static(len(SERVO_FEATURES["load"]))):
         p.carries = p.carries or c.params[h, P_LOADOUT + k] != f64(0.0)
     p.gear_load = c.params[h, P_GEARLOAD]
@@ -327,30 +322,23 @@ def guess(c: Recorded, h: int, dt: f64):
 
 
 @wp.func
-def shown(q: f64, p: Guess):
-    """What the encoder shows at position q."""
+def shown(of: wp.array(dtype=f64), q: f64, p: Guess):
+    """(what the encoder shows at position q, what it shows of a speed there over that speed)."""
+    error = encoder(of, q)
     m = p.scale * q + p.offset
-    if p.round_:
-        m += eccentricity(q, p.esin, p.ecos)
-    return m
+    m += error[0] + error[1]
+    return wp.vec2d(m, p.scale + error[2])
 
 
 @wp.func
-def shown_rate(q: f64, p: Guess):
-    """What the encoder shows of a speed at position q, over that speed."""
-    k = p.scale
-    if p.round_:
-        k += eccentricity_slope(q, p.esin, p.ecos)
-    return k
-
-
-@wp.func
-def position(m: f64, p: Guess):
+def position(of: wp.array(dtype=f64), m: f64, p: Guess):
     """Where m is reported: its inverse, by two fixed-point steps."""
-    at = unread(m, p)
-    q = (at - p.offset) / p.scale
-    q = (at - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
-    q = (at - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
+    at = unread(m, p) - p.offset
+    q = at / p.scale
+    error = encoder(of, q)
+    q = (at - error[0] - error[1]) / p.scale
+    error = encoder(of, q)
+    q = (at - error[0] - error[1]) / p.scale
     return q
 
 
@@ -574,14 +562,15 @@ def borne_friction(borne: f64, v: f64, p: Guess):
 
 
 @wp.func
-def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, theta: f64, dt: f64,
-             p: Guess, n: Now):  # fmt: skip
-    """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]."""
+def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, grease: f64, theta: f64,
+             dt: f64, p: Guess, n: Now):  # fmt: skip
+    """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]; visc: all that
+    is by its speed, grease: of it, what is by the motor's [N.m.s/rad]."""
     begun = x.v
     damping = n.efficiency * t.on_loop + n.efficiency * t.on_drive
     level += p.base_friction
     a = n.inertia / (theta * dt) + damping + visc + stop_d
-    free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + p.viscous * n.friction * n.carried) / a
+    free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + grease * n.carried) / a
     free -= n.carried  # dry friction acts where the motor turns
     if n.held:
         if p.give > f64(0.0):
@@ -614,10 +603,10 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 
 
 @wp.func
-def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, drag: f64, dt: f64,
-               p: Guess, n: Now, b: Pair):  # fmt: skip
+def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, drag: f64,
+               grease: f64, dt: f64, p: Guess, n: Now, b: Pair):  # fmt: skip
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
-    the step. drag: on the rotor [N.m.s/rad], beyond friction."""
+    the step. grease: viscous friction, drag: what else is by the speed of the rotor [N.m.s/rad]."""
     zero = f64(0.0)
     begun = x.v
     begun_m = x.vm
@@ -637,7 +626,7 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
     link_share = f64(1.0) - p.motor_share
     level += p.motor_share * p.base_friction
     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
-    a11 = b.rotor_rate + p.viscous * n.friction + p.motor_share * p.base_damping + kh + d_m + drag
+    a11 = b.rotor_rate + grease + p.motor_share * p.base_damping + kh + d_m + drag
     a12 = -kh + d_l
     a21 = -kh
     a22 = b.link_rate + link_share * p.base_damping + kh + stop_d
@@ -683,8 +672,8 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
 
 
 @wp.func
-def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair):
-    """The joint after a sub-step. visc: the model's damping and viscous friction [N.m.s/rad]."""
+def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
+    """The joint after a sub-step."""
     dt = p.dt
     zero = f64(0.0)
     half = f64(0.5)
@@ -701,12 +690,13 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         v_drive = x.v - n.carried
         if p.loop_motor:
             v_l = v_drive
-    shows = shown_rate(q_l, p)
+    seen = shown(c.params[h], q_l, p)
+    shows = seen[1]
     if x.fresh != zero or p.speed_lag <= zero:
         x.v_f = v_l
     else:
         x.v_f += p.filter * (v_l - x.v_f)
-    e = n.target - shown(q_l, p) + p.age * shows * v_l  # a sampled loop acts on where the joint was
+    e = n.target - seen[0] + p.age * shows * v_l  # a sampled loop acts on where the joint was
     rate = shows * x.v_f
 
     load = n.gravity_cos
@@ -721,6 +711,10 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
 
     beside = parasitic(c.params[h], x.q, v_drive)
     drag = wp.max(zero, -beside[2])  # what of it brakes is taken at the end of the step
+    grease = p.viscous * n.friction  # at the speed of the step's begin
+    if p.thins > zero:
+        grease = viscous(p.viscous, p.thins, p.thin_speed, v_drive) * n.friction
+    visc = p.base_damping + grease
     visc += drag
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
@@ -740,7 +734,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
-    u = pd(e, rate, rate, rate, shows, p.kp, p.kd, p.deadband, p.deadband_kind, step, p.age, f64(1.0))
+    u = pd(e, lost(c.params[h], n.target, e), rate, rate, rate, shows, p.kp, p.kd, step, p.age, f64(1.0))
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
     limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
@@ -812,9 +806,9 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         if p.gap2 > zero:  # a spring behind the play would keep it closed: one that leaves it open is before it
             on_motor = p.preload + p.spring * (x.qm + half * dt * x.vm)
             load -= pulled
-        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, drag, dt, p, n, b)
+        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, drag, grease, dt, p, n, b)
     else:
-        x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
+        x = one_body(x, t, applied, load, level, stop_d, visc, grease, theta, dt, p, n)
     if p.staged:
         x.stage = stage_before(before, x.last, p.lag)
     if by_gear and not n.held:
@@ -827,8 +821,8 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
 def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
     """The joint at the begin of a window: where it was measured."""
     x = State()
-    x.q = position(c.series[g, XQ], p)
-    x.v = c.series[g, XV] / (p.read_scale * shown_rate(x.q, p))
+    x.q = position(c.params[h], c.series[g, XQ], p)
+    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, p)[1])
     if warm == 0:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
@@ -842,11 +836,10 @@ def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
 @wp.func
 def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
     """The joint on its recorded motion, while the drive's own state settles; last: it is let go now."""
-    m = unread(c.series[g, XQ], p)
-    if p.round_:
-        m = m - p.esin * wp.sin(x.q) - p.ecos * (wp.cos(x.q) - f64(1.0))
+    error = encoder(c.params[h], x.q)
+    m = unread(c.series[g, XQ], p) - error[0] - error[1]
     x.q = (m - p.offset) / p.scale
-    x.v = c.series[g, XV] / (p.read_scale * shown_rate(x.q, p))
+    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, p)[1])
     if last:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
@@ -897,7 +890,7 @@ def plant_kernel() -> wp.Kernel:
             lead = asked_before(c, h, k, c_end, t, dt, p)
             t -= f64(lead) * dt
         on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
-        after = shown(x.q, p)  # at the end of the step
+        after = shown(c.params[h], x.q, p)[0]  # at the end of the step
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
@@ -909,15 +902,15 @@ def plant_kernel() -> wp.Kernel:
                     x.last = torque
                     x.stage = stage
                     x.fresh = f64(2.0)
-                after = shown(x.q, p)
+                after = shown(c.params[h], x.q, p)[0]
             if i >= 0 and i <= warm and warm > 0:
                 x = held(c, h, g, i == warm, x, p)
                 if i == 0:
                     x.qm = x.q
                     x.vm = x.v
-                after = shown(x.q, p)
+                after = shown(c.params[h], x.q, p)[0]
                 if on_motor:
-                    after = shown(x.qm, p)
+                    after = shown(c.params[h], x.qm, p)[0]
             reported = after
             n = Now()
             n.held = i < warm or i < 0
@@ -929,22 +922,21 @@ def plant_kernel() -> wp.Kernel:
             n.feed = aim[1]
             n = drive_now(c, h, g, p, n)
             n = body_now(c, h, g, p, n)
-            visc = c.consts[C_DAMPING] + p.viscous * n.friction
             b = pair_now(c, h, p, n)
             n_sub = int(ONE_BODY_STEPS)
             if p.two:
                 n_sub = TWO_BODY_STEPS
             for _ in range(n_sub):
-                x = substep(c, h, x, visc, p, n, b)
+                x = substep(c, h, x, p, n, b)
 
             if not (wp.abs(x.q) < f64(1.0e4)):  # diverged: keep it finite, far off
                 x.q = f64(1.0e4)
                 x.v = f64(0.0)
                 x.qm = x.q
                 x.vm = f64(0.0)
-            after = shown(x.q, p)
+            after = shown(c.params[h], x.q, p)[0]
             if on_motor:
-                after = shown(x.qm, p)
+                after = shown(c.params[h], x.qm, p)[0]
             elif i < warm:
                 after = reported
             while s < s_end and c.sample_step[s] == i:
