@@ -371,6 +371,7 @@ class Deadband(Effect):
     words = "ignores small position errors"
     shows = "at small errors"
     experiment = "small steps of increasing size"
+    classes = ("friction or dead zone",)  # counted from its edge it is a friction's torque while the joint lags behind
     demo = {"deadband": 0.03}
 
     def variants(self, s: Scales) -> list[Variant]:

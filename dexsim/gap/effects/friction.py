@@ -22,7 +22,7 @@ class CoulombFriction(Effect):
     shows = "at reversals and low speed"
     experiment = "slow triangles in both directions at constant load"
     plain = ("coulomb_friction",)
-    classes = ("friction or play", "friction and load", "friction or pull")
+    classes = ("friction or play", "friction and load", "friction or pull", "friction or dead zone")
     motions = ("triangles", "steps")
     fitted_anyway = {"coulomb_friction": "torque"}
     demo = {"coulomb_friction": 0.06}
