@@ -97,8 +97,8 @@ CLASSES: dict[str, str] = {
     "to a side",
     "friction or pull": "static poses over the whole range with the drive off at each: friction holds the joint where "
     "a pull moves it",
-    "friction or dead zone": "small steps of increasing size from one place, each way, and the joint pushed a little by "
-    "hand while it is held: friction resists from the first, inside a dead zone the drive does not",
+    "friction or dead zone": "small steps of increasing size from one place, each way, and the joint pushed a little "
+    "by hand while it is held: friction resists from the first, inside a dead zone the drive does not",
     "weight or push": "static poses over the whole range, twice, with nothing in reach",
 }
 TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
