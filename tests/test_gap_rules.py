@@ -421,7 +421,7 @@ def test_findings_that_do_not_help_are_taken_back():
         )
         refuted = Refuted()
         refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
-        assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
+        assert (conclude._take_back(d, [refuted], [named()], {}) == set()) is kept, ratio
 
 
 def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
@@ -432,7 +432,7 @@ def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
         refuted = Refuted()
         refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
         e.joint = "j"
-        assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
+        assert (conclude._take_back(d, [refuted], [named()], {}) == set()) is kept, ratio
         assert (joint_answer.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
 
 
@@ -628,7 +628,7 @@ class Shook(shaking.Shaking):
         q = np.repeat(np.asarray(sizes, float), n) * (-1.0) ** np.arange(n * count)
         w = SimpleNamespace(n=n * count, window=np.arange(count), sample_window=window, sample_row=np.arange(n * count))
         plant = SimpleNamespace(t=0.01 * np.arange(n * count), q=q)
-        case = SimpleNamespace(plant=plant, quantum=1e-6)
+        case = SimpleNamespace(plant=plant, quantum=1e-6, sigma=np.inf)
         none = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
         self.simulated = np.full((1, 3, count), 1e-9), np.zeros((1, count))
         super().__init__(SimpleNamespace(short=w, case=case), none)
@@ -647,9 +647,12 @@ def test_a_joint_must_shake_in_some_windows():
     try:
         for count, told in ((2, False), (3, True)):
             shaking.Shaking = lambda *_, count=count: SimpleNamespace(
-                quiet=1e-3, loud=np.ones(count, bool), of=lambda t: np.full(count, 9.0 if t == "none" else 1.0)
+                quiet=1e-3,
+                loud=np.ones(count, bool),
+                rung=np.zeros(count, bool),
+                of=lambda t: np.full(count, 9.0 if t == "none" else 1.0),
             )
-            assert shaking.shown(SimpleNamespace(), outcome, [1], None) is told, count
+            assert (shaking.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, count
     finally:
         shaking.Shaking = made
 

@@ -63,7 +63,7 @@ def test_a_joint_that_rings_is_not_pushed():
         own = float(np.sqrt(np.mean(np.diff(slow[moves], 2) ** 2)))
         shakes = own * np.sqrt(times**2 - 1) / 4.0 / np.sqrt(0.5) * np.sin(2 * np.pi * 49.0 * t + 0.3)
         run = SimpleNamespace(t=t, q=(slow + np.where(moves, shakes, 0.0))[:, None])
-        assert logged_torque._by_ringing([(t, moves)], [run], 0, 10.0) is ringing, times
+        assert logged_torque._by_ringing([(t, moves)], [run], [0], 10.0) is ringing, times
 
 
 def test_a_plain_fit_must_leave_much_for_a_push():

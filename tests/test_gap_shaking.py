@@ -10,7 +10,7 @@ import pytest
 from test_gap import model, plant_run
 from test_gap_torque_route import arm, run
 
-from dexsim.gap.judge import conclude
+from dexsim.gap.judge import conclude, confidence
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
 from dexsim.gap.search import logged_torque, shaking
@@ -43,7 +43,37 @@ def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
     assert at["compliance.softness"] == pytest.approx(SOFT["softness"], rel=0.3)
     assert ringing.of(found.best).sum() < 0.5 * ringing.of(nothing.none).sum()
     assert shaking.shown(soft, found, [2], None) and not shaking.shown(soft, nothing, [2], None)
-    assert "ring by itself" in conclude._not_refuted(soft, found, 1.2, [2], None)
+
+
+def test_play_rings_on_where_it_was_struck():
+    """A joint with play that sticks is at rest in one state and rattles in another, at the same command: windows that
+    begin rattling are begun so."""
+    play = {"backlash": 0.03, "rebound": 0.05, "coulomb_friction": 0.05}
+    servo = SERVO | {"coulomb_friction": 0.05}
+    runs = [plant_run(f"run{k}", k, 4.0, play, seed=k, servo=servo) for k in (1, 3, 2)]
+    for r in runs:
+        r.smooth()
+    search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs), allowed={"backlash"})
+    nothing = search.without_search()
+    found = shaking.answered(search, nothing)
+    at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
+    assert found.best.ids == ("backlash",) and at["backlash.gap"] == pytest.approx(0.03, rel=0.25)
+    rattles = shaking.Shaking(search, nothing.none)
+    assert rattles.rung.sum() >= 4 and 0.3 < rattles.speed < 3.0
+    begun_ringing = rattles.of(found.best)
+    assert begun_ringing.sum() < 0.05 * rattles.of(nothing.none).sum()
+    rattles.speed = 0.0
+    assert rattles.of(found.best).max() > 3 * begun_ringing.max()
+
+
+def test_a_name_that_makes_a_joint_ring_as_it_does_is_as_sure_as_that():
+    """What no free run keeps step with is judged by how it rings; a doubted name at most."""
+    for rings, share, sure in ((0.95, 1.0, 0.7), (0.8, 0.6, 0.4), (0.4, 0.9, 0.45), (0.95, 0.3, 0.275)):
+        e = confidence.Evidence("backlash", "elbow", share, 0.0, 1.0, 1.0, [], 1, 0, ["not borne out"], 0.0)
+        other = confidence.Evidence("backlash", "wrist", 1.0, 0.0, 1.0, 1.0, [], 1, 0, ["not borne out"], 0.0)
+        conclude._judged_by_ringing(SimpleNamespace(evidence=[e, other]), {"elbow": rings})
+        assert e.confidence == pytest.approx(sure, abs=0.01) and len(e.reasons) == 1, (rings, share)
+        assert other.confidence == 0.0 and other.reasons == ["not borne out"]
 
 
 def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
@@ -74,7 +104,10 @@ def test_nobody_pushes_a_joint_that_rings():
             r.torque[:, 1] -= np.where(swing != 0, 5.0 * np.sign(np.sin(2 * np.pi * 0.7 * r.t)), 0.0)
         runs.append(r)
     assert logged_torque.find_pushes(model, runs, [0, 1]) == []
-    runs[0].q[:, 1] -= ringing(runs[0].t)  # the same torque where it does not ring
+    runs[0].q[:, 0] += ringing(runs[0].t)  # the shoulder, which carries the elbow, rings in its place
+    runs[0].q[:, 1] -= ringing(runs[0].t)
+    assert logged_torque.find_pushes(model, runs, [0, 1]) == []
+    runs[0].q[:, 0] -= ringing(runs[0].t)  # the same torque where nothing rings
     assert [p.joint for p in logged_torque.find_pushes(model, runs, [0, 1])] == ["elbow"]
 
 

@@ -582,6 +582,19 @@ class BeliefRules:
         "of 158 joints (hands, other plants, benches, a real pendulum) only the four that ring meet it and `ringing`",
         "test_a_joint_that_rings_is_not_noisy",
     )
+    noisier: float = _rule(
+        2.5,
+        "x the usual noise of the other joints of a machine: a joint that scatters by more, and not as white noise, "
+        "rings all the time",
+        "between 1.5, the most of a joint beside one that rings, and 6, the least of two that ring all the time",
+        "test_a_joint_that_rings_all_the_time_has_the_others_noise",
+    )
+    coloured: float = _rule(
+        0.19,
+        "by how much the autocorrelation of third differences differs from white noise's where a joint rings",
+        "between 0.13, the most of 44 joints that do not ring, and 0.25, the least of two that ring all the time",
+        "test_a_joint_that_rings_all_the_time_has_the_others_noise",
+    )
     ringing: float = _rule(
         0.1,
         "share of half seconds in which a joint must ring for its noise to be told by the others",

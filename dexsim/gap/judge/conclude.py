@@ -79,7 +79,8 @@ def into_diagnosis(
         if (curve := a.curve()) is not None:
             d.curves.append(curve)
     d.spots = locate.control([x for a in answers for x in a.spots])
-    refuted = _take_back(d, answers, findings)
+    rings = {a.case.joint: x for a in answers if (x := _rings(a)) > SEARCH.least}
+    refuted = _take_back(d, answers, findings, rings)
     if noise.how == "repeats":
         found = [a for a in answers if a.found and a.case.joint not in refuted]
         noise = noise.at_most({a.case.joint: a.floor_beyond() for a in found})
@@ -104,8 +105,10 @@ def into_diagnosis(
         )
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
     worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
+    worse = {joint: reason for joint, reason in worse.items() if joint not in rings}
     _not_better(d, worse)
-    findings.sort(key=lambda f: -_weight(f))
+    _judged_by_ringing(d, rings)
+    findings.sort(key=lambda f: -_weight(f, rings))
     _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
     _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
     data["baseline"] = baseline.overall(plains)
@@ -121,6 +124,17 @@ def into_diagnosis(
     d.sentence = sentence(data, d, noise.floor)
 
 
+def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
+    """What was found on joints that ring by themselves, of which it takes away a share of what is missed of that
+    (`rings`): as sure as its share of the bootstraps and what stays make it, and doubted, since no free run keeps step
+    with it."""
+    for e in d.evidence:
+        if e.joint in rings and EFFECTS[e.effect].rings:
+            e.left = 1.0 - rings[e.joint]
+            e.reasons = ["the joint rings by itself as it does in what was kept out, but no free run keeps step"]
+            e.confidence = min(e.share * confidence.kept_of(e.left), JUDGE.doubted)
+
+
 def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
     """Doubts what was found on joints that a plain model follows better, or of which a recorded motion says that it
     cannot be."""
@@ -132,15 +146,25 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
                 e.confidence = min(e.confidence, JUDGE.hinted)
 
 
-def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:
+def _rings(a: JointAnswer) -> float:
+    """Share of what is missed of how a joint rings by itself in what was kept out that what was found takes away; 0
+    where the error there is lower with it anyway."""
+    if _less(a.numbers["after"], a.numbers["before"]):
+        return 0.0
+    return shaking.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
+
+
+def _take_back(
+    d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]], rings: dict[str, float]
+) -> set[str]:
     """Joints whose findings did not help on what was kept out: they keep none of them, and are left as they were
-    believed."""
+    believed. rings: of `_rings`, by joint: no free run keeps step with those."""
     refuted = set()
     for a in answers:
         joint = a.case.joint
         mine = [f for f in findings if joint in f["where"]["joints"] and not EFFECTS[f["effect"]].effort_only]
         v = d.joints[joint]
-        if not mine or _less(v["after"], v["before"]):
+        if not mine or joint in rings or _less(v["after"], v["before"]):
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
         elsewhere = _less(v["told_after"], v["told_before"])  # but for moments that nothing follows
@@ -266,8 +290,6 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     if before > SEARCH.enough**2 and after < (1 - 2 * SEARCH.least) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
-    if shaking.shown(search, outcome, test, span):
-        return "it makes the joint ring by itself as it does in what was kept out, but no free run keeps step with that"
     sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
     plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= 2 * SEARCH.least
     return "what was kept out does not show it" if sides_with_neither and plain else ""
@@ -336,9 +358,11 @@ def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) ->
     return out
 
 
-def _weight(f: dict) -> float:
-    h = f["held_out"]
-    return (h["before"] - h["after"]) if h else 0.0
+def _weight(f: dict, rings: dict[str, float]) -> float:
+    """How much of the error on what was kept out a finding removes; of a joint that rings (`_rings`), of how it
+    rings."""
+    h, share = f["held_out"], rings.get(f["where"]["joints"][0]) if f["where"]["joints"] else None
+    return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
 
 
 def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:

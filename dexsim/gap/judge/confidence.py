@@ -98,7 +98,12 @@ def trusted(before: float, after: float, noise: float) -> float:
     """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses
     `JUDGE.left_costs` where that is `JUDGE.removed` or more, evenly less below. What follows only half of a gap may be
     another effect's likeness."""
-    return 1.0 - JUDGE.left_costs * min(left_over(after, before, noise) / JUDGE.removed, 1.0)
+    return kept_of(left_over(after, before, noise))
+
+
+def kept_of(left: float) -> float:
+    """The same of the share `left` that stays unexplained."""
+    return 1.0 - JUDGE.left_costs * min(left / JUDGE.removed, 1.0)
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:

@@ -25,6 +25,7 @@ PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothin
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 BESIDE = 3  # neighbours on each side by which a sample's noise is told
 HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples, of a part of a recording that may ring by itself
+FEWEST_OTHERS = 3  # joints that tell what noise is usual
 FEW = 2  # parts that may be quieter by accident than what is usual
 REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
 
@@ -130,6 +131,38 @@ def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray]], quantum: float
     if not usual or np.mean(level[: len(usual)] > BELIEF.rings * np.array(usual)) <= BELIEF.ringing:
         return None
     return float(np.median(level[level < 2 * np.quantile(level, 0.1)]))
+
+
+# autocorrelation of white noise's third differences, 2 to 4 samples apart: those are its weights 1, -3, 3, -1
+WHITE = (0.3, -0.05, 0.0)
+
+
+def usual_noise(runs: Sequence[Run], j: int, own: float) -> float | None:
+    """Standard deviation of the measurement noise of joint j, if it rings all the time, by the other joints' encoders;
+    None where it does not seem to. own: by its samples.
+
+    A joint that rings without a pause shows no noise of its own. It scatters by far more than the others of its
+    machine (`BELIEF.noisier`), and not as white noise does (`BELIEF.coloured`), by the third differences of its
+    readings, in which a slow motion is nothing."""
+    apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
+    if np.abs(apart).max() < BELIEF.coloured:
+        return None
+    others = [k for k in range(runs[0].q.shape[1]) if k != j]
+    if len(others) < FEWEST_OTHERS:
+        return None
+    usual = float(np.median([_of_recordings(runs, [noise(r.t, r.q[:, k])[0] for r in runs]) for k in others]))
+    return usual if own > BELIEF.noisier * usual else None
+
+
+def _coloured(x: np.ndarray) -> np.ndarray:
+    """[3] autocorrelation of the third differences of a signal x [S], 2 to 4 samples apart; white noise's where it is
+    too short to tell. What a sudden motion adds is cut off."""
+    third = np.diff(x, 3)
+    cut = 3 * float(np.median(np.abs(third))) / 0.6745 if len(third) else 0.0
+    if len(third) < FEWEST_SAMPLES * FEW or cut <= 0.0:
+        return np.array(WHITE)
+    third = np.clip(third, -cut, cut)
+    return np.array([np.mean(third[k:] * third[:-k]) for k in (2, 3, 4)]) / np.mean(third**2)
 
 
 def demand(
@@ -315,6 +348,8 @@ def _case(
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
     quiet = quiet_noise([(runs[i].t, runs[i].q[:, j]) for i in told], quantum)
     sigma = min(sigma, quiet) if quiet is not None else sigma
+    usual = usual_noise([runs[i] for i in told], j, sigma)
+    sigma = min(sigma, usual) if usual is not None else sigma
 
     def series(name: str) -> np.ndarray:
         each = [np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]]) for i in range(len(runs))]

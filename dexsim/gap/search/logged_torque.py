@@ -373,30 +373,54 @@ def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int
                 _spans(push[0], [runs[r] for r in use], 1.0 / cutoff),
                 int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE),
             )
-            if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], j, cutoff):
+            moving = _moving_one_another(model, runs[0].joints, j)
+            if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], moving, cutoff):
                 continue
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
     return out
 
 
+QUIETEST = 0.05  # of a joint's samples: those by which it is told what is no ringing
+
+
+def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) -> list[int]:
+    """Of `joints` the j-th and those before and behind it in the mechanism: what one accelerates asks a torque of the
+    others."""
+
+    def chain(joint: str) -> set[int]:
+        dof, out = int(model.jnt_dofadr[model.joint(joint).id]), set()
+        while dof >= 0:
+            out.add(dof)
+            dof = int(model.dof_parentid[dof])
+        return out
+
+    chains = [chain(x) for x in joints]
+    return [k for k, c in enumerate(chains) if c <= chains[j] or chains[j] <= c]
+
+
 def _by_ringing(
-    given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], j: int, cutoff: float
+    given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], joints: Sequence[int], cutoff: float
 ) -> bool:
-    """Whether a joint rings in most of the samples in which something seems to push it, (times [S] s, pushed [S]) by
-    run: it shakes by far more than it does elsewhere, and by more than its motion below the cutoff [Hz] asks for.
-    Inverse dynamics know no acceleration of what is faster than the readings, and a loop that rings by itself is
-    pushed by nobody."""
-    pushed, rings = [], []
-    for (t, on), run in zip(given, runs, strict=True):
-        step = float(np.median(np.diff(run.t)))
-        even = np.arange(run.t[0], run.t[-1], step)
-        raw = np.interp(even, run.t, run.q[:, j])
-        all_, slow = (_swing(x, step) for x in (raw, inverse_dynamics.low_pass(raw, cutoff, step)))
-        beyond = (all_ > TORQUE.shakes * slow) & (all_ > SEARCH.loud * np.quantile(all_, 0.25))
-        pushed.append(on)
-        rings.append(np.interp(t, even - run.t[0], beyond.astype(float)) > 0.5)
-    on = np.concatenate(pushed)
-    return bool(on.any() and np.mean(np.concatenate(rings)[on]) > 0.5)
+    """Whether one of `joints` (`_moving_one_another`) rings in most of the samples in which something seems to push one
+    of them, (times [S] s, pushed [S]) by run: it shakes by far more than where it is quietest, and by more than its
+    motion below the cutoff [Hz] asks for. Inverse dynamics know no acceleration of what is faster than the readings,
+    and a loop that rings by itself is pushed by nobody."""
+    on = np.concatenate([pushed for _, pushed in given])
+    for j in joints:
+        swings = []
+        for run in runs:
+            step = float(np.median(np.diff(run.t)))
+            even = np.arange(run.t[0], run.t[-1], step)
+            raw = np.interp(even, run.t, run.q[:, j])
+            swings.append((even, _swing(raw, step), _swing(inverse_dynamics.low_pass(raw, cutoff, step), step)))
+        quiet = float(np.quantile(np.concatenate([all_ for _, all_, _ in swings]), QUIETEST))
+        rings = []
+        for (t, _), (even, all_, slow) in zip(given, swings, strict=True):
+            beyond = (all_ > TORQUE.shakes * slow) & (all_ > SEARCH.loud * quiet)
+            rings.append(np.interp(t, even - even[0], beyond.astype(float)) > 0.5)
+        if on.any() and np.mean(np.concatenate(rings)[on]) > 0.5:
+            return True
+    return False
 
 
 def _swing(x: np.ndarray, step: float) -> np.ndarray:

@@ -6,7 +6,10 @@ friction and the limits of its drive, often beyond half the rate of the samples.
 longer than a few swings, so that sample by sample all hypotheses miss it alike, the true one too. What lasts is when it
 rings and how strongly. Of windows of a second that begin at the measured motion are compared, measured and simulated:
 the rms by which a reading differs from the line between its neighbours one, two and three samples away (by logarithms:
-of what rings by itself only the order of size is to be trusted), and the mean position. Sizes are tried over their
+of what rings by itself only the order of size is to be trusted), and the mean position. A loop with play is at rest in
+one state and rings on in another, with the same command, and a measured motion that was smoothed or sampled slowly does
+not tell its speed: a window whose first part rings, which is not compared, begins with the speed of a swing of that
+size. Sizes are tried over their
 whole range and then at random about the best (a loop rings or it does not: there is no slope to follow), beliefs with
 them, which decide by how little it rings.
 """
@@ -18,15 +21,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from dexsim.gap.effects.catalogue import CATALOGUE
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.columns import Param, expand, neutral_of
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, thin
+from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, subset, thin
 from dexsim.gap.search.search import JointSearch
 
 APART = (1, 2, 3)  # samples between a reading and those that it is compared with
 SETTLES = 0.25  # s of a window before it is looked at: what was let go at a measured state swings in
 MOST_LOG, MOST_AWAY = 3.0, 5.0  # log ratio of what shakes, and x the usual miss of the mean: more counts as much
-RINGS = (0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little more or less decides
+# speed of a sine over its `levels[0]` and the time between samples: sqrt(2) wT / (1 - cos wT), within a tenth of this
+# from 1.6 to 3 rad a sample
+KICK = 2.1
+RINGS = (0.02, 0.05, 0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little more or less decides
 LIMITS: tuple[dict[str, float], ...] = (  # laws of the drive's limits, which end how far it swings
     {"braking_slope": -1.0, "limit_speed": 1.0},
     {"braking_slope": -1.0, "limit_speed": 0.0},
@@ -39,7 +46,8 @@ DRAWS = 300  # of a bootstrap over windows
 
 
 class Shaking:
-    """How much a joint shakes in windows of the recordings `runs`. loud [W] bool: windows that shake."""
+    """How much a joint shakes in windows of the recordings `runs`. loud [W] bool: windows that shake; rung [W] bool:
+    those that begin ringing."""
 
     def __init__(
         self,
@@ -57,6 +65,8 @@ class Shaking:
             else thin(self.plant.windows(SHORT, list(runs), span=span), search.case, SCAN_BUDGET)
         )
         self.quiet, self.loud = quiet, np.zeros(len(self.w.window), bool)
+        self.rung, self.speed = self.loud.copy(), 0.0
+        self._parts: dict[bytes, Windows] = {}
         if not len(self.loud) or self.w.n < 20:
             return
         t, window = self.plant.t[self.w.sample_row], self.w.sample_window
@@ -71,13 +81,28 @@ class Shaking:
         self.kept = np.flatnonzero(settled)
         self.levels, self.means = (x[0] for x in self._of(self.plant.q[self.w.sample_row][None]))
         least = max(search.case.quantum / np.sqrt(12), 1e-12)  # readings of a joint at rest do not differ at all
-        self.quiet = max(min(float(self.levels[0].min()), quiet), least)
+        noise = np.sqrt(1.5) * search.case.sigma  # that of one reading and half of both its neighbours'
+        self.quiet = max(min(float(self.levels[0].min()), quiet, noise), least)
         self.loud = self.levels[0] > SEARCH.loud * self.quiet
         if not self.loud.any():
             return
+        self._begun(t, window, ~settled)
         levels, means = self._simulated(none.members, none.fit.params, none.fit.x[None])
         self.loud &= self.levels[0] > SEARCH.loud * levels[0, 0]
         self.usual = max(1.5 * float(np.median(np.abs(means[0] - self.means))), self.quiet / 3)
+
+    def _begun(self, t: np.ndarray, window: np.ndarray, early: np.ndarray) -> None:
+        """Fills `rung` and the speed [rad/s] at which such windows begin; t, window [n]: of each sample, early [n]
+        bool: those that are not compared."""
+        mid = np.flatnonzero((window[2:] == window[:-2]) & early[1:-1]) + 1
+        q, step = self.plant.q[self.w.sample_row], np.diff(t)[np.diff(window) == 0]
+        part = (t[mid] - t[mid - 1]) / np.maximum(t[mid + 1] - t[mid - 1], 1e-9)
+        off = q[mid] - (q[mid - 1] * (1 - part) + q[mid + 1] * part)
+        count = np.bincount(window[mid], None, len(self.loud))
+        level = np.sqrt(np.bincount(window[mid], off**2, len(self.loud)) / np.maximum(count, 1))
+        self.rung = level > SEARCH.loud * self.quiet
+        if self.rung.any():
+            self.speed = KICK * float(np.median(level[self.rung])) / float(np.median(step))
 
     def _of(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """([H, gaps, W] rms by which readings q [H, n] differ from the line between their neighbours, [H, W] their
@@ -97,9 +122,21 @@ class Shaking:
         parts = []
         with self.search._fix(members):
             for i in range(0, len(x), CHUNK):
-                q, _ = self.plant.simulate(expand(self.plant, params, x[i : i + CHUNK]), self.w)
+                rows = expand(self.plant, params, x[i : i + CHUNK])
+                q = np.empty((len(rows), self.w.n))
+                for on, speed in ((~self.rung, 0.0), (self.rung, self.speed)):
+                    if on.any():
+                        inits = np.tile([0.0, speed], (len(rows), 1))
+                        q[:, on[self.w.sample_window]] = self.plant.simulate(rows, self._part(on), inits)[0]
                 parts.append(self._of(np.clip(np.nan_to_num(q, nan=1e4), -1e4, 1e4)))
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+    def _part(self, on: np.ndarray) -> Windows:
+        """The windows `on` [W] bool; made once, with what is known of them."""
+        key = on.tobytes()
+        if key not in self._parts:
+            self._parts[key] = self.w if on.all() else subset(self.w, on)
+        return self._parts[key]
 
     def missed(self, members: tuple[Member, ...], params: list[Param], x: np.ndarray) -> np.ndarray:
         """[H, W] by how much each guess x [H, P] misses each window."""
@@ -205,16 +242,16 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     )  # fmt: skip
 
 
-def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict | None) -> bool:
-    """Whether a joint rings by itself in `runs`, which were kept out, rather as what was found makes it than as it is
-    without."""
+def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict | None) -> float:
+    """Share of what is missed of how a joint rings by itself in `runs`, which were kept out, that what was found takes
+    away; 0 where it does not ring there."""
     if not any(m.effect.rings for m in outcome.best.members):
-        return False
+        return 0.0
     fitted = Shaking(search, outcome.none)
     if not fitted.loud.any():
-        return False
+        return 0.0
     shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
-    if shaking.loud.sum() < SEARCH.shaking:
-        return False
-    before, after = (shaking.of(t).sum() for t in (outcome.none, outcome.best))
-    return bool(after < (1 - SEARCH.least) * before)
+    if (shaking.loud | shaking.rung).sum() < SEARCH.shaking:
+        return 0.0
+    before, after = (float(shaking.of(t).sum()) for t in (outcome.none, outcome.best))
+    return max(1.0 - after / before, 0.0)
