@@ -215,6 +215,18 @@ def test_an_interval_holds_the_size_by_another_law():
     assert best.members[0].variant.label == "exponential in speed"
 
 
+def test_a_law_is_tried_before_what_it_gets_wrong_is_named():
+    """By the other law a breakaway friction leaves so much that a second friction would be found beside it."""
+    off = {"stribeck_peak": 0.12, "stribeck_speed": 0.15, "stribeck_exponent": 1.0}
+    runs = [plant_run(f"run{k}", k, 4.0, off, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    allowed = {"stribeck_friction", "load_friction", "torque_ripple"}
+    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed=allowed)
+    best = search.run().best
+    assert best.ids == ("stribeck_friction",) and best.members[0].variant.label == "exponential in speed"
+
+
 def test_a_grease_that_thins_is_told_by_the_line_that_takes_as_much_energy_too():
     """At one speed that is the friction there; a jump from one recording to the next is no motion."""
     t, q = np.array([0.0, 0.1, 0.2, 9.0, 9.1]), np.array([0.0, 0.3, 0.6, -5.0, -5.3])

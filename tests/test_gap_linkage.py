@@ -198,3 +198,30 @@ def test_a_linkage_with_a_joint_further_off_is_found(ratio):
     (member,) = found.best.members
     assert member.variant.note["from_joint"] == "f" and drives.cases[0] is answers[0][0].case
     assert float(found.best.fit.x[0]) == pytest.approx(ratio, rel=0.1)
+
+
+def test_the_other_end_of_a_linkage_is_asked_for_it():
+    """What drags a joint feels it: it is searched again with that joint among those that it knows, if something was
+    found in it and it does not know it."""
+    from types import SimpleNamespace
+
+    from dexsim.gap.diagnosis import Drives
+
+    def outcome(*others: str) -> SimpleNamespace:
+        effect = SimpleNamespace(couples=True)
+        note = [SimpleNamespace(effect=effect, variant=SimpleNamespace(note={"from_joint": o})) for o in others]
+        return SimpleNamespace(best=SimpleNamespace(members=note or (SimpleNamespace(effect=SimpleNamespace()),)))
+
+    drives = object.__new__(Drives)
+    drives.cases = several()
+    assert drives.cases[5].scales.others == ("a", "b", "c", "d")
+    asked: list[dict] = []
+    drives._search_with = lambda answers, cases: asked.append(cases)
+    found = [outcome("f"), None, outcome("f", "d", "z"), outcome(), outcome("f", "b"), outcome()]
+    answers = [(SimpleNamespace(case=c), x) for c, x in zip(drives.cases, found, strict=True)]
+    drives._other_ends(answers, [0, 2, 4])
+    (ends,) = asked
+    assert list(ends) == [5] and ends[5].scales.others == ("a", "b", "c", "e")
+    answers[5] = answers[5][0], SimpleNamespace(best=SimpleNamespace(members=()))  # nothing there to be explained
+    drives._other_ends(answers, [4])
+    assert asked[1] == {}

@@ -1,11 +1,13 @@
 """The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of
 time."""
 
+import contextlib
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import TouchResult
@@ -140,7 +142,7 @@ def test_a_limit_ends_searches_and_says_which():
 @pytest.mark.parametrize("spent, again", [(10.0, ["b"]), (700.0, [])])
 def test_a_joint_whose_share_was_too_short_gets_what_the_others_left(spent, again, monkeypatch):
     """Of 1,000 s, 800 for searches, each of eight joints has its share; b needed more. Where the others hardly used
-    theirs b is searched again, in half of what is left; where they did, a search anew would end where it did."""
+    theirs b is searched again, in two thirds of what is left; where they did, a search anew would end where it did."""
     clock = [0.0]
     monkeypatch.setattr("dexsim.gap.compute.time.monotonic", lambda: clock[0])
     monkeypatch.setattr("dexsim.gap.diagnosis.workers", lambda device, jobs: 1)
@@ -168,19 +170,20 @@ def test_a_joint_whose_share_was_too_short_gets_what_the_others_left(spent, agai
     assert limit.cut == (set() if again else {"b"})
     assert {j for j in ends if ends[j] != before[j]} == set(again)
     if again:
-        assert ends["b"] == pytest.approx(0.5 * (800 - spent))
+        assert ends["b"] == pytest.approx((800 - spent) * 2 / 3)
 
 
 @pytest.mark.parametrize("limit, again", [(None, True), (1000.0, True), (150.0, False)])
 def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypatch):
     """A joint that the others move otherwise is searched again only where that can end where the first search did: the
-    second answer takes the first one's place."""
+    second answer takes the first one's place, but where the first follows better all the same."""
     clock = [0.0]
     monkeypatch.setattr("dexsim.gap.compute.time.monotonic", lambda: clock[0])
     monkeypatch.setattr("dexsim.gap.diagnosis.workers", lambda device, jobs: 2)
     monkeypatch.setattr("dexsim.gap.diagnosis._unsettled", lambda found: True)
     monkeypatch.setattr("dexsim.gap.diagnosis._other", lambda search, found: True)
     monkeypatch.setattr("dexsim.gap.diagnosis._moved_by", lambda model, joints, found: [])
+    monkeypatch.setattr("dexsim.gap.diagnosis._follows_better", lambda old, search, found: old == "first 3")
     drives = object.__new__(Drives)
     drives.w = SimpleNamespace(limit=TimeLimit(limit), settings=SimpleNamespace(device="cpu"), progress=None)
     drives.mj_model, drives.unknown_controllers = None, set()
@@ -190,7 +193,24 @@ def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypat
     answers = [(SimpleNamespace(case=c, took=40.0), f"first {k}") for k, c in enumerate(drives.cases)]
     clock[0] = 60.0  # of 150 s, 120 for searches, 60 are left: 30 a joint, two at a time
     drives._search_again(answers)
-    assert [x for _, x in answers] == [f"{'second' if again else 'first'} {k}" for k in range(4)]
+    assert [x for _, x in answers] == [f"{'second' if again and k < 3 else 'first'} {k}" for k in range(4)]
+
+
+def test_what_follows_better_is_kept():
+    """An answer is held against a later one of the same joint on the later one's recordings, as it is."""
+    answer = lambda name: SimpleNamespace(members=(name,), fit=SimpleNamespace(params=[], x=np.zeros(1)))  # noqa: E731
+    for before, kept in ((0.5, True), (0.97, False), (3.0, False)):
+        loss = {"old": before, "new": 1.0}
+        search = SimpleNamespace(
+            _fix=lambda members: contextlib.nullcontext(),
+            fitter=SimpleNamespace(fit=lambda params, x0, iterations: iterations),
+            _here=lambda t, loss=loss: loss[t.members[0]],
+        )
+        old, new = (SimpleNamespace(best=answer(n)) for n in ("old", "new"))
+        assert diagnosis._follows_better(old, search, new) is kept
+        assert not diagnosis._follows_better(None, search, new) and not diagnosis._follows_better(old, search, None)
+    old.best.members = ()
+    assert not diagnosis._follows_better(old, search, new)
 
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():

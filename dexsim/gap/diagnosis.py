@@ -352,13 +352,13 @@ class Drives(Steps):
 
     def _search_longer(self, answers: Answers) -> None:
         """Joints whose share of the limit was too short, searched once more in what the others did not need of theirs:
-        a joint with something hidden takes longest. `answers` is changed. Half of what is left at most: what follows
-        needs time too."""
+        a joint with something hidden takes longest. `answers` is changed. Two thirds of what is left at most: what
+        follows needs time too."""
         w = self.w
         cut = [k for k, (search, _) in enumerate(answers) if search.case.joint in w.limit.cut]
         if not cut or w.limit.stopped:
             return
-        share = 0.5 * min(1.0, workers(w.settings.device, len(cut)) / len(cut))
+        share = 2 / 3 * min(1.0, workers(w.settings.device, len(cut)) / len(cut))
         if share * w.limit.left() < LONGER * max(answers[k][0].deadline.seconds for k in cut):
             return  # a search begins anew, and would end where it did
         w.limit.cut -= {answers[k][0].case.joint for k in cut}
@@ -403,7 +403,8 @@ class Drives(Steps):
         joints = [self.cases[k].joint for k in unsettled]
         renewed = map_joints(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
         for k, answer in zip(unsettled, renewed, strict=True):
-            answers[k] = answer
+            if not _follows_better(found[k], *answer):  # it had less time, and ended before where the first did
+                answers[k] = answer
 
     def _dragged_from_afar(self, answers: Answers) -> None:
         """Joints of which much is left, searched once more with one that drags them from further off in the mechanism
@@ -422,26 +423,53 @@ class Drives(Steps):
             and found.best.fit.loss > SEARCH.unsettled
             and not any(m.effect.couples for m in found.best.members)
         }
-        near, several = {k: search.case for k, (search, _) in left.items()}, list(left.values())
+        several = list(left.values())
         by = compute.each(len(left), lambda i: None if w.limit.left() <= 0 else self._dragger(*several[i]))
-        pulled = [(k, case) for k, case in zip(left, by, strict=True) if case is not None]
-        if pulled and not self._time_for(left[k][0] for k, _ in pulled):
-            return
-        for k, case in pulled:
+        pulled = {k: case for k, case in zip(left, by, strict=True) if case is not None}
+        self._other_ends(answers, self._search_with(answers, pulled))
+
+    def _other_ends(self, answers: Answers, dragged: Sequence[int]) -> None:
+        """The joints that drag those of `dragged`, numbers of `answers`, searched once more with what hangs on them: a
+        linkage pulls at both its ends, and what is not asked for at the second looks like a friction or a weight of its
+        own."""
+        number = {search.case.joint: k for k, (search, _) in enumerate(answers)}
+        ends: dict[int, Case] = {}
+        for k in dragged:
+            search, found = answers[k]
+            assert found is not None  # of `_search_with`
+            for other in (m.variant.note["from_joint"] for m in found.best.members if m.effect.couples):
+                i = number.get(other)
+                if i is None or i in ends or (mine := answers[i][1]) is None or not mine.best.members:
+                    continue
+                if search.case.joint not in answers[i][0].case.scales.others:
+                    ends[i] = dragged_by(self.cases[i], [self.cases[k]])
+        self._search_with(answers, ends)
+
+    def _search_with(self, answers: Answers, cases: dict[int, Case]) -> list[int]:
+        """The joints `cases`, by their number in `answers`, searched once more as these cases have them; `answers` is
+        changed where a coupling explains more. Returns the numbers of those."""
+        before = {k: (self.cases[k], *answers[k]) for k in cases}
+        if not cases or not self._time_for(search for _, search, _ in before.values()):
+            return []
+        for k, case in cases.items():
             self.cases[k] = case
-        self._left = len(pulled)
-        again = lambda i, tell: self._search_of(pulled[i][0], tell)  # noqa: E731
-        renewed = map_joints([c.joint for _, c in pulled], again, w.settings.device, w.progress) if pulled else []
-        for (k, _), (search, found) in zip(pulled, renewed, strict=True):
-            old_search, old = left[k]
+        self._left, several = len(cases), list(cases)
+        again = lambda i, tell: self._search_of(several[i], tell)  # noqa: E731
+        renewed = map_joints([c.joint for c in cases.values()], again, self.w.settings.device, self.w.progress)
+        explained = []
+        for k, (search, found) in zip(several, renewed, strict=True):
+            near, old_search, old = before[k]
             if (
                 found is not None
+                and old is not None
                 and any(m.effect.couples for m in found.best.members)
                 and search._left(found.best).sum() < (1 - SEARCH.least) * old_search._left(old.best).sum()
             ):
                 answers[k] = search, found
+                explained.append(k)
             else:
-                self.cases[k] = near[k]
+                self.cases[k] = near
+        return explained
 
     def _dragger(self, search: JointSearch, found: Outcome) -> Case | None:
         """The joint's case with the one further off, if any, that by the scan drags it, in the place of the last of
@@ -643,6 +671,16 @@ def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outc
         x.none if k in misreads and any(clearer(other, k) for other in misreads) else x.best
         for k, x in enumerate(found)
     ]
+
+
+def _follows_better(old: Outcome | None, search: JointSearch, found: Outcome | None) -> bool:
+    """Whether what was found before follows the recordings of `search` better, as it is, than what it found."""
+    if old is None or found is None or not old.best.members:
+        return False
+    with search._fix(old.best.members):
+        fit = search.fitter.fit(old.best.fit.params, x0=old.best.fit.x, iterations=0)
+    before = search._here(Trial(old.best.members, fit))
+    return bool(before < (1 - SEARCH.least) * search._here(found.best))
 
 
 def _unsettled(found: Outcome) -> bool:

@@ -89,6 +89,8 @@ class JointSelection(JointScan):
             rest, last = best.members[:-1], best.ids[-1]
             forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
             current, level = best, trials
+            if self._left(current).sum() / per > SEARCH.unsettled and not self.deadline.over():
+                current = self._by_laws(current)  # before what its law gets wrong is taken for a further effect
             if len(current.members) > 1 and not self.deadline.over():
                 current, level = self._swap(current, pool, level)
         current = self._from_plain(self._beside_alike(forks, current, shortlist, pool, price))
