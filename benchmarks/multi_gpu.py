@@ -70,10 +70,11 @@ class Job:
         return [r for r in rows if r.get("rate")]
 
     def watch(self, learn_s: float, until: float, end: float) -> None:
-        """Ask the run to stop when it has learned long enough, reached its aim or the time is up."""
+        """Ask the run to stop when it has learned long enough or reached its aim, with iterations enough for a rate, or
+        when the time is up."""
         rows = self.rows()
         found = series(rows)
-        done = bool(rows) and (found["time_s"][-1] >= learn_s or found["share"][-1] >= until)
+        done = len(rows) > SKIPPED and (found["time_s"][-1] >= learn_s or found["share"][-1] >= until)
         if (done or time.perf_counter() > end) and not self.stopped:
             self.process.send_signal(signal.SIGINT)
             self.stopped = True
