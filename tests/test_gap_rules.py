@@ -713,6 +713,24 @@ def test_a_law_that_training_lacks_must_explain_far_more():
         assert ids == (("load_friction",) if taken else ("coulomb_friction",)), (before, after)
 
 
+def test_a_law_that_training_lacks_is_asked_in_the_place_of_what_imitates_its_likes():
+    class Beside(Selecting):
+        _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
+        _earns = lambda self, new, old, further=True: self._left(new).sum() < 0.9 * self._left(old).sum()  # noqa: E731
+
+    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), instead=True)
+    other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
+    plain = replace(law, instead=False)
+    for found, taken in ((("stribeck_friction",), True), (("stribeck_friction", "deadband"), True), (("lag",), False)):
+        search = Beside(lambda ids: (4.0 if ids == ("load_friction",) else 10.0,) * 2)
+        search.allowed, search.case.scales = None, None
+        members = tuple(Member(EFFECTS[e], replace(plain, params=(param("size", e, "set", 0.0, 1.0),))) for e in found)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(selecting, "CATALOGUE", [other, EFFECTS["coulomb_friction"]])
+            patch.setattr(EFFECTS["coulomb_friction"].__class__, "variants", lambda self, _: [plain])
+            assert JointSearch._instead(search, search.fit(members)).ids == (("load_friction",) if taken else found)
+
+
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
     """What a search of a joint ended with, at `loss`; and now, with what is known of the others."""
     one = SimpleNamespace(members=members, fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)))

@@ -414,33 +414,42 @@ class JointSelection(JointScan):
 
     def _instead(self, current: Trial) -> Trial:
         """The members that are confused with an effect replaced by a law of it that training has less exactly
-        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it."""
+        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it.
+
+        Asked too in the place of what is confused with their likes: before that law is tried, which of several
+        imitations follows best (dry friction, or one that falls off with speed) is an accident, and what it lacks
+        seems to be others."""
         mine = self._left(current).sum()
         if mine < SEARCH.unsettled * len(self.blocks):
             return current
-        best = current
+        best, count = current, range(len(current.members))
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
         for effect in CATALOGUE:
-            rest = [k for k, m in enumerate(current.members) if not confusable(effect.id, m.id)]
-            if len(rest) == len(current.members) or (self.allowed is not None and effect.id not in self.allowed):
+            laws = [v for v in effect.variants(self.case.scales) if v.instead]
+            if not laws or (self.allowed is not None and effect.id not in self.allowed):
                 continue
-            for variant in (v for v in effect.variants(self.case.scales) if v.instead):
-                if self.deadline.over():
-                    return best
-                member, others = Member(effect, variant), tuple(current.members[k] for k in rest)
-                if any(not fits_beside(member, m) for m in others):
-                    continue
-                kept = [values[k] for k in rest]
-                drafts = [
-                    self.draft((*others, member), np.concatenate([*kept, np.array(start)]), current)
-                    for start in variant.starts
-                ]
-                trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
-                left = self._left(trial).sum()
-                if left < SEARCH.instead * mine and left < self._left(best).sum() and not self._shrunk(trial):
-                    best = trial
-        return best
+            likes = [e.id for e in CATALOGUE if confusable(effect.id, e.id)]
+            near = tuple(k for k in count if not confusable(effect.id, current.members[k].id))
+            far = tuple(k for k in near if not any(confusable(e, current.members[k].id) for e in likes))
+            for rest in dict.fromkeys((near, far)):
+                others = tuple(current.members[k] for k in rest)
+                for variant in laws if len(rest) < len(count) else ():
+                    if self.deadline.over():
+                        return best
+                    member = Member(effect, variant)
+                    if any(not fits_beside(member, m) for m in others):
+                        continue
+                    kept = [values[k] for k in rest]
+                    drafts = [
+                        self.draft((*others, member), np.concatenate([*kept, np.array(start)]), current)
+                        for start in variant.starts
+                    ]
+                    trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
+                    left = self._left(trial).sum()
+                    if left < SEARCH.instead * mine and left < self._left(best).sum() and not self._shrunk(trial):
+                        best = trial
+        return best if best is current else self._drop(best)  # what made up for the imitations may not be needed
 
     def _by_laws(self, current: Trial) -> Trial:
         """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the
