@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
-from dexsim.actuator.columns import FEATURES, INDEX, column
+from dexsim.actuator.columns import FEATURES, INDEX, MEMORY, column
 from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS
 from dexsim.actuator.reference import servo as servo_reference
 from dexsim.actuator.reference import target_in_force, target_rates
@@ -110,6 +110,8 @@ def test_every_column_says_how_large_a_usual_one_is():
     for c in COLUMNS:
         centre = c.neutral if math.isfinite(c.neutral) else 0.0
         assert c.usual > 0 and (c.low <= centre - c.usual or centre + c.usual <= c.high), c.name
+        assert c.feature or not c.remembers, f"{c.name}: a servo has room for memory where a feature asks for it"
+    assert sum(len(c.remembers) for c in COLUMNS) == len(MEMORY)  # none has another's place
 
 
 @pytest.mark.parametrize("voltage", [False, True])
@@ -159,6 +161,8 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     if extra:
         state[..., slots["fresh"]] = rng.random((n, j)) < 0.1
         state[..., slots["filtered"]], state[..., slots["line_a"]] = rng.normal(0, 6.0, (2, n, j))
+        for name in set(MEMORY) - {"filtered"}:
+            state[..., slots[name]] = np.random.default_rng(MEMORY[name]).normal(0, 0.3, (n, j))
         state[..., slots["line_b"]] = rng.uniform(-0.2, 0.9, (n, j))
         state[..., slots["taken"]] = rng.uniform(-1.0, 1.0, (n, j))
         state[..., slots["integral"]] = rng.normal(0, 0.3, (n, j))
@@ -185,7 +189,8 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
 
     stamps, targets = np.split(state[..., slots["stamp0"] : slots["stamp0"] + 2 * queue], 2, axis=-1)
     target = target_in_force(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt)
-    known = {name: state[..., slots[name]] for name in EXTRA_SLOTS} if extra else {}
+    known = {name: state[..., slots[name]] for name in EXTRA_SLOTS if name not in MEMORY} if extra else {}
+    kept = {name for c in COLUMNS if c.feature in features for name in c.remembers}
     source = np.clip(params[..., INDEX["coupling_from"]].astype(int), 0, j - 1)
     expected = servo_reference(
         params,
@@ -197,6 +202,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         features=features,
         base_armature=armature,
         **known,
+        memory={name: state[..., slots[name]] for name in kept},
         dragging=np.take_along_axis(q - home, source, 1),
         others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
         loop_motor=np.array([False, True, False]),
@@ -217,7 +223,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         got |= {name: servo.state[..., slots[name]].numpy() for name in ("line_a", "line_b") if "play" in features}
         got |= {"taken": servo.state[..., slots["taken"]].numpy()} if "presliding" in features else {}
         got |= {"integral": servo.state[..., slots["integral"]].numpy()} if "controller" in features else {}
-        got |= {"filtered": servo.state[..., slots["filtered"]].numpy()} if "rare" in features else {}
+        got |= {name: servo.state[..., slots[name]].numpy() for name in kept}
     if "play" in features:
         got |= {
             "rotor": servo.state[..., slots["rotor"]].numpy(),
@@ -568,7 +574,7 @@ def test_send_and_reset_touch_masked_worlds_only():
 
 def test_saved_state_continues_bitwise():
     columns = {"kp": 1.5, "kd": 0.03, "delay": 0.012, "lag": 0.01, "torque_limit": 0.4, "no_load_speed": 14.38}
-    engine, servo = drive(columns)
+    engine, servo = drive(columns | {"speed_lag": 0.02})  # of which the law has a memory
     servo.send(torch.full((1, 1), 1.0))
     run(engine, servo, 0.02)
     state, qpos, qvel, time = servo.get_state(), engine.t.qpos.clone(), engine.t.qvel.clone(), engine.t.time.clone()

@@ -27,7 +27,8 @@ class Column:
 
     feature: the part of the servo's kernel that has its law and is compiled in only where a drive asks for it; empty:
     all servos have it. asks: whether a value other than the neutral one asks for that part; False where the column says
-    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`)."""
+    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`). remembers: the
+    numbers that its law keeps from one step to the next (`MEMORY`), in units of its own; it needs a feature."""
 
     name: str
     unit: str
@@ -39,6 +40,7 @@ class Column:
     feature: str = ""
     asks: bool = True
     encoder: bool = False
+    remembers: tuple[str, ...] = ()
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -182,6 +184,7 @@ COLUMNS: tuple[Column, ...] = (
         0.02,
         "time constant of the filter on the velocity that kd acts on",
         feature="rare",
+        remembers=("filtered",),
     ),
     Column(
         "deadband_kind",
@@ -396,6 +399,11 @@ FEATURE_OF: dict[str, str] = {name: feature for feature, names in FEATURES.items
 
 ENCODER: frozenset[str] = frozenset(c.name for c in COLUMNS if c.encoder)
 """Columns of what an encoder shows beyond its scale and offset (`laws.encoder_error`)."""
+
+
+MEMORY: dict[str, int] = {name: i for i, name in enumerate(n for c in COLUMNS for n in c.remembers)}
+"""What the laws of drives keep from step to step, each number with its place: slots of the same names in a servo's
+state, a vector for the laws."""
 
 
 def simulated(features: frozenset[str]) -> list[int]:

@@ -48,12 +48,13 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.actuator.columns import INDEX
+from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY
 from dexsim.actuator.laws import (
     arrived,
     difference,
     dry_friction,
     encoder_error,
+    heard_speed,
     hold,
     lag_share,
     lost_error,
@@ -75,10 +76,11 @@ from dexsim.actuator.laws import (
 # Slots of state[world, joint, slot] before the queue: `queue` stamps [s], then `queue` targets [rad], oldest first.
 MOTOR, ENABLED, QUEUE = 0, 1, 2
 SLOTS = ("motor", "enabled")
-# After the queue, where a feature of `columns.FEATURES` needs it. line_a, line_b: see "Play and elasticity".
-EXTRA_SLOTS = ("filtered", "rotor", "line_a", "line_b", "fresh", "integral", "taken")
-FILTERED, ROTOR, LINE_A, LINE_B, FRESH, INTEGRAL, TAKEN = range(len(EXTRA_SLOTS))
-EXTENDED = frozenset({"play", "rare", "controller", "presliding"})  # the features that need them
+# After the queue, where a feature of `columns.FEATURES` needs it: what laws remember, in the order of its places, then
+# what a step itself does. line_a, line_b: see "Play and elasticity".
+EXTRA_SLOTS = (*MEMORY, "rotor", "line_a", "line_b", "fresh", "integral", "taken")
+ROTOR, LINE_A, LINE_B, FRESH, INTEGRAL, TAKEN = range(len(MEMORY), len(EXTRA_SLOTS))
+EXTENDED = frozenset({"play", "controller", "presliding"}) | {c.feature for c in COLUMNS if c.remembers}
 
 NEVER = -1.0e9  # the stamp of a target that has always been there
 SEED = 1.0e-6  # of the stall torque: braking from the no-load speed starts from no less
@@ -96,7 +98,6 @@ EFFICIENCY, DELAY, LAG_TIME, SUPPLY = INDEX["efficiency"], INDEX["delay"], INDEX
 VISCOUS, ASYMMETRY = INDEX["viscous_friction"], INDEX["friction_asymmetry"]
 THINNING, THINNING_SPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
-SPEED_LAG = INDEX["speed_lag"]
 BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
     INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
 )
@@ -190,14 +191,17 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
     asks for; `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two.
-    Each has the law as `laws.py` states it and takes it to the end of the step ("Integration")."""
+    Each has the law as `laws.py` states it and takes it to the end of the step ("Integration"); what laws remember goes
+    from one to the next and is written when all have had it."""
     play, sag, rare, braking, controller, presliding, load, shape = (
         name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "load", "shape")
     )
     extended = bool(features & EXTENDED)
-    Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
+    # of the state, those that some law of this kernel keeps
+    remembered = [MEMORY[name] for c in COLUMNS if c.feature in features for name in c.remembers]
+    Drives, vec3, Memory = drives(real), wp.types.vector(length=3, dtype=real), wp.types.vector(len(MEMORY), real)
     parasitic, dry = parasitic_torque(features), dry_friction(features)
-    encoder, lost = encoder_error(features), lost_error(features)
+    encoder, hears, lost = encoder_error(features), heard_speed(features), lost_error(features)
 
     @wp.struct
     # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
@@ -263,8 +267,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         return r
 
     @wp.func
-    def sense(dt: real, x0: int, fresh: bool, r: Rotor, d: Drives, w: int, j: int):
-        """What the loop's encoder shows; writes the slot of kd's filter."""
+    def sense(dt: real, fresh: bool, r: Rotor, memory: Memory, d: Drives, w: int, j: int):
+        """(what the loop's encoder shows, memory)."""
         turned = d.qpos[w, d.loop_q[j]]
         turning = d.qvel[w, d.loop_dof[j]]
         if wp.static(play):
@@ -273,24 +277,16 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 turning = r.v
         s = Sensed()
         s.scale = d.params[w, j, SCALE]
-        s.share = real(1.0)
         error = encoder(d.params[w, j], turned)
         s.q = s.scale * turned + d.params[w, j, OFFSET]
         s.q += error[0] + error[1]
         s.scale += error[2]
         s.rate = s.scale * turning
-        s.v = s.rate
-        s.v_end = s.rate
-        if wp.static(rare):
-            s.share = lag_share(d.params[w, j, SPEED_LAG], dt)
-            filtered = turning
-            if not fresh:
-                filtered = d.state[w, j, x0 + FILTERED]
-                filtered += s.share * (turning - filtered)
-            d.state[w, j, x0 + FILTERED] = filtered
-            s.v = s.scale * filtered
-            s.v_end = s.scale * (filtered + s.share * (turning - filtered))
-        return s
+        heard, kept = hears(d.params[w, j], turning, memory, fresh, dt)
+        s.v = s.scale * heard[0]
+        s.v_end = s.scale * heard[1]
+        s.share = heard[2]
+        return s, kept
 
     @wp.func
     def remaining(d: Drives, w: int, j: int):
@@ -312,9 +308,21 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         return m
 
     @wp.func
-    def control(dt: real, queue: int, x0: int, s: Sensed, lower: real, upper: real, d: Drives, w: int, j: int):
-        """(now, end, slope) that the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at which its
-        integral waits."""
+    def control(
+        dt: real,
+        queue: int,
+        x0: int,
+        fresh: bool,
+        s: Sensed,
+        memory: Memory,
+        lower: real,
+        upper: real,
+        d: Drives,
+        w: int,
+        j: int,
+    ):
+        """((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at
+        which its integral waits."""
         end = d.time[w] - d.params[w, j, DELAY] + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
         if wp.static(rare):
@@ -322,9 +330,10 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             if dragged != real(0.0):
                 other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
                 target += dragged * (d.qpos[w, d.dof_q[other]] - d.home[w, other])
+        off, kept = lost(d.params[w, j], target, target - s.q, memory, fresh, dt)
         u = pd(
             target - s.q,
-            lost(d.params[w, j], target, target - s.q),
+            off,
             s.v,
             s.v_end,
             s.rate,
@@ -336,7 +345,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             s.share,
         )
         if wp.static(not controller):
-            return wp.vector(u[0], u[1], u[2])
+            return wp.vector(u[0], u[1], u[2]), kept
         wish = target_rates(d.state, w, j, queue, end - dt, dt)
         feed = d.params[w, j, FEED_SPEED] * wish[0] + d.params[w, j, FEED_ACCELERATION] * wish[1]
         gain = d.params[w, j, INTEGRAL_GAIN]
@@ -345,7 +354,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             integral = d.state[w, j, x0 + INTEGRAL]
             integral = wind(integral, dt * gain * u[3], u[0] + feed + integral, lower, upper)
         d.state[w, j, x0 + INTEGRAL] = integral
-        return other_terms(u, feed, integral, gain, s.rate, s.scale, dt)
+        return other_terms(u, feed, integral, gain, s.rate, s.scale, dt), kept
 
     @wp.func
     def drive_voltage(u: vec3, v: real, m: Motor):
@@ -395,11 +404,26 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         return t
 
     @wp.func
-    def ask(dt: real, queue: int, x0: int, s: Sensed, r: Rotor, m: Motor, d: Drives, w: int, j: int):
-        """The motor's torque after its lag; writes what the current shows."""
+    def ask(
+        dt: real,
+        queue: int,
+        x0: int,
+        fresh: bool,
+        s: Sensed,
+        memory: Memory,
+        r: Rotor,
+        m: Motor,
+        d: Drives,
+        w: int,
+        j: int,
+    ):
+        """(the motor's torque after its lag, memory); writes what the current shows."""
         t = Torque()
+        kept = memory
         if wp.static(voltage):
-            t = drive_voltage(control(dt, queue, x0, s, real(1.0), real(1.0), d, w, j), r.v, m)
+            duty, then = control(dt, queue, x0, fresh, s, memory, real(1.0), real(1.0), d, w, j)
+            t = drive_voltage(duty, r.v, m)
+            kept = then
         else:
             x = wp.abs(r.v) / (m.no_load * m.supply)
             steep = real(1.0)
@@ -409,7 +433,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             inertia = d.inertia[w, j]
             if r.two:
                 inertia = r.inertia
-            u = control(dt, queue, x0, s, limits[0], limits[1], d, w, j)
+            u, then = control(dt, queue, x0, fresh, s, memory, limits[0], limits[1], d, w, j)
+            kept = then
             t = drive_torque(dt, u, r.v, x, limits[0], limits[1], steep, inertia, m)
         if d.state[w, j, ENABLED] == real(0.0):
             t.now = real(0.0)
@@ -425,11 +450,13 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         t.end = m.efficiency * t.end
         t.slope = m.efficiency * (share * t.slope)
         t.on_drive = m.efficiency * share * t.on_drive
-        return t
+        return t, kept
 
     @wp.func
-    def resist(dt: real, x0: int, fresh: bool, last: real, r: Rotor, factor: real, d: Drives, w: int, j: int):
-        """Friction at the motor's speed; last: its torque of the step before."""
+    def resist(
+        dt: real, x0: int, fresh: bool, last: real, r: Rotor, factor: real, memory: Memory, d: Drives, w: int, j: int
+    ):
+        """(friction at the motor's speed, memory); last: its torque of the step before."""
         f = Friction()
         f.viscous = d.params[w, j, VISCOUS] * factor
         if wp.static(shape):
@@ -438,7 +465,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         outside = real(0.0)
         if wp.static(load):
             outside = d.outside[w, d.dof[j]]
-        level = dry(d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, last, outside, wp.static(load), factor)
+        level, kept = dry(
+            d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, last, outside, wp.static(load), factor, memory, fresh, dt
+        )
         f.level = d.base_frictionloss[w, j] + level[0]
         f.level += level[1] + level[2] + level[3]
         f.own = f.level - d.base_frictionloss[w, j]
@@ -455,7 +484,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                     sliding = f.own
                 f.taken = sliding * taken
                 f.viscous += sliding * dt / give * preslide_slope(taken, turned)
-        return f
+        return f, kept
 
     @wp.func
     def couple(dt: real, t: Torque, f: Friction, r: Rotor, stiffness: real, d: Drives, w: int, j: int):
@@ -526,12 +555,16 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             fresh = d.state[w, j, x0 + FRESH] != real(0.0)
             d.state[w, j, x0 + FRESH] = real(0.0)
         last = d.state[w, j, MOTOR]
+        memory = Memory()
+        for k in range(wp.static(len(remembered))):
+            memory[wp.static(remembered[k])] = d.state[w, j, x0 + wp.static(remembered[k])]
         r = locate(dt, x0, fresh, d, w, j)
         m = remaining(d, w, j)
-        t = ask(dt, queue, x0, sense(dt, x0, fresh, r, d, w, j), r, m, d, w, j)
+        s, heard = sense(dt, fresh, r, memory, d, w, j)
+        t, asked = ask(dt, queue, x0, fresh, s, heard, r, m, d, w, j)
 
         # Ripple and its like; what of it brakes, or pulls like a spring, is taken at the end of the step.
-        beside = parasitic(d.params[w, j], q, r.v)
+        beside, added = parasitic(d.params[w, j], q, r.v, asked, fresh, dt)
         t.end += beside[0]
         stiffness = wp.max(real(0.0), -beside[1])
         t.end -= stiffness * dt * v
@@ -552,7 +585,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         damping += spring * dt
 
         # Dry friction: an interval of torques [-level (1 + a/2), +level (1 - a/2)], as a symmetric one and a constant.
-        f = resist(dt, x0, fresh, last, r, m.friction, d, w, j)
+        f, kept = resist(dt, x0, fresh, last, r, m.friction, added, d, w, j)
+        for k in range(wp.static(len(remembered))):
+            d.state[w, j, x0 + wp.static(remembered[k])] = kept[wp.static(remembered[k])]
         uneven = real(0.5) * d.params[w, j, ASYMMETRY]
         if wp.static(play):
             d.state[w, j, x0 + LINE_A] = real(0.0)

@@ -3,8 +3,13 @@ search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32
 same laws in NumPy, written apart, as their check.
 
 Where several laws make up one quantity they are put together here, for both kernels: `warm_motor`, `dry_friction`,
-`parasitic_torque`, `encoder_error`, `lost_error`. `of` is there a drive's row of the table, in the order of
-`columns.py`."""
+`parasitic_torque`, `encoder_error`, `heard_speed`, `lost_error`. `of` is there a drive's row of the table, in the order
+of `columns.py`.
+
+Laws with memory: `dry_friction`, `parasitic_torque`, `heard_speed` and `lost_error` are given what their drive
+remembers and hand it on. memory: a vector, `columns.MEMORY` has the place of each number; fresh: nothing is remembered
+yet (the first step after a reset), a law begins from rest and sets what it will remember; dt: of the step [s]. Each
+number is written by one law, once a step."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
@@ -14,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.actuator.columns import INDEX
+from dexsim.actuator.columns import INDEX, MEMORY
 
 TORQUE_LIMIT, NO_LOAD_SPEED, EFFICIENCY = (INDEX[n] for n in ("torque_limit", "no_load_speed", "efficiency"))
 THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE = (
@@ -34,6 +39,7 @@ RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE, RIPPLE_SHAPE = (
 )
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 DEADBAND, DEADBAND_KIND = INDEX["deadband"], INDEX["deadband_kind"]
+SPEED_LAG, FILTERED = INDEX["speed_lag"], MEMORY["filtered"]
 
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
@@ -101,6 +107,36 @@ def stage_before(before: Any, after: Any, share: Any):
     """What went into a first-order lag whose output went from `before` to `after` in a step of this `lag_share`: of a
     lag of second order the first stage, where the output of the second is known."""
     return before + (after - before) / share
+
+
+@cache
+def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> Any:
+    """The Warp function of the speed that a loop's gain kd acts on, for a kernel with these of `columns.FEATURES`;
+    skips: whether a filter without a lag passes the speed as it is, where it else comes out but for rounding: each
+    kernel keeps its own, as of `dry_friction`.
+
+    A further filter of the speed is a function of this file and one more step from v to `now` here, and in
+    `reference.heard_speed`."""
+
+    @wp.func
+    def heard(of: wp.array(dtype=Any), v: Any, memory: Any, fresh: bool, dt: Any):
+        """((now, end, share), memory): speed [rad/s] of what the encoder turns with as kd has it now, and at the end of
+        a step of dt [s] in which v does not change; share of a change of v that passes in the step.
+
+        A first-order lag (column `speed_lag`)."""
+        now = v
+        end = v
+        share = type(v)(1.0)
+        if wp.static("rare" in features):
+            if wp.static(not skips) or of[SPEED_LAG] > type(v)(0.0):
+                share = lag_share(of[SPEED_LAG], dt)
+                if not fresh:
+                    now = memory[FILTERED] + share * (v - memory[FILTERED])
+                end = now + share * (v - now)
+            memory[FILTERED] = now
+        return wp.vector(now, end, share), memory
+
+    return heard
 
 
 # -- the motor ---------------------------------------------------------------------------------------------------------
@@ -276,10 +312,21 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
     the joint, that it sticks, differs by direction or gives way first, is the kernels' own."""
 
     @wp.func
-    def friction(of: wp.array(dtype=Any), q: Any, v: Any, motor: Any, outside: Any, carries: bool, warm: Any):
-        """Level [N.m], as four parts of a sum: what neither speed nor load changes; what falls with speed; by the load;
-        by the load and falling with speed. Four, since in finite precision a sum depends on its order, and each kernel
-        keeps its own, so that results made before can be made again bit for bit.
+    def friction(
+        of: wp.array(dtype=Any),
+        q: Any,
+        v: Any,
+        motor: Any,
+        outside: Any,
+        carries: bool,
+        warm: Any,
+        memory: Any,
+        fresh: bool,
+        dt: Any,
+    ):
+        """(level [N.m], memory), the level as four parts of a sum: what neither speed nor load changes; what falls with
+        speed; by the load; by the load and falling with speed. Four, since in finite precision a sum depends on its
+        order, and each kernel keeps its own, so that results made before can be made again bit for bit.
 
         q, v: position [rad] of the joint and speed [rad/s] of the motor; motor: torque [N.m] of the step before;
         outside: what the joint felt from outside then; carries: whether that, or a column of the feature `load`,
@@ -304,7 +351,7 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
                 by_both = gear_friction(motor, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
                 by_both += opposed_square(motor, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
                 loaded_fading = warm * left * by_both
-        return wp.vector(steady, fading, loaded, loaded_fading)
+        return wp.vector(steady, fading, loaded, loaded_fading), memory
 
     return friction
 
@@ -379,15 +426,15 @@ def ripple_wave(angle: Any, shape: Any):
 @cache
 def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
     """The Warp function of all torque of a drive that neither its motor is asked for nor is dry friction, as a sum of
-    laws of position and speed, for a kernel with these of `columns.FEATURES`.
+    laws of position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
 
     A further such law is a function of this file and a term here, and in `reference.parasitic_torque`: training, search
     and what a diagnosis hands on take their torque from these two."""
 
     @wp.func
-    def parasitic(of: wp.array(dtype=Any), q: Any, v: Any):
-        """(torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]) at position q [rad] of the joint
-        and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
+    def parasitic(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
+        """((torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]), memory) at position q [rad] of
+        the joint and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
         torque = type(q)(0.0)
         by_position = type(q)(0.0)
         by_speed = type(v)(0.0)
@@ -398,7 +445,7 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
             wave = ripple_wave(of[RIPPLE_PER_TURN] * q + of[RIPPLE_PHASE], form)
             torque += of[RIPPLE] * wave[0]
             by_position += of[RIPPLE] * of[RIPPLE_PER_TURN] * wave[1]
-        return wp.vector(torque, by_position, by_speed)
+        return wp.vector(torque, by_position, by_speed), memory
 
     return parasitic
 
@@ -420,17 +467,17 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
 
 @cache
 def lost_error(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what of its error a loop does not act on, as a sum of laws of the target and the error, for
-    a kernel with these of `columns.FEATURES`.
+    """The Warp function of what of its error a loop does not act on, as a sum of laws of the target, the error and what
+    is remembered, for a kernel with these of `columns.FEATURES`.
 
-    A further such law (another dead zone, an error that is limited, a target that is rounded) is a function of this
-    file and a term of `lost` and `slope` here, and in `reference.lost_error`: training, search and what a diagnosis
-    hands on take the error from these two."""
+    A further such law (another dead zone, an error that is limited, a target that is rounded or smoothed, a position
+    that the loop has filtered) is a function of this file and a term of `lost` and `slope` here, and in
+    `reference.lost_error`: training, search and what a diagnosis hands on take the error from these two."""
 
     @wp.func
-    def lost_of(of: wp.array(dtype=Any), target: Any, e: Any):
-        """(lost, slope, acts): lost [rad] of the error e [rad] to a target [rad]; its slope in e at that target; acts:
-        0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
+    def lost_of(of: wp.array(dtype=Any), target: Any, e: Any, memory: Any, fresh: bool, dt: Any):
+        """((lost, slope, acts), memory): lost [rad] of the error e [rad] to a target [rad]; its slope in e at that
+        target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
 
         The deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2
         it counts from the edge on."""
@@ -447,7 +494,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
             acts = type(e)(0.0)
             if kind > type(e)(0.5):
                 acts = type(e)(1.0)
-        return wp.vector(lost, slope, acts)
+        return wp.vector(lost, slope, acts), memory
 
     return lost_of
 

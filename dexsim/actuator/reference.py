@@ -4,15 +4,50 @@ numerics, as how stiff the end of a play is."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from dexsim.actuator.columns import FEATURES, INDEX
+from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX, MEMORY
 from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
 
 Numbers = float | np.ndarray
+
+
+@dataclass
+class Step:
+    """What a law with memory is given beside what it acts on; it writes what it will remember.
+
+    dt: of the step [s]; fresh [...]: nothing is remembered yet; memory: numbers [...] by their names in
+    `columns.MEMORY`."""
+
+    dt: float = 0.0
+    fresh: Numbers | bool = True
+    memory: dict[str, Numbers] = field(default_factory=lambda: {name: np.zeros(()) for name in MEMORY})
+
+
+def over_time(
+    law: Callable[..., Any],
+    p: Mapping[str, float],
+    t: np.ndarray,
+    *signals: np.ndarray,
+    features: Collection[str] = FEATURES,
+) -> Any:
+    """What a law of this file (`lost_error`, `parasitic_torque`, `dry_friction`) answers to signals [S] at the times t
+    [S] s, from rest at the first: one after the other where a column p of it remembers, else at once."""
+    step = Step()
+    begun = dict(step.memory)
+    out = law(p, *signals, features, step)
+    there = {name for c in COLUMNS if c.feature in features and p[c.name] != c.neutral for name in c.remembers}
+    if all(step.memory[name] is begun[name] for name in there):  # the law has not written it: it is another one's
+        return out
+    step, each = Step(), []
+    for i, dt in enumerate(np.diff(t, prepend=t[0])):
+        step.dt, step.fresh = float(dt), i == 0
+        each.append(law(p, *(x[i] for x in signals), features, step))
+    return tuple(np.array(x) for x in zip(*each, strict=True)) if isinstance(out, tuple) else np.array(each)
 
 
 def measured_position(
@@ -31,17 +66,39 @@ def measured_position(
 
 
 def lost_error(
-    p: Mapping[str, Numbers], target: Numbers, e: Numbers, features: Collection[str] = FEATURES
+    p: Mapping[str, Numbers],
+    target: Numbers,
+    e: Numbers,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:
     """(what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what acts: 0
     no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
 
-    p: columns by name; features: those of `columns.FEATURES` that count."""
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
     kind = p["deadband_kind"] if "rare" in features else 0.0
     inside = np.abs(e) < p["deadband"]
     lost = np.where(np.greater(kind, 1.5), np.clip(e, -p["deadband"], p["deadband"]), 0.0)
     slope = np.zeros_like(lost)
     return lost, slope, np.where(inside, np.where(np.greater(kind, 0.5), 1.0, 0.0), 2.0)
+
+
+def heard_speed(
+    p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
+) -> tuple[Numbers, Numbers, Numbers]:
+    """(speed [...] rad/s that kd acts on where the encoder's is v [...] rad/s, at the end of a step at unchanged v,
+    share of a change of v that passes): of all filters of `laws.heard_speed`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    if "rare" not in features:
+        return v, v, 1.0
+    step = step or Step()
+    share = step.dt / (p["speed_lag"] + step.dt) if step.dt else 1.0
+    before = step.memory["filtered"]
+    now = np.where(step.fresh, v, before + share * (v - before))
+    step.memory["filtered"] = now
+    return now, now + share * (v - now), share
 
 
 def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float) -> np.ndarray:
@@ -118,13 +175,18 @@ def lagged(t: np.ndarray, torque: np.ndarray, time: float, stages: int = 1) -> n
 
 
 def parasitic_torque(
-    p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES
+    p: Mapping[str, Numbers],
+    q: Numbers,
+    v: Numbers,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:
     """(torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its motor is
     asked for nor is dry friction: of all terms of `laws.parasitic_torque`.
 
     p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
-    count."""
+    count; step: None from rest."""
+    step = step or Step()
     angle = p["ripple_per_turn"] * q + p["ripple_phase"]
     wave, tilt = np.sin(angle), np.cos(angle)
     if "shape" in features:
@@ -144,11 +206,13 @@ def dry_friction(
     motor: Numbers,
     outside: Numbers = 0.0,
     features: Collection[str] = FEATURES,
+    step: Step | None = None,
 ) -> Numbers:
     """Level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of `laws.dry_friction`.
 
     p: columns by name; q [rad] of the joint, v [rad/s] of the motor; motor, outside: torques on the gear's two sides,
-    N.m; features: those of `columns.FEATURES` that count."""
+    N.m; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
     exponent = p["stribeck_exponent"] if "shape" in features else 2.0
     fades = np.exp(-(np.abs(v / p["stribeck_speed"]) ** exponent))
     share = np.where(motor * v < 0.0, p["load_friction_backdriven"], p["load_friction"])
@@ -194,7 +258,7 @@ def servo(
     features: Collection[str] = (),
     dragging: Numbers = 0.0,
     others: Numbers = 0.0,
-    filtered: Numbers = 0.0,
+    memory: Mapping[str, Numbers] | None = None,
     rotor: Numbers = 0.0,
     line_a: Numbers = 0.0,
     line_b: Numbers = 0.0,
@@ -210,12 +274,12 @@ def servo(
     target [rad]; q [rad], v [rad/s] of the driven joint; q_loop, v_loop of the joint that carries the loop's encoder
     (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint [kg.m2];
     base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
-    far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered,
-    rotor, line_a, line_b, fresh, integral, taken: the state's slots; loop_motor: the loop's encoder is on the rotor;
-    rates: the target's speed and acceleration (`target_rates`); outside: what the joint felt from outside in the step
-    before [N.m]. Returns `torque` (motor torque the current shows),
-    `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as `kernel.py` defines them, and the next
-    `filtered`, `rotor`, `line_a`, `line_b`, `integral`, `taken`.
+    far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; memory: what
+    laws remember by name (`columns.MEMORY`); rotor, line_a, line_b, fresh, integral, taken: the state's other slots;
+    loop_motor: the loop's encoder is on the rotor; rates: the target's speed and acceleration (`target_rates`);
+    outside: what the joint felt from outside in the step before [N.m]. Returns `torque` (motor torque the current
+    shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as `kernel.py` defines them, and the next
+    of what is remembered, of `rotor`, `line_a`, `line_b`, `integral` and `taken`.
     """
     play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
@@ -233,15 +297,14 @@ def servo(
     turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
     q_m, scale = measured_position(p, turned, features)
     v_m = scale * turning
-    kd_blend: Numbers = 1.0
-    v_d, v_next = v_m, v_m
+    step = Step(dt, first)
+    step.memory |= memory or {}
+    heard, then, kd_blend = heard_speed(p, turning, features, step)
+    v_d, v_next = scale * heard, scale * then
     if rare:
-        kd_blend = dt / (p["speed_lag"] + dt)
-        filtered = np.where(first, turning, filtered + kd_blend * (turning - filtered))
-        v_d, v_next = scale * filtered, scale * (filtered + kd_blend * (turning - filtered))
         target = target + p["coupling"] * dragging
 
-    lost, bend, acts = lost_error(p, target, target - q_m, features)
+    lost, bend, acts = lost_error(p, target, target - q_m, features, step)
     e, heeded = target - q_m - lost, 1.0 - bend
     now = p["kp"] * e - p["kd"] * v_d
     pd = p["kp"] * (e - heeded * dt * v_m) - p["kd"] * v_next
@@ -322,7 +385,7 @@ def servo(
     damping = efficiency * damping
     on_drive = efficiency * blend * on_drive
 
-    beside, by_position, by_speed = parasitic_torque(p, q, v_drive, features)
+    beside, by_position, by_speed = parasitic_torque(p, q, v_drive, features, step)
     stiffness, drag = np.maximum(0.0, -by_position), np.maximum(0.0, -by_speed)
     applied = applied + beside - stiffness * dt * v
     damping = damping + stiffness * dt + drag
@@ -335,7 +398,7 @@ def servo(
     applied = applied + p["standin_constant"] + pull * q + brake * v - spring * dt * v
     damping = damping + spring * dt + np.maximum(0.0, -brake)
 
-    own = friction_factor * dry_friction(p, q, v_drive, last, outside, features)
+    own = friction_factor * dry_friction(p, q, v_drive, last, outside, features, step)
     level = base_frictionloss + own
     grease = friction_factor * viscous(p, v_drive, features)
 
@@ -384,10 +447,10 @@ def servo(
         if play
         else base_armature
     )
-    return out | {
+    kept = {name: np.asarray(value) for name, value in step.memory.items()}
+    return out | kept | {
         "torque": motor_now,
         "dof_armature": armature,
-        "filtered": filtered,
         "rotor": rotor_q,
         "integral": integral,
         "taken": taken,

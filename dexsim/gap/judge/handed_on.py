@@ -12,7 +12,15 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
-from dexsim.actuator.reference import dry_friction, lagged, lost_error, parasitic_torque, torque_along, viscous
+from dexsim.actuator.reference import (
+    dry_friction,
+    lagged,
+    lost_error,
+    over_time,
+    parasitic_torque,
+    torque_along,
+    viscous,
+)
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.plant.case import Case, true_motion
@@ -297,7 +305,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     cmd = r.command_at(t - p("delay"))[:, j]
     columns = {n: row[i] for n, i in INDEX.items()}
     error = cmd - shown[1]
-    lost, _, acts = lost_error(columns, cmd, error, KINDLESS)
+    lost, _, acts = over_time(lost_error, columns, t, cmd, error, features=KINDLESS)
     damped = p("kd") * shown[2]
     asked = np.where(acts > 1.5, p("kp") * (error - lost) - damped, np.where(acts > 0.5, -damped, 0.0))
     supply = s("supply") if plant.voltage else 1.0
@@ -305,7 +313,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     if p("lag") > 0:
         motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
     slope = 0.05 * max(case.scales.speed, 1e-9)
-    beside, _, _ = parasitic_torque(columns, q, v)
+    beside, _, _ = over_time(parasitic_torque, columns, t, q, v)
     inertia = s("inertia") * p("inertia_scale") + p("armature")
     turned = q - shown[1]  # the model was evaluated at the measured pose
     gravity = s("gravity_cos") * np.cos(turned) + s("gravity_sin") * np.sin(turned)
@@ -314,7 +322,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
     )
-    level = dry_friction(columns, q, v, motor, inertia * a - needed) + case.constants.friction
+    level = over_time(dry_friction, columns, t, q, v, motor, inertia * a - needed) + case.constants.friction
     friction = (
         level * np.sign(v)
         + 0.5 * p("friction_asymmetry") * level

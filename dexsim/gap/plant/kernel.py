@@ -17,11 +17,13 @@ from functools import cache
 import warp as wp
 
 from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
+from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
     arrived,
     difference,
     dry_friction,
     encoder_error,
+    heard_speed,
     hold,
     lag_share,
     load_share,
@@ -46,6 +48,7 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
 encoder = encoder_error(frozenset(SERVO_FEATURES))
+hears = heard_speed(frozenset(SERVO_FEATURES), skips=True)
 lost = lost_error(frozenset(SERVO_FEATURES))
 dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
@@ -67,9 +70,7 @@ P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, 
         "rotor", "sag",
     )
 )  # fmt: skip
-P_COUPLING, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
-    INDEX[n] for n in ("coupling", "speed_lag", "bias", "feedback_delay", "limit_speed")
-)
+P_COUPLING, P_BIAS, P_AGE, P_LIMITSPEED = (INDEX[n] for n in ("coupling", "bias", "feedback_delay", "limit_speed"))
 X = SERIES_INDEX
 XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
     X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
@@ -99,6 +100,9 @@ P_MOTORSHARE = INDEX["motor_share"]
 P_STAGES = INDEX["lag_stages"]
 P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
+
+
+Memory = wp.types.vector(length=len(MEMORY), dtype=f64)
 
 
 @wp.struct
@@ -145,8 +149,6 @@ class Guess:  # the columns of one guess that every step asks for
     offset: f64
     delay: f64
     dt: f64  # of a sub-step
-    speed_lag: f64
-    filter: f64  # share of its way that kd's filter goes in a sub-step
     age: f64
     ki: f64
     beyond: bool  # the controller has more terms than the PD
@@ -202,7 +204,7 @@ class State:  # of the joint
     vm: f64
     last: f64  # motor torque
     stage: f64  # the same before the second stage of its lag
-    v_f: f64  # the speed after kd's filter
+    memory: Memory  # what the drive's laws remember (`columns.MEMORY`)
     taken: f64  # share of the dry friction that is taken up
     integral: f64  # the controller's integral term
     since: f64  # s, since it was taken
@@ -265,7 +267,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.read_offset = c.params[h, P_READOFFSET]
     p.offset = c.params[h, P_OFFSET]
     p.delay = c.params[h, P_DELAY]
-    p.speed_lag = c.params[h, P_SPEEDLAG]
     p.age = c.params[h, P_AGE]
     p.ki = c.params[h, P_KI]
     p.steep = c.params[h, P_BRAKING]
@@ -278,7 +279,6 @@ def guess(c: Recorded, h: int, dt: f64):
         p.dt = dt / f64(TWO_BODY_STEPS)
     p.staged = c.params[h, P_STAGES] > f64(1.5)
     p.lag = lag_share(c.params[h, P_LAG] / c.params[h, P_STAGES], p.dt)
-    p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
     p.thins = c.params[h, P_THINS]
@@ -692,12 +692,10 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
             v_l = v_drive
     seen = shown(c.params[h], q_l, p)
     shows = seen[1]
-    if x.fresh != zero or p.speed_lag <= zero:
-        x.v_f = v_l
-    else:
-        x.v_f += p.filter * (v_l - x.v_f)
+    fresh = x.fresh != zero
+    heard, kept = hears(c.params[h], v_l, x.memory, fresh, dt)
     e = n.target - seen[0] + p.age * shows * v_l  # a sampled loop acts on where the joint was
-    rate = shows * x.v_f
+    rate = shows * heard[0]
 
     load = n.gravity_cos
     if not p.slide:
@@ -709,7 +707,7 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     if by_gear and (n.held or x.fresh != zero):
         x.borne = load
 
-    beside = parasitic(c.params[h], x.q, v_drive)
+    beside, kept = parasitic(c.params[h], x.q, v_drive, kept, fresh, dt)
     drag = wp.max(zero, -beside[2])  # what of it brakes is taken at the end of the step
     grease = p.viscous * n.friction  # at the speed of the step's begin
     if p.thins > zero:
@@ -734,7 +732,8 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
-    u = pd(e, lost(c.params[h], n.target, e), rate, rate, rate, shows, p.kp, p.kd, step, p.age, f64(1.0))
+    off, kept = lost(c.params[h], n.target, e, kept, fresh, dt)
+    u = pd(e, off, rate, rate, rate, shows, p.kp, p.kd, step, p.age, f64(1.0))
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
     limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
@@ -786,7 +785,8 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     applied = n.efficiency * t.end
     applied += beside[0]
     applied += p.bias
-    parts = dry(c.params[h], x.q, v_drive, before, p.bias - load, p.carries, f64(1.0))
+    parts, kept = dry(c.params[h], x.q, v_drive, before, p.bias - load, p.carries, f64(1.0), kept, fresh, dt)
+    x.memory = kept
     level = (parts[0] + parts[1] + (parts[2] + parts[3])) * n.friction
     if by_gear:
         level += borne_friction(x.borne, v_drive, p) * n.friction
@@ -828,7 +828,6 @@ def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
         x.v += c.inits[h, 1]
     x.qm = x.q
     x.vm = x.v
-    x.v_f = x.v
     x.fresh = f64(1.0)
     return x
 
