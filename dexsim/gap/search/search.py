@@ -12,6 +12,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.gap import compute
+from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
@@ -31,6 +32,7 @@ class JointSelection(JointScan):
     def run(self, shortlist: int = 6) -> Outcome:
         """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
         self.fitted: dict[frozenset, Trial] = {}
+        self.first_laws: dict[tuple[str, str], Variant] = {}  # by effect and the label of one of its laws
         none = self.start()
         self.none_loss = self._left(none)
         self._on(0.1)
@@ -456,12 +458,19 @@ class JointSelection(JointScan):
         others kept beside it, so that intervals hold what the law is not known to be."""
         for i, member in enumerate(current.members):
             tries = [current]
-            for variant in member.variant.by_law():
+            for variant in self._laws_of(member):
                 members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
                 tries.append(self.fit(members, self._values(current), current, quick=True))
             current = min(tries, key=self._score)
             self.by_law[member.id] = tries
         return current
+
+    def _laws_of(self, member: Member) -> list[Variant]:
+        """The other laws of a hypothesis' effect, the first among them where a later one has taken its place."""
+        first = self.first_laws.get((member.id, member.variant.label), member.variant)
+        laws = [first, *first.by_law()]
+        self.first_laws |= {(member.id, v.label): first for v in laws}
+        return [v for v in laws if v.label != member.variant.label]
 
     def _overtaken(
         self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]
