@@ -645,14 +645,20 @@ def test_a_joint_must_shake_in_some_windows():
     made, rings = shaking.Shaking, SimpleNamespace(effect=SimpleNamespace(rings=True))
     outcome = SimpleNamespace(none="none", best=SimpleNamespace(members=(rings,)))
     try:
-        for count, told in ((2, False), (3, True)):
-            shaking.Shaking = lambda *_, count=count: SimpleNamespace(
-                quiet=1e-3,
-                loud=np.ones(count, bool),
-                rung=np.zeros(count, bool),
-                of=lambda t: np.full(count, 9.0 if t == "none" else 1.0),
-            )
-            assert (shaking.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, count
+        # in what was fitted, in what was kept out, of which one must shake
+        for fitted, kept, told in ((1, 1, False), (2, 1, True), (1, 2, True), (4, 0, False)):
+
+            def counted(search, none, runs=None, *_, fitted=fitted, kept=kept):
+                count = kept if runs else fitted
+                return SimpleNamespace(
+                    quiet=1e-3,
+                    loud=np.ones(count, bool),
+                    rung=np.zeros(count, bool),
+                    of=lambda t: np.full(count, 9.0 if t == "none" else 1.0),
+                )
+
+            shaking.Shaking = counted
+            assert (shaking.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, (fitted, kept)
     finally:
         shaking.Shaking = made
 

@@ -154,7 +154,8 @@ class SearchRules:
     )
     shaking: int = _rule(
         3,
-        "windows of a second in which a joint must shake for that to tell of an effect",
+        "windows of a second in which a joint must shake for that to tell of an effect; one of them kept out where it "
+        "is judged",
         "of fewer windows more than one bootstrap in 20 draws none; one that rings does in five of six",
         "test_a_joint_must_shake_in_some_windows",
     )

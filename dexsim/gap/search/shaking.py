@@ -251,7 +251,8 @@ def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict
     if not fitted.loud.any():
         return 0.0
     shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
-    if (shaking.loud | shaking.rung).sum() < SEARCH.shaking:
+    # what is kept out is a part of the recordings: one stretch of it bears out what several of the others show
+    if not shaking.loud.any() or sum((x.loud | x.rung).sum() for x in (fitted, shaking)) < SEARCH.shaking:
         return 0.0
     before, after = (float(shaking.of(t).sum()) for t in (outcome.none, outcome.best))
     return max(1.0 - after / before, 0.0)
