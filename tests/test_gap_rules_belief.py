@@ -70,11 +70,11 @@ def test_a_joint_that_rings_is_not_noisy():
     assert restless(8.0, 0.15, speed=1.0) is None  # readings whose times vary are noisier where it moves faster
 
 
-def rattling(loud: float, swings: float) -> float | None:
+def rattling(loud: float, swings: float, others: float = 0.3) -> float | None:
     """What `usual_noise` says of the last of four joints with noise of 1 mrad, which scatters by `loud` times as much:
-    a share `swings` of its square by swings of 31 Hz, the rest as white noise does."""
+    a share `swings` of its square by swings of 31 Hz, the rest as white noise does. others: rad that they move."""
     rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
-    q = 0.3 * np.sin(0.4 * t)[:, None] + 1e-3 * rng.normal(size=(2000, 4))
+    q = np.outer(np.sin(0.4 * t), [others, others, others, 0.3]) + 1e-3 * rng.normal(size=(2000, 4))
     more = np.sqrt(loud**2 - 1) * 1e-3
     q[:, 3] += more * np.sqrt(1 - swings) * rng.normal(size=2000)
     q[:, 3] += more * np.sqrt(2 * swings) * np.sin(2 * np.pi * 31.0 * t + 0.2)
@@ -85,6 +85,7 @@ def test_a_joint_that_rings_all_the_time_has_the_others_noise():
     rings = rattling(4.0, 1.0)
     assert rings is not None and np.isclose(rings, 1e-3, rtol=0.1)
     assert rattling(2.0, 1.0) is None  # not so much noisier
+    assert rattling(4.0, 1.0, others=0.1) is None  # a joint that hardly moves tells nothing of one that does
     assert rattling(4.0, 0.0) is None  # a worse sensor: its noise is white
     assert rattling(4.0, 0.15) is None and rattling(4.0, 0.3) is not None
 

@@ -142,16 +142,24 @@ def usual_noise(runs: Sequence[Run], j: int, own: float) -> float | None:
     None where it does not seem to. own: by its samples.
 
     A joint that rings without a pause shows no noise of its own. It scatters by far more than the others of its
-    machine (`BELIEF.noisier`), and not as white noise does (`BELIEF.coloured`), by the third differences of its
-    readings, in which a slow motion is nothing."""
+    machine that move as far (`BELIEF.noisier`; readings whose times vary are noisier where a joint moves), and not as
+    white noise does (`BELIEF.coloured`), by the third differences of its readings, in which a slow motion is
+    nothing."""
     apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
     if np.abs(apart).max() < BELIEF.coloured:
         return None
-    others = [k for k in range(runs[0].q.shape[1]) if k != j]
+    ways = np.mean([_way(r.t, r.q) for r in runs], 0)
+    others = [k for k, way in enumerate(ways) if k != j and way > 0.5 * ways[j]]
     if len(others) < FEWEST_OTHERS:
         return None
     usual = float(np.median([_of_recordings(runs, [noise(r.t, r.q[:, k])[0] for r in runs]) for k in others]))
     return usual if own > BELIEF.noisier * usual else None
+
+
+def _way(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[J] how far joints with positions q [S, J] at t [S] s go in half a second, in the mean."""
+    later = np.minimum(np.searchsorted(t, t + HALF_SECOND), len(t) - 1)
+    return np.abs(q[later] - q).mean(0)
 
 
 def _coloured(x: np.ndarray) -> np.ndarray:
