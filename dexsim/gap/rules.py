@@ -147,7 +147,7 @@ class SearchRules:
         "test_a_small_change_of_temperature_tells_nothing",
     )
     loud: float = _rule(
-        5.0,
+        3.0,
         "x how much a joint shakes in its quietest stretch, and simulated without any effect: it shakes by itself",
         "between 1.7, the most of joints with friction, play, delay or ripple, and 9.6, the least of one that rings",
         "test_a_joint_shakes_that_is_far_louder_than_at_its_quietest",
@@ -585,9 +585,10 @@ class BeliefRules:
     )
     noisier: float = _rule(
         2.5,
-        "x the usual noise of the other joints of a machine: a joint that scatters by more, and not as white noise, "
-        "rings all the time",
-        "between 1.5, the most of a joint beside one that rings, and 6, the least of two that ring all the time",
+        "x the usual noise of the other joints of a machine: a joint that scatters by more, and not as white noise or "
+        "its motor's torque by as much more again, rings all the time",
+        "between 2.2, the most of a joint beside one that rings, and 3.8, the least of four that ring all the time; of "
+        "the torque they have 4.8 or more",
         "test_a_joint_that_rings_all_the_time_has_the_others_noise",
     )
     coloured: float = _rule(

@@ -137,23 +137,34 @@ def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray]], quantum: float
 WHITE = (0.3, -0.05, 0.0)
 
 
-def usual_noise(runs: Sequence[Run], j: int, own: float) -> float | None:
+def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> float | None:
     """Standard deviation of the measurement noise of joint j, if it rings all the time, by the other joints' encoders;
-    None where it does not seem to. own: by its samples.
+    None where it does not seem to. own: by its samples; limits [J]: of the drives' torque.
 
     A joint that rings without a pause shows no noise of its own. It scatters by far more than the others of its
     machine that move as far (`BELIEF.noisier`; readings whose times vary are noisier where a joint moves), and not as
-    white noise does (`BELIEF.coloured`), by the third differences of its readings, in which a slow motion is
-    nothing."""
-    apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
-    if np.abs(apart).max() < BELIEF.coloured:
-        return None
+    a worse sensor does: its readings are not white (`BELIEF.coloured`), by their third differences, in which a slow
+    motion is nothing, or where it rings too fast for that, its motor's torque scatters by even more than they do."""
     ways = np.mean([_way(r.t, r.q) for r in runs], 0)
     others = [k for k, way in enumerate(ways) if k != j and way > 0.5 * ways[j]]
     if len(others) < FEWEST_OTHERS:
         return None
     usual = float(np.median([_of_recordings(runs, [noise(r.t, r.q[:, k])[0] for r in runs]) for k in others]))
-    return usual if own > BELIEF.noisier * usual else None
+    if own <= BELIEF.noisier * usual:
+        return None
+    apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
+    rings = np.abs(apart).max() >= BELIEF.coloured or _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual
+    return usual if rings else None
+
+
+def _torque_scatter(runs: Sequence[Run], j: int, others: Sequence[int], limits: np.ndarray) -> float:
+    """By how much the logged torque of joint j scatters, x what those of others do, each as a part of its drive's
+    limit; 0 where it is not logged."""
+    torques = [(r.t, r.torque) for r in runs if r.torque is not None and np.isfinite(r.torque[:, [j, *others]]).all()]
+    if not torques:
+        return 0.0
+    each = [np.median([noise(t, torque[:, k])[0] for t, torque in torques]) / limits[k] for k in (j, *others)]
+    return float(each[0] / np.median(each[1:]))
 
 
 def _way(t: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -356,7 +367,7 @@ def _case(
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
     quiet = quiet_noise([(runs[i].t, runs[i].q[:, j]) for i in told], quantum)
     sigma = min(sigma, quiet) if quiet is not None else sigma
-    usual = usual_noise([runs[i] for i in told], j, sigma)
+    usual = usual_noise([runs[i] for i in told], j, sigma, rows[0][:, SERVO_INDEX["torque_limit"]])
     sigma = min(sigma, usual) if usual is not None else sigma
 
     def series(name: str) -> np.ndarray:
