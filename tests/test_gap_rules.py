@@ -709,7 +709,7 @@ def test_a_law_that_training_lacks_must_explain_far_more():
 
     law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), instead=True)
     other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
-    for before, after, taken in ((10.0, 4.0, True), (10.0, 6.0, False), (1.5, 0.1, False)):
+    for before, after, taken in ((10.0, 4.0, True), (10.0, 6.0, False), (1.5, 0.1, False), (2.0, 1.2, True)):
         search = Beside(lambda ids, a=after, b=before: (a if "load_friction" in ids else b,) * 2)
         search.allowed, search.case.scales = None, None
         current = search.fit((Member(EFFECTS["coulomb_friction"], replace(law, instead=False)),))

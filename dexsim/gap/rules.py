@@ -107,10 +107,10 @@ class SearchRules:
     )
     instead: float = _rule(
         0.5,
-        "share of what likenesses leave on what was left out that a law which training has less exactly may leave in "
-        "their place",
-        "between 0.011, where that law is the true one, and 1.46, the less of two where another friction and a late "
-        "drive are: what training can be given goes before what explains a little more",
+        "share of what likenesses leave beyond the noise, on what was left out, that a law which training has less "
+        "exactly may leave in their place",
+        "between 0.16, the most of three where that law is the true one, and 1.5, the less of two where another "
+        "friction and a late drive are: what training can be given goes before what explains a little more",
         "test_a_law_that_training_lacks_must_explain_far_more",
     )
     most: int = _rule(

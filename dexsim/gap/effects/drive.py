@@ -372,6 +372,8 @@ class Deadband(Effect):
     shows = "at small errors"
     experiment = "small steps of increasing size"
     classes = ("friction or dead zone",)  # counted from its edge it is a friction's torque while the joint lags behind
+    kinds = 3
+    every_kind = True  # the slopes of one say little of another: that counted from its edge pulls to where it ends
     demo = {"deadband": 0.03}
 
     def variants(self, s: Scales) -> list[Variant]:

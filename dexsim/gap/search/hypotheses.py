@@ -514,20 +514,21 @@ class JointHypotheses:
 
     def _shrunk(self, trial: Trial) -> bool:
         """Whether an effect was fitted down to the size at which it begins: what it gained is another's."""
+        return any(self._nothing_of(m, trial) for m in trial.members)
+
+    def _nothing_of(self, m: Member, trial: Trial) -> bool:
+        """Whether a member of a trial was fitted down to the size at which it begins."""
         at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
-        for m in trial.members:
-            first = m.variant.params[0]
-            # of a friction with load one direction may have none
-            sizes = [p for p in m.variant.params if p.key.startswith(first.key)]
-            others = [p for p in m.variant.params if p.key in m.effect.also_sizes]
-            if (
-                first.mode == "set"
-                and first.start == first.low
-                and all(at[f"{m.id}.{p.key}"] <= p.low + 1e-3 * p.span for p in sizes)
-                and all(abs(at[f"{m.id}.{p.key}"] - p.start) <= 1e-3 * p.span for p in others)
-            ):
-                return True
-        return False
+        first = m.variant.params[0]
+        # of a friction with load one direction may have none
+        sizes = [p for p in m.variant.params if p.key.startswith(first.key)]
+        others = [p for p in m.variant.params if p.key in m.effect.also_sizes]
+        return (
+            first.mode == "set"
+            and first.start == first.low
+            and all(at[f"{m.id}.{p.key}"] <= p.low + 1e-3 * p.span for p in sizes)
+            and all(abs(at[f"{m.id}.{p.key}"] - p.start) <= 1e-3 * p.span for p in others)
+        )
 
     def _here(self, trial: Trial) -> float:
         """Mean square where it was fitted, with what the beliefs give for it."""

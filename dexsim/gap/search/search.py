@@ -87,7 +87,11 @@ class JointSelection(JointScan):
                 # a pair may be there where neither of its halves is seen alone
                 best = current if enough or self.deadline.over() else self._pair(current, listed[:3]) or current
                 if best is current:
-                    break
+                    instead = self._in_its_place(trials, current)
+                    if instead is current:
+                        break
+                    current = instead
+                    continue
             rest, last = best.members[:-1], best.ids[-1]
             forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
             current, level = best, trials
@@ -372,6 +376,23 @@ class JointSelection(JointScan):
                     best = trial
         return best, level
 
+    def _in_its_place(self, trials: Sequence[Trial], current: Trial) -> Trial:
+        """What was added in the place of what was fitted down to nothing beside it, which had only looked like it;
+        `current` where no trial that follows far better has such a member."""
+        for trial in sorted(trials, key=lambda t: t.fit.loss):
+            if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or self.deadline.over():
+                break
+            kept = [k for k, m in enumerate(trial.members) if not self._nothing_of(m, trial)]
+            if not 0 < len(kept) < len(trial.members) or len(trial.members) - 1 not in kept:
+                continue
+            sizes = np.cumsum([len(m.variant.params) for m in trial.members])[:-1]
+            values = np.split(self._values(trial), sizes)
+            alone = self.fit(tuple(trial.members[k] for k in kept), np.concatenate([values[k] for k in kept]), trial)
+            lasts = self._left(alone).sum() < (1 - SEARCH.least) * self._left(current).sum()
+            if lasts and not self._shrunk(alone):
+                return alone
+        return current
+
     def _drop(self, current: Trial) -> Trial:
         """Members that no longer earn their place are let go."""
         changed = True
@@ -416,13 +437,13 @@ class JointSelection(JointScan):
 
     def _instead(self, current: Trial) -> Trial:
         """The members that are confused with an effect replaced by a law of it that training has less exactly
-        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it.
+        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of what is more.
 
         Asked too in the place of what is confused with their likes: before that law is tried, which of several
         imitations follows best (dry friction, or one that falls off with speed) is an accident, and what it lacks
         seems to be others."""
-        mine = self._left(current).sum()
-        if mine < SEARCH.unsettled * len(self.blocks):
+        mine, noise = self._left(current).sum(), float(len(self.blocks))
+        if mine < SEARCH.unsettled * noise:
             return current
         best, count = current, range(len(current.members))
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
@@ -449,7 +470,8 @@ class JointSelection(JointScan):
                     ]
                     trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
                     left = self._left(trial).sum()
-                    if left < SEARCH.instead * mine and left < self._left(best).sum() and not self._shrunk(trial):
+                    far_more = left - noise < SEARCH.instead * (mine - noise)
+                    if far_more and left < self._left(best).sum() and not self._shrunk(trial):
                         best = trial
         return best if best is current else self._drop(best)  # what made up for the imitations may not be needed
 
