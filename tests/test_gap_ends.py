@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read import Run, inputs
 
 XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/>
@@ -64,3 +66,16 @@ def test_an_end_met_only_in_what_is_kept_out_is_neither_used_nor_judged():
     assert (held.q[~inside, 0] > -1.03 + 0.01).all() and inside.mean() < 0.35
     inputs.used_end_stops(model, [held])  # the same end, shown to the fit: nothing is unforeseen about it
     assert inputs.unforeseen_end_stops(model, [held]) == {}
+
+
+@pytest.mark.parametrize(
+    "column, value", [("position_offset", 0.5), ("position_offset", -0.5), ("position_scale", 0.7)]
+)
+def test_no_end_is_where_a_joint_was_recorded_to_be(column, value):
+    """An encoder that misreads shows a joint, about a hinge that gravity does not turn, within its range: a loop that
+    goes by it moves the joint as without, to where the model has a stop (an error of scale but for its gains)."""
+    plant = build(model_of(more=' range="-1.6 1.6" limited="true"'), [run_of(None)])[0].plant
+    rows = np.repeat(plant.base()[None], 2, 0)
+    rows[1, :, INDEX[column]] = value
+    sound, misread = plant.simulate(rows, plant.windows(None, [0], every_run=True))[0]
+    assert np.ptp(sound) > 2.9 and np.abs(misread - sound).max() < (1e-6 if column == "position_offset" else 0.1)

@@ -230,6 +230,18 @@ def test_a_joint_has_at_most_so_many_effects():
     assert len(search.run().best.ids) == 4
 
 
+@pytest.mark.parametrize("alone, found", [(2.0, ("deadband",)), (49.0, ("lag",))])
+def test_what_looked_like_an_effect_is_let_go_for_it(alone, found):
+    """Beside a dead zone the lag that was taken for it is fitted down to nothing."""
+    losses = {(): 100.0, ("lag",): 50.0, ("deadband", "lag"): 2.0, ("deadband",): alone}
+    search = Selecting(lambda ids: (losses[tuple(sorted(ids))],) * 2, ("lag", 0.0), ("deadband", 0.0))
+    search._shortlist = lambda scan, *_: scan[:1]  # the dead zone is not thought of at first
+    search._values = lambda trial: np.zeros(sum(len(m.variant.params) for m in trial.members))
+    search._nothing_of = lambda m, trial: m.id == "lag" and trial.ids == ("lag", "deadband")
+    search._shrunk = lambda trial: any(search._nothing_of(m, trial) for m in trial.members)
+    assert search.run().best.ids == found
+
+
 class Plainly(Selecting):
     """A selection whose scan offers nothing, beside a plain model that differs from what is believed by friction of
     both kinds; `fits` are the hypotheses that were tried, with the sizes they began at."""

@@ -153,8 +153,9 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     if own <= BELIEF.noisier * usual:
         return None
     apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
-    rings = np.abs(apart).max() >= BELIEF.coloured or _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual
-    return usual if rings else None
+    if np.abs(apart).max() >= BELIEF.coloured:
+        return usual
+    return usual if _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual else None
 
 
 def _torque_scatter(runs: Sequence[Run], j: int, others: Sequence[int], limits: np.ndarray) -> float:

@@ -312,8 +312,9 @@ def guess(c: Recorded, h: int, dt: f64):
     p.base_friction = c.consts[C_FRICTION]
     p.base_damping = c.consts[C_DAMPING]
     p.motor_share = c.params[h, P_MOTORSHARE]
-    p.low = c.consts[C_LOW]
-    p.high = c.consts[C_HIGH]
+    # what an encoder that misreads has shown lies within the range: no stop is where the joint was recorded to be
+    p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) / p.scale)
+    p.high = wp.max(c.consts[C_HIGH], (c.consts[C_HIGH] - p.offset) / p.scale)
     p.stop = c.consts[C_STIFF]
     return p
 
