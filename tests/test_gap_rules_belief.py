@@ -70,14 +70,17 @@ def test_a_joint_that_rings_is_not_noisy():
     assert restless(8.0, 0.15, speed=1.0) is None  # readings whose times vary are noisier where it moves faster
 
 
-def rattling(loud: float, swings: float, others: float = 0.3, torque: float | None = None) -> float | None:
+def rattling(loud: float, swings: float, others: float = 0.3, torque: float | None = None,
+             steady: bool = False) -> float | None:  # fmt: skip
     """What `usual_noise` says of the last of four joints with noise of 1 mrad, which scatters by `loud` times as much:
     a share `swings` of its square by swings of 31 Hz, the rest as white noise does. others: rad that they move; torque:
-    by how much its motor's torque scatters, x what theirs do, its limit being a half of theirs; None: not logged."""
+    by how much its motor's torque scatters, x what theirs do, its limit being a half of theirs; None: not logged;
+    steady: the rest is of swings of one size, each sample at another time of one."""
     rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
     q = np.outer(np.sin(0.4 * t), [others, others, others, 0.3]) + 1e-3 * rng.normal(size=(2000, 4))
     more = np.sqrt(loud**2 - 1) * 1e-3
-    q[:, 3] += more * np.sqrt(1 - swings) * rng.normal(size=2000)
+    rest = np.sqrt(2) * np.sin(rng.uniform(0, 2 * np.pi, 2000)) if steady else rng.normal(size=2000)
+    q[:, 3] += more * np.sqrt(1 - swings) * rest
     q[:, 3] += more * np.sqrt(2 * swings) * np.sin(2 * np.pi * 31.0 * t + 0.2)
     scatter = None if torque is None else rng.normal(size=(2000, 4)) * [2e-3, 2e-3, 2e-3, 1e-3 * torque]
     run = SimpleNamespace(name="a", t=t, q=q, torque=scatter)
@@ -94,6 +97,7 @@ def test_a_joint_that_rings_all_the_time_has_the_others_noise():
     # too fast for its samples: the motor shakes by far more than a noisy reading makes it shake
     assert rattling(4.0, 0.0, torque=12.0) is not None and rattling(4.0, 0.0, torque=8.0) is None
     assert rattling(2.0, 0.0, torque=12.0) is None
+    assert rattling(8.0, 0.0, steady=True) is not None and rattling(2.0, 0.0, steady=True) is None
 
 
 def test_a_belief_weighs_some_samples():

@@ -587,14 +587,20 @@ class BeliefRules:
         2.5,
         "x the usual noise of the other joints of a machine: a joint that scatters by more, and not as white noise or "
         "its motor's torque by as much more again, rings all the time",
-        "between 2.2, the most of a joint beside one that rings, and 3.8, the least of four that ring all the time; of "
-        "the torque they have 4.8 or more",
+        "between 2.2, the most of a joint beside one that rings, and 3.8, the least of five that ring all the time; of "
+        "the torque two of them have 4.8 or more",
         "test_a_joint_that_rings_all_the_time_has_the_others_noise",
     )
     coloured: float = _rule(
         0.19,
         "by how much the autocorrelation of third differences differs from white noise's where a joint rings",
         "between 0.13, the most of 44 joints that do not ring, and 0.25, the least of two that ring all the time",
+        "test_a_joint_that_rings_all_the_time_has_the_others_noise",
+    )
+    steady: float = _rule(
+        2.6,
+        "kurtosis of second differences below which what scatters is a swing of steady size, not noise",
+        "between 2.3, of one that rings all the time, and 3.2, the least of 36 joints that do not ring; a sine has 1.5",
         "test_a_joint_that_rings_all_the_time_has_the_others_noise",
     )
     ringing: float = _rule(

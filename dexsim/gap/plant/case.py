@@ -144,7 +144,8 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     A joint that rings without a pause shows no noise of its own. It scatters by far more than the others of its
     machine that move as far (`BELIEF.noisier`; readings whose times vary are noisier where a joint moves), and not as
     a worse sensor does: its readings are not white (`BELIEF.coloured`), by their third differences, in which a slow
-    motion is nothing, or where it rings too fast for that, its motor's torque scatters by even more than they do."""
+    motion is nothing, or where it rings too fast for that, they are those of a swing of steady size, which is seldom
+    at its middle (`BELIEF.steady`), or its motor's torque scatters by even more than they do."""
     ways = np.mean([_way(r.t, r.q) for r in runs], 0)
     others = [k for k, way in enumerate(ways) if k != j and way > 0.5 * ways[j]]
     if len(others) < FEWEST_OTHERS:
@@ -153,9 +154,19 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     if own <= BELIEF.noisier * usual:
         return None
     apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
-    if np.abs(apart).max() >= BELIEF.coloured:
+    if np.abs(apart).max() >= BELIEF.coloured or np.mean([_kurtosis(r.q[:, j]) for r in runs]) < BELIEF.steady:
         return usual
     return usual if _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual else None
+
+
+def _kurtosis(x: np.ndarray) -> float:
+    """Fourth moment over the square of the second of the second differences of a signal x [S], what is far out left
+    out; a normal distribution's where it is too short to tell."""
+    second = np.abs(np.diff(x, 2))
+    second = second[second < 4 * np.median(second) / 0.6745] if len(second) else second
+    if len(second) < FEWEST_SAMPLES * FEW:
+        return 3.0
+    return float(np.mean(second**4) / np.mean(second**2) ** 2)
 
 
 def _torque_scatter(runs: Sequence[Run], j: int, others: Sequence[int], limits: np.ndarray) -> float:
