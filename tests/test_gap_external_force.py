@@ -82,6 +82,7 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
         "unexplained": {"depends_on": []},
     }
     d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[])
+    d.ringing = frozenset()
     conclude.claim_push(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
     assert d.sentence.startswith("Joint elbow is pushed by something outside")

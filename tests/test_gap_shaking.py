@@ -122,7 +122,7 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
         "indistinguishable": [],
     }
 
-    def claimed(after: float, loss: float) -> list[str]:
+    def claimed(after: float, loss: float, ringing: frozenset[str] = frozenset()) -> list[str]:
         data = {
             "findings": [finding],
             "verdict": "explained",
@@ -133,6 +133,7 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
         outcome = SimpleNamespace(joint="elbow", best=SimpleNamespace(fit=SimpleNamespace(loss=loss)))
         joints = {"elbow": {"after": after, "sigma": 0.001}}
         d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints=joints, outcomes=[outcome])
+        d.ringing = ringing
         conclude.claim_push(d, [push])
         assert len(d.notes) == 1
         return [f["effect"] for f in d.data["findings"]]
@@ -140,6 +141,8 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
     assert claimed(0.0011, 1.1) == ["torque_ripple"]
     assert claimed(0.005, 1.1) == ["external_force"]  # what was kept out is not followed
     assert claimed(0.0011, 9.0) == ["external_force"]  # nor what was fitted
+    # nothing keeps step with a joint that rings by itself: what was found rings as it does
+    assert claimed(0.005, 9.0, frozenset(("elbow",))) == ["torque_ripple"]
 
 
 def test_a_reading_that_shakes_and_stands_by_chance_is_not_repeated():

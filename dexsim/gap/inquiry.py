@@ -135,6 +135,8 @@ class Diagnosis:
     untrained: list[str] = field(default_factory=list)
     confirmation: full_model.Confirmation | None = None
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
+    # joints that ring by themselves, as what was found of them does in what was kept out
+    ringing: frozenset[str] = frozenset()
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:

@@ -80,6 +80,7 @@ def into_diagnosis(
             d.curves.append(curve)
     d.spots = locate.control([x for a in answers for x in a.spots])
     rings = {a.case.joint: x for a in answers if (x := _rings(a)) > SEARCH.least}
+    d.ringing = frozenset(rings)
     refuted = _take_back(d, answers, findings, rings)
     if noise.how == "repeats":
         found = [a for a in answers if a.found and a.case.joint not in refuted]
@@ -410,8 +411,8 @@ def _followed(d: Diagnosis, joint: str) -> bool:
 def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
     """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
     motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was kept out,
-    by what was found of it: nothing is left that could push."""
-    followed = {p.joint for p in pushes if not p.cut and _followed(d, p.joint)}
+    by what was found of it, nor of one that rings by itself as that does: nothing is left that could push."""
+    followed = {p.joint for p in pushes if not p.cut and (p.joint in d.ringing or _followed(d, p.joint))}
     d.notes += [
         f"{joint}: its torque fits no inertia, gravity or friction, but what was found does: nothing from outside "
         "pushes it"
