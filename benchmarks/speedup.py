@@ -1,6 +1,6 @@
 """From physics to a trained policy in one run: dexsim's own kernels beside MuJoCo-Warp's, and what a task then takes.
 
-    python -m benchmarks.speedup [worlds=8192,32768] [parts=physics,learning,grasp,rotate] [limit_s=900]
+    python -m benchmarks.speedup [worlds=8192,32768] [parts=physics,learning,grasp,rotate] [limit_s=1200]
                                  [grasp_s=150] [rotate_s=205] [episodes=2048] [mjlab=PYTHON] [out=out/speedup]
                                  [any setting of train.py]
 
@@ -46,7 +46,7 @@ class Run:
             {
                 "worlds": "8192,32768",
                 "parts": ",".join(PARTS),
-                "limit_s": "900",
+                "limit_s": "1200",
                 "grasp_s": "150",
                 "rotate_s": "205",
                 "episodes": "2048",
