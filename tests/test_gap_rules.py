@@ -141,6 +141,13 @@ def test_the_short_list_asks_a_price():
         assert bool(Made()._shortlist([row(0.5, price)], 6, loss, ())) is tried, (price, loss)
 
 
+def test_every_kind_of_a_dead_zone_is_tried():
+    """Slopes at one say little of another; of other effects a short list holds one or two."""
+    scan = [row(0.9, 0.0), *(row(0.8 - 0.1 * k, 0.0, "deadband") for k in range(3)), row(0.2, 0.0)]
+    ids = [x[2].id for x in Made()._shortlist(scan, 2, 20.0, ())]
+    assert ids == ["lag", "deadband", "deadband", "deadband"] + ["lag"] * (EFFECTS["lag"].kinds - 1)
+
+
 def test_within_the_noise_nothing_is_looked_for_nearby():
     search = Made()
     assert (
