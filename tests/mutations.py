@@ -273,6 +273,41 @@ MUTATIONS = (
         '0.0,\n        "share of the error kept out that a name must cost',
         "tests/test_gap_rules.py::test_a_stand_in_must_take_a_least_share_off",
     ),
+    Mutation(
+        "a joint whose ringing is explained is said to be pushed",
+        "dexsim/gap/judge/conclude.py",
+        "(p.joint in d.ringing or _followed(d, p.joint))",
+        "_followed(d, p.joint)",
+        "tests/test_gap_shaking.py::test_what_is_followed_to_the_noise_is_not_pushed",
+    ),
+    Mutation(
+        "a joint that rings as white as noise is noisy, whatever its torque does",
+        "dexsim/gap/plant/case.py",
+        "return usual if _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual else None",
+        "return None",
+        "tests/test_gap_rules_belief.py::test_a_joint_that_rings_all_the_time_has_the_others_noise",
+    ),
+    Mutation(
+        "the model's stops stand where a misread joint was recorded to be",
+        "dexsim/gap/plant/kernel.py",
+        "p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) / p.scale)",
+        "p.low = c.consts[C_LOW]",
+        "tests/test_gap_ends.py::test_no_end_is_where_a_joint_was_recorded_to_be",
+    ),
+    Mutation(
+        "what hid an effect keeps its place",
+        "dexsim/gap/search/search.py",
+        "instead = self._in_its_place(trials, current)",
+        "instead = current",
+        "tests/test_gap_rules.py::test_what_looked_like_an_effect_is_let_go_for_it",
+    ),
+    Mutation(
+        "of a dead zone one kind is tried",
+        "dexsim/gap/effects/drive.py",
+        "    kinds = 3\n",
+        "",
+        "tests/test_gap_rules.py::test_every_kind_of_a_dead_zone_is_tried",
+    ),
 )
 
 
