@@ -14,8 +14,8 @@ import warp as wp
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
 from dexsim.actuator.columns import FEATURES, INDEX, MEMORY, column
 from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS
+from dexsim.actuator.reference import Step, command_delay, target_in_force, target_rates
 from dexsim.actuator.reference import servo as servo_reference
-from dexsim.actuator.reference import target_in_force, target_rates
 from dexsim.errors import UserError
 from dexsim.sim import make_engine
 
@@ -188,9 +188,13 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     servo.before_each()
 
     stamps, targets = np.split(state[..., slots["stamp0"] : slots["stamp0"] + 2 * queue], 2, axis=-1)
-    target = target_in_force(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt)
-    known = {name: state[..., slots[name]] for name in EXTRA_SLOTS if name not in MEMORY} if extra else {}
+    by_name = {name: params[..., i] for name, i in INDEX.items()}
     kept = {name for c in COLUMNS if c.feature in features for name in c.remembers}
+    step = Step(engine.dt, state[..., slots["fresh"]] != 0 if extra else True)
+    step.memory |= {name: state[..., slots[name]] for name in kept}
+    delay = command_delay(by_name, 1.0, features, step)
+    target = target_in_force(1.0, stamps, targets, delay, engine.dt)
+    known = {name: state[..., slots[name]] for name in EXTRA_SLOTS if name not in MEMORY} if extra else {}
     source = np.clip(params[..., INDEX["coupling_from"]].astype(int), 0, j - 1)
     expected = servo_reference(
         params,
@@ -202,11 +206,11 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         features=features,
         base_armature=armature,
         **known,
-        memory={name: state[..., slots[name]] for name in kept},
+        memory={name: step.memory[name] for name in kept},
         dragging=np.take_along_axis(q - home, source, 1),
         others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
         loop_motor=np.array([False, True, False]),
-        rates=target_rates(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt),
+        rates=target_rates(1.0, stamps, targets, delay, engine.dt),
         outside=outside,
         last=state[..., slots["motor"]],
         enabled=state[..., slots["enabled"]],

@@ -27,8 +27,9 @@ class Column:
 
     feature: the part of the servo's kernel that has its law and is compiled in only where a drive asks for it; empty:
     all servos have it. asks: whether a value other than the neutral one asks for that part; False where the column says
-    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`). remembers: the
-    numbers that its law keeps from one step to the next (`MEMORY`), in units of its own; it needs a feature."""
+    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`). delays: it is part
+    of a command's delay [s], at most what it says (`DELAYS`). remembers: the numbers that its law keeps from one step
+    to the next (`MEMORY`), in units of its own; it needs a feature."""
 
     name: str
     unit: str
@@ -40,6 +41,7 @@ class Column:
     feature: str = ""
     asks: bool = True
     encoder: bool = False
+    delays: bool = False
     remembers: tuple[str, ...] = ()
 
 
@@ -96,7 +98,7 @@ COLUMNS: tuple[Column, ...] = (
         feature="braking",
     ),
     Column("efficiency", "1", 1.0, 0.0, 2.0, 0.3, "eta: torque at the joint over motor torque"),
-    Column("delay", "s", 0.0, 0.0, 0.5, 0.02, "time from a target being sent to the servo acting on it"),
+    Column("delay", "s", 0.0, 0.0, 0.5, 0.02, "time from a target being sent to the servo acting on it", delays=True),
     Column("lag", "s", 0.0, 0.0, 1.0, 0.02, "time constant of a first-order lag on the motor torque"),
     Column("supply", "1", 1.0, 0.05, 2.0, 0.3, "supply voltage over nominal: scales the no-load speed (and the duty)"),
     # Friction of motor and gear, at the joint.
@@ -400,6 +402,8 @@ FEATURE_OF: dict[str, str] = {name: feature for feature, names in FEATURES.items
 ENCODER: frozenset[str] = frozenset(c.name for c in COLUMNS if c.encoder)
 """Columns of what an encoder shows beyond its scale and offset (`laws.encoder_error`)."""
 
+DELAYS: tuple[str, ...] = tuple(c.name for c in COLUMNS if c.delays)
+"""Columns [s] that a command's delay is at most the sum of (`laws.command_delay`)."""
 
 MEMORY: dict[str, int] = {name: i for i, name in enumerate(n for c in COLUMNS for n in c.remembers)}
 """What the laws of drives keep from step to step, each number with its place: slots of the same names in a servo's

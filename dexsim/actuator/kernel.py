@@ -50,10 +50,15 @@ import warp as wp
 
 from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY
 from dexsim.actuator.laws import (
+    amplifier,
     arrived,
+    command_delay,
     difference,
+    dragged_target,
     dry_friction,
     encoder_error,
+    encoder_memory,
+    friction_acts,
     heard_speed,
     hold,
     lag_share,
@@ -63,7 +68,7 @@ from dexsim.actuator.laws import (
     pd,
     preslide,
     preslide_slope,
-    sagging,
+    supply_left,
     torque_limits,
     transmission,
     transmission_damping,
@@ -93,20 +98,17 @@ SNAP = 1.0e-3  # parts of a step shorter than this are rounding of the clock
 WHOLE = 1.0 - SNAP
 
 KP, KD = INDEX["kp"], INDEX["kd"]
-TORQUE_LIMIT, NO_LOAD_SPEED = INDEX["torque_limit"], INDEX["no_load_speed"]
-EFFICIENCY, DELAY, LAG_TIME, SUPPLY = INDEX["efficiency"], INDEX["delay"], INDEX["lag"], INDEX["supply"]
-VISCOUS, ASYMMETRY = INDEX["viscous_friction"], INDEX["friction_asymmetry"]
+LAG_TIME, SUPPLY, VISCOUS = INDEX["lag"], INDEX["supply"], INDEX["viscous_friction"]
 THINNING, THINNING_SPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
 BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
     INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
 )
 WARMTH, BRAKING = INDEX["warmth"], INDEX["braking_slope"]
-PRESLIDING = INDEX["presliding"]
 FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (
     INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain")
 )
-SAG, COUPLING, COUPLING_FROM = INDEX["sag"], INDEX["coupling"], INDEX["coupling_from"]
+COUPLING_FROM = INDEX["coupling_from"]
 REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
 REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
@@ -200,8 +202,10 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     # of the state, those that some law of this kernel keeps
     remembered = [MEMORY[name] for c in COLUMNS if c.feature in features for name in c.remembers]
     Drives, vec3, Memory = drives(real), wp.types.vector(length=3, dtype=real), wp.types.vector(len(MEMORY), real)
-    parasitic, dry = parasitic_torque(features), dry_friction(features)
-    encoder, hears, lost = encoder_error(features), heard_speed(features), lost_error(features)
+    encoder, remember, late = encoder_error(features), encoder_memory(features), command_delay(features)
+    hears, lost, motor, given = heard_speed(features), lost_error(features), warm_motor(features), amplifier(features)
+    drags, leaves = dragged_target(features), supply_left(features)
+    parasitic, dry, acts = parasitic_torque(features), dry_friction(features), friction_acts(features)
 
     @wp.struct
     # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
@@ -240,6 +244,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     class Friction:
         level: real  # dry
         own: real  # the drive's part of it
+        uneven: real  # share of it that differs by direction, half
+        give: real  # how far the joint gives way before it slides
         viscous: real
         taken: real  # torque of what gives way elastically; the level is 0 then
 
@@ -277,35 +283,33 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 turning = r.v
         s = Sensed()
         s.scale = d.params[w, j, SCALE]
-        error = encoder(d.params[w, j], turned)
+        kept = remember(d.params[w, j], turned, memory, fresh, dt)
+        error = encoder(d.params[w, j], turned, kept, False)
         s.q = s.scale * turned + d.params[w, j, OFFSET]
         s.q += error[0] + error[1]
         s.scale += error[2]
         s.rate = s.scale * turning
-        heard, kept = hears(d.params[w, j], turning, memory, fresh, dt)
+        heard, kept = hears(d.params[w, j], turning, kept, fresh, dt)
         s.v = s.scale * heard[0]
         s.v_end = s.scale * heard[1]
         s.share = heard[2]
         return s, kept
 
     @wp.func
-    def remaining(d: Drives, w: int, j: int):
-        """What the supply and the temperature leave of the motor."""
+    def remaining(dt: real, fresh: bool, last: real, memory: Memory, d: Drives, w: int, j: int):
+        """(what the supply and the temperature leave of the motor, memory); last: its torque of the step before."""
         m = Motor()
-        m.tau0 = d.params[w, j, TORQUE_LIMIT]
-        m.supply = d.params[w, j, SUPPLY]
-        m.no_load = d.params[w, j, NO_LOAD_SPEED]
-        m.efficiency = d.params[w, j, EFFICIENCY]
-        m.friction = real(1.0)
-        if wp.static(rare):
-            warm = warm_motor(d.params[w, j], d.params[w, j, WARMTH], wp.static(voltage))
-            m.tau0 = warm[0]
-            m.no_load = warm[1]
-            m.efficiency = warm[2]
-            m.friction = warm[3]
+        left, kept = motor(d.params[w, j], d.params[w, j, WARMTH], last, wp.static(voltage), memory, fresh, dt)
+        m.tau0 = left[0]
+        m.no_load = left[1]
+        m.efficiency = left[2]
+        m.friction = left[3]
+        others = real(0.0)
         if wp.static(sag):
-            m.supply = sagging(m.supply, d.params[w, j, SAG], d.given[w] - wp.abs(d.torque[w, j]))
-        return m
+            others = d.given[w] - wp.abs(d.torque[w, j])
+        supply, kept = leaves(d.params[w, j], d.params[w, j, SUPPLY], others, kept, fresh, dt)
+        m.supply = supply
+        return m, kept
 
     @wp.func
     def control(
@@ -323,14 +327,15 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     ):
         """((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at
         which its integral waits."""
-        end = d.time[w] - d.params[w, j, DELAY] + dt
+        waits, kept = late(d.params[w, j], d.time[w], memory, fresh, dt)
+        end = d.time[w] - waits + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
         if wp.static(rare):
-            dragged = d.params[w, j, COUPLING]
-            if dragged != real(0.0):
-                other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
-                target += dragged * (d.qpos[w, d.dof_q[other]] - d.home[w, other])
-        off, kept = lost(d.params[w, j], target, target - s.q, memory, fresh, dt)
+            other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
+            away = d.qpos[w, d.dof_q[other]] - d.home[w, other]
+            shift, kept = drags(d.params[w, j], away, kept, fresh, dt)
+            target += shift
+        off, kept = lost(d.params[w, j], target, target - s.q, kept, fresh, dt)
         u = pd(
             target - s.q,
             off,
@@ -436,6 +441,11 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             u, then = control(dt, queue, x0, fresh, s, memory, limits[0], limits[1], d, w, j)
             kept = then
             t = drive_torque(dt, u, r.v, x, limits[0], limits[1], steep, inertia, m)
+        gives, kept = given(d.params[w, j], t.now, t.end, kept, fresh, dt)
+        t.now = gives[0]
+        t.end = gives[1]
+        t.slope = gives[2] * t.slope
+        t.on_drive = gives[2] * t.on_drive
         if d.state[w, j, ENABLED] == real(0.0):
             t.now = real(0.0)
             t.end = real(0.0)
@@ -471,10 +481,12 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         f.level = d.base_frictionloss[w, j] + level[0]
         f.level += level[1] + level[2] + level[3]
         f.own = f.level - d.base_frictionloss[w, j]
+        how, kept = acts(d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, kept, fresh, dt)
+        f.uneven = how[0]
         if wp.static(presliding):  # a torque, taken up at the step's begin, and its line in the speed at the step's end
-            give = d.params[w, j, PRESLIDING]
-            if give > real(0.0):
-                turned = r.v * dt / give
+            f.give = how[1]
+            if f.give > real(0.0):
+                turned = r.v * dt / f.give
                 taken = real(0.0)
                 if not fresh:
                     taken = preslide(d.state[w, j, x0 + TAKEN], turned)
@@ -483,7 +495,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 if r.two:
                     sliding = f.own
                 f.taken = sliding * taken
-                f.viscous += sliding * dt / give * preslide_slope(taken, turned)
+                f.viscous += sliding * dt / f.give * preslide_slope(taken, turned)
         return f, kept
 
     @wp.func
@@ -501,7 +513,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             on_loop = t.slope - on_drive
         own = f.own
         if wp.static(presliding):
-            if d.params[w, j, PRESLIDING] > real(0.0):
+            if f.give > real(0.0):
                 own = real(0.0)
         soft = d.params[w, j, SOFTNESS]
         link = wp.max(d.inertia[w, j] - r.inertia, wp.static(real(LEAST_ROTOR)) * d.inertia[w, j])
@@ -559,8 +571,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         for k in range(wp.static(len(remembered))):
             memory[wp.static(remembered[k])] = d.state[w, j, x0 + wp.static(remembered[k])]
         r = locate(dt, x0, fresh, d, w, j)
-        m = remaining(d, w, j)
-        s, heard = sense(dt, fresh, r, memory, d, w, j)
+        m, left = remaining(dt, fresh, last, memory, d, w, j)
+        s, heard = sense(dt, fresh, r, left, d, w, j)
         t, asked = ask(dt, queue, x0, fresh, s, heard, r, m, d, w, j)
 
         # Ripple and its like; what of it brakes, or pulls like a spring, is taken at the end of the step.
@@ -588,14 +600,13 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         f, kept = resist(dt, x0, fresh, last, r, m.friction, added, d, w, j)
         for k in range(wp.static(len(remembered))):
             d.state[w, j, x0 + wp.static(remembered[k])] = kept[wp.static(remembered[k])]
-        uneven = real(0.5) * d.params[w, j, ASYMMETRY]
         if wp.static(play):
             d.state[w, j, x0 + LINE_A] = real(0.0)
             d.state[w, j, x0 + LINE_B] = real(1.0)
             if r.two:
                 applied = applied - t.end  # what acts on the link itself: the stand-in
                 damping = damping - t.slope + wp.max(real(0.0), -brake)
-                t.end -= uneven * f.own
+                t.end -= f.uneven * f.own
                 if wp.static(presliding):
                     t.end -= f.taken
                 loop = d.params[w, j, KP]
@@ -611,9 +622,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 d.dof_damping[w, i] = d.base_damping[w, j] + damping
                 d.dof_frictionloss[w, i] = d.base_frictionloss[w, j]
                 return
-        applied -= uneven * f.level
+        applied -= f.uneven * f.level
         if wp.static(presliding):
-            if d.params[w, j, PRESLIDING] > real(0.0):
+            if f.give > real(0.0):
                 applied -= f.taken
                 f.level = real(0.0)
         damping += wp.max(real(0.0), -brake)

@@ -2,14 +2,15 @@
 search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32 and in float64; `reference.py` has the
 same laws in NumPy, written apart, as their check.
 
-Where several laws make up one quantity they are put together here, for both kernels: `warm_motor`, `dry_friction`,
-`parasitic_torque`, `encoder_error`, `heard_speed`, `lost_error`. `of` is there a drive's row of the table, in the order
+Where several laws make up one quantity they are put together here, for both kernels, in the order of the signal:
+`encoder_error`, `command_delay`, `dragged_target`, `heard_speed`, `lost_error`, `warm_motor`, `supply_left`,
+`amplifier`, `dry_friction`, `friction_acts`, `parasitic_torque`. `of` is there a drive's row of the table, in the order
 of `columns.py`.
 
-Laws with memory: `dry_friction`, `parasitic_torque`, `heard_speed` and `lost_error` are given what their drive
-remembers and hand it on. memory: a vector, `columns.MEMORY` has the place of each number; fresh: nothing is remembered
-yet (the first step after a reset), a law begins from rest and sets what it will remember; dt: of the step [s]. Each
-number is written by one law, once a step."""
+Laws with memory: all of them are given what their drive remembers and hand it on; what an encoder remembers is written
+by `encoder_memory` and read by `encoder_error`. memory: a vector, `columns.MEMORY` has the place of each number; fresh:
+nothing is remembered yet (the first step after a reset), a law begins from rest and sets what it will remember; dt: of
+the step [s]. Each number is written by one law, once a step."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
@@ -39,7 +40,9 @@ RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE, RIPPLE_SHAPE = (
 )
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 DEADBAND, DEADBAND_KIND = INDEX["deadband"], INDEX["deadband_kind"]
-SPEED_LAG, FILTERED = INDEX["speed_lag"], MEMORY["filtered"]
+DELAY, SPEED_LAG, FILTERED = INDEX["delay"], INDEX["speed_lag"], MEMORY["filtered"]
+COUPLING, SAG = INDEX["coupling"], INDEX["sag"]
+ASYMMETRY, PRESLIDING = INDEX["friction_asymmetry"], INDEX["presliding"]
 
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
@@ -61,10 +64,11 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
 
     A further such law is a function of this file and a term of `error` and `slope` here, and in
     `reference.measured_position`; its columns are marked `encoder`. Training, search, recordings and whoever asks what
-    a position is from what is shown take the encoder from these two."""
+    a position is from what is shown take the encoder from these two, at any time: one with a memory reads it here and
+    writes it in `encoder_memory`."""
 
     @wp.func
-    def error(of: wp.array(dtype=Any), q: Any):
+    def error(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool):
         """(first, error, slope): first + error [rad] at position q [rad] of what the encoder turns with, and the slope
         of that in q. Two parts, since each kernel keeps the order of its sum, as of `dry_friction`."""
         first = type(q)(0.0)
@@ -81,7 +85,41 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
     return error
 
 
+@cache
+def encoder_memory(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function that brings what an encoder remembers to a step's begin, before it is read there: once a step,
+    for a kernel with these of `columns.FEATURES`. None of our encoders remembers.
+
+    A further encoder's error with a memory (teeth with a play, an output that settles) has its law for that here, and
+    in `reference.encoder_memory`; what it shows by it, in `encoder_error`."""
+
+    @wp.func
+    def remember(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool, dt: Any):
+        """memory at position q [rad] of what the encoder turns with."""
+        return memory
+
+    return remember
+
+
 # -- delay and lag -----------------------------------------------------------------------------------------------------
+
+
+@cache
+def command_delay(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of how long after its time a target acts, as a sum of laws of the time and of what is
+    remembered, for a kernel with these of `columns.FEATURES`.
+
+    A further such law (a delay that varies, or grows) is a function of this file and a term of `late` here, and in
+    `reference.command_delay`; its columns are marked `delays`, so that a servo keeps its targets for as long."""
+
+    @wp.func
+    def delay(of: wp.array(dtype=Any), t: Any, memory: Any, fresh: bool, dt: Any):
+        """(delay [s], memory) of the targets that a step uses which begins at time t [s] of the run."""
+        late = type(t)(0.0)
+        late += of[DELAY]
+        return late, memory
+
+    return delay
 
 
 @wp.func
@@ -89,6 +127,25 @@ def arrived(end: Any, stamp: Any, dt: Any):
     """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in
     force, (end - stamp) / dt within 0 .. 1: a delay that ends inside a step acts for the rest of it."""
     return wp.clamp((end - stamp) / dt, type(dt)(0.0), type(dt)(1.0))
+
+
+@cache
+def dragged_target(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of how far another joint (column `coupling_from`) drags a joint's target, as a sum of laws of
+    where that is, for a kernel with these of `columns.FEATURES`.
+
+    A further such law (a tendon that is slack at first, one that gives) is a function of this file and a term of
+    `shift` here, and in `reference.dragged_target`; it needs the feature `rare`."""
+
+    @wp.func
+    def dragged(of: wp.array(dtype=Any), away: Any, memory: Any, fresh: bool, dt: Any):
+        """(shift of the target [rad], memory) where the other joint is `away` [rad] from its home."""
+        shift = type(away)(0.0)
+        if wp.static("rare" in features):
+            shift += of[COUPLING] * away
+        return shift, memory
+
+    return dragged
 
 
 @wp.func
@@ -152,24 +209,62 @@ def warmed(per_degree: Any, warmth: Any):
     return type(warmth)(1.0) + per_degree * warmth
 
 
-@wp.func
-def warm_motor(of: wp.array(dtype=Any), warmth: Any, voltage: bool):
-    """(stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction) of a drive `warmth` [degC] above
-    the temperature that its figures hold at (`warmed`).
+@cache
+def warm_motor(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of what a motor can do as it is now, for a kernel with these of `columns.FEATURES`.
 
-    The torque constant k is Nm/A and V.s/rad in one. A voltage drive's stall torque k u / R and no-load speed u / k
-    follow from it and from the resistance R; a torque drive asks for a current, and k is lost on the way to the
-    joint."""
-    constant = warmed(of[THERMAL_TORQUE], warmth)
-    tau0 = of[TORQUE_LIMIT] * constant
-    no_load = of[NO_LOAD_SPEED]
-    efficiency = of[EFFICIENCY]
-    if voltage:
-        tau0 = tau0 / wp.max(warmed(of[THERMAL_RESISTANCE], warmth), type(warmth)(0.1))
-        no_load = no_load / constant
-    else:
-        efficiency = efficiency * constant
-    return wp.vector(tau0, no_load, efficiency, wp.max(warmed(of[THERMAL_FRICTION], warmth), type(warmth)(0.0)))
+    A further such law (a motor that heats up as it works, one that weakens) is a function of this file and a term of
+    `warm`, or a factor of what is returned, here, and in `reference.warm_motor`: training, search and what a diagnosis
+    hands on take the motor from these two."""
+
+    @wp.func
+    def motor(
+        of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any
+    ):
+        """((stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction), memory) of a drive `warmth`
+        [degC] above the temperature that its figures hold at (`warmed`); torque: what it gave in the step before [N.m].
+
+        The torque constant k is Nm/A and V.s/rad in one. A voltage drive's stall torque k u / R and no-load speed u / k
+        follow from it and from the resistance R; a torque drive asks for a current, and k is lost on the way to the
+        joint."""
+        tau0 = of[TORQUE_LIMIT]
+        no_load = of[NO_LOAD_SPEED]
+        efficiency = of[EFFICIENCY]
+        rubs = type(warmth)(1.0)
+        if wp.static("rare" in features):
+            warm = warmth
+            constant = warmed(of[THERMAL_TORQUE], warm)
+            tau0 = tau0 * constant
+            if voltage:
+                tau0 = tau0 / wp.max(warmed(of[THERMAL_RESISTANCE], warm), type(warmth)(0.1))
+                no_load = no_load / constant
+            else:
+                efficiency = efficiency * constant
+            rubs = wp.max(warmed(of[THERMAL_FRICTION], warm), type(warmth)(0.0))
+        return wp.vector(tau0, no_load, efficiency, rubs), memory
+
+    return motor
+
+
+@cache
+def amplifier(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of what the power stage gives of the torque that is asked of it, before the current's lag
+    (column `lag`), for a kernel with these of `columns.FEATURES`. Ours gives all of it.
+
+    A further such law (a dead band of the current, a torque that can only change so fast, steps of a converter) is a
+    function of this file and one more step from what is asked to what is given here, and in `reference.amplifier`:
+    training, search and what a diagnosis hands on take it from these two."""
+
+    @wp.func
+    def given(of: wp.array(dtype=Any), asked: Any, end: Any, memory: Any, fresh: bool, dt: Any):
+        """((now, end, share), memory): torque [N.m] given where `asked` is asked now, and at the end of a step of dt
+        [s], where `end` would be at unchanged speed; share of a change of what is asked that passes in the step."""
+        now = asked
+        then = end
+        share = type(end)(1.0)
+        return wp.vector(now, then, share), memory
+
+    return given
 
 
 @wp.func
@@ -177,6 +272,26 @@ def sagging(supply: Any, per_torque: Any, others: Any):
     """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque|
     [N.m]). A source with an internal resistance, currents in proportion to torques."""
     return supply * wp.max(type(supply)(1.0) - per_torque * others, type(supply)(0.05))
+
+
+@cache
+def supply_left(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of what is left of a supply that other motors load, for a kernel with these of
+    `columns.FEATURES`.
+
+    A further such law (a battery that empties, a converter that limits) is a function of this file and one more step
+    from the supply to what is left here, and in `reference.supply_left`; it needs the feature `sag`."""
+
+    @wp.func
+    def left(of: wp.array(dtype=Any), supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
+        """(supply over nominal, memory), where it would be `supply` without load and the other motors give |torque| of
+        `others` [N.m] together."""
+        there = supply
+        if wp.static("sag" in features):
+            there = sagging(there, of[SAG], others)
+        return there, memory
+
+    return left
 
 
 @wp.func
@@ -308,8 +423,8 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
     gone: `stribeck_power` from which on nothing of the column `stribeck_peak` is left.
 
     A further such law is a function of this file and a term of `steady` here, and in `reference.dry_friction`:
-    training, search and what a diagnosis hands on take their friction from these two. How a level of friction acts on
-    the joint, that it sticks, differs by direction or gives way first, is the kernels' own."""
+    training, search and what a diagnosis hands on take their friction from these two. How a level acts on the joint is
+    told by `friction_acts`; that it sticks is the kernels' own."""
 
     @wp.func
     def friction(
@@ -354,6 +469,29 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
         return wp.vector(steady, fading, loaded, loaded_fading), memory
 
     return friction
+
+
+@cache
+def friction_acts(features: frozenset[str] = frozenset()) -> Any:
+    """The Warp function of how a level of dry friction (`dry_friction`) acts on the joint, as sums of laws of position,
+    speed and what is remembered, for a kernel with these of `columns.FEATURES`.
+
+    A further such law (friction that differs by direction at one side of the turn, a seal that gives way farther after
+    a rest) is a function of this file and a term here, and in `reference.friction_acts`: training, search and what a
+    diagnosis hands on take it from these two. What gives way needs the feature `presliding`."""
+
+    @wp.func
+    def acts(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
+        """((uneven, give), memory) at position q [rad] of the joint and speed v [rad/s] of the motor. uneven: the level
+        moving positive is 1 + uneven of the mean of both directions, moving negative 1 - uneven; give: how far the
+        joint gives way before it slides [rad], 0 not at all (`preslide`)."""
+        uneven = type(v)(0.5) * of[ASYMMETRY]
+        give = type(v)(0.0)
+        if wp.static("presliding" in features):
+            give += of[PRESLIDING]
+        return wp.vector(uneven, give), memory
+
+    return acts
 
 
 @wp.func

@@ -5,7 +5,7 @@ numerics, as how stiff the end of a play is."""
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,8 @@ Numbers = float | np.ndarray
 
 @dataclass
 class Step:
-    """What a law with memory is given beside what it acts on; it writes what it will remember.
+    """What a law with memory is given beside what it acts on; it writes what it will remember (but for
+    `measured_position`, which reads what `encoder_memory` has written).
 
     dt: of the step [s]; fresh [...]: nothing is remembered yet; memory: numbers [...] by their names in
     `columns.MEMORY`."""
@@ -35,8 +36,8 @@ def over_time(
     *signals: np.ndarray,
     features: Collection[str] = FEATURES,
 ) -> Any:
-    """What a law of this file (`lost_error`, `parasitic_torque`, `dry_friction`) answers to signals [S] at the times t
-    [S] s, from rest at the first: one after the other where a column p of it remembers, else at once."""
+    """What a law of this file (`lost_error`, `parasitic_torque`, `shown_position`, ...) answers to signals [S] at the
+    times t [S] s, from rest at the first: one after the other where a column p of it remembers, else at once."""
     step = Step()
     begun = dict(step.memory)
     out = law(p, *signals, features, step)
@@ -51,18 +52,80 @@ def over_time(
 
 
 def measured_position(
-    p: Mapping[str, Any], q: Any, features: Collection[str] = FEATURES, xp: Any = np
+    p: Mapping[str, Any],
+    q: Any,
+    features: Collection[str] = FEATURES,
+    xp: Any = np,
+    step: Step | None = None,
 ) -> tuple[Any, Any]:
     """(position [...] rad that an encoder shows where what it turns with is at q [...] rad, its slope in q): scale,
     offset and all terms of `laws.encoder_error`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; xp: whose arrays these are, `numpy` or
-    `torch`: a servo says with this what its encoders report."""
+    `torch`: a servo says with this what its encoders report; step: what they remember, None from rest."""
+    step = step or Step()
     shown, slope = p["position_scale"] * q + p["position_offset"], p["position_scale"]
     if "rare" in features:
         shown = shown + p["eccentric_sin"] * xp.sin(q) + p["eccentric_cos"] * (xp.cos(q) - 1.0)
         slope = slope + p["eccentric_sin"] * xp.cos(q) - p["eccentric_cos"] * xp.sin(q)
     return shown, slope
+
+
+def encoder_memory(p: Mapping[str, Numbers], q: Numbers, features: Collection[str], step: Step) -> Step:
+    """The step with what an encoder remembers brought to where it is at q [...] rad of what it turns with: all of
+    `laws.encoder_memory`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count."""
+    return step
+
+
+def shown_position(
+    p: Mapping[str, Numbers], q: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
+) -> tuple[Numbers, Numbers]:
+    """`measured_position` of an encoder that has come to q [...] rad in this step: as a law for `over_time`."""
+    step = encoder_memory(p, q, features, step or Step())
+    at: tuple[Numbers, Numbers] = measured_position(p, q, features, np, replace(step, fresh=False))
+    return at
+
+
+def command_delay(
+    p: Mapping[str, Numbers], t: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
+) -> Numbers:
+    """How long after its time a target acts [...] s, in a step that begins at t [...] s: of all terms of
+    `laws.command_delay`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
+    late = p["delay"]
+    return late
+
+
+def dragged_target(
+    p: Mapping[str, Numbers], away: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
+) -> Numbers:
+    """Shift [...] rad of a joint's target by another that is `away` [...] rad from its home: of all terms of
+    `laws.dragged_target`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
+    shift = p["coupling"] * away if "rare" in features else np.zeros(())
+    return shift
+
+
+def supply_left(
+    p: Mapping[str, Numbers],
+    supply: Numbers,
+    others: Numbers,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
+) -> Numbers:
+    """Supply [...] over nominal where it would be `supply` [...] without load and the other motors give |torque| of
+    `others` [...] N.m together: of all steps of `laws.supply_left`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
+    there = supply * np.maximum(1.0 - p["sag"] * others, 0.05) if "sag" in features else supply
+    return there
 
 
 def lost_error(
@@ -135,11 +198,54 @@ def target_rates(
     return (share * rates).sum(-1), (share * bends).sum(-1)
 
 
+def warm_motor(
+    p: Mapping[str, Numbers],
+    torque: Numbers,
+    voltage: bool,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
+) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    """(stall torque [...] N.m, no-load speed [...] rad/s, efficiency [...], factor [...] on the friction) of a motor as
+    it is now: of all of `laws.warm_motor`.
+
+    p: columns by name; torque [...] N.m that it gave before; features: those of `columns.FEATURES` that count; step:
+    None from rest."""
+    step = step or Step()
+    tau0, no_load, efficiency, rubs = p["torque_limit"], p["no_load_speed"], p["efficiency"], np.ones(())
+    if "rare" in features:
+        warmth = p["warmth"]
+        torque_factor = 1.0 + p["thermal_torque"] * warmth
+        rubs = np.maximum(1.0 + p["thermal_friction"] * warmth, 0.0)
+        tau0 = tau0 * torque_factor
+        if voltage:
+            tau0 = tau0 / np.maximum(1.0 + p["thermal_resistance"] * warmth, 0.1)
+            no_load = no_load / torque_factor
+        else:
+            efficiency = efficiency * torque_factor
+    return tau0, no_load, efficiency, rubs
+
+
+def amplifier(
+    p: Mapping[str, Numbers],
+    asked: Numbers,
+    end: Numbers,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
+) -> tuple[Numbers, Numbers, Numbers]:
+    """(torque [...] N.m that the power stage gives where `asked` is asked of it, at the end of a step where `end` is
+    asked then, share of a change that passes): of all steps of `laws.amplifier`.
+
+    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    step = step or Step()
+    now, share = asked, np.ones(())
+    return now, end, share
+
+
 def torque_along(
     asked: np.ndarray,
     v: np.ndarray,
-    stall: float,
-    no_load: float,
+    stall: Numbers,
+    no_load: Numbers,
     voltage: bool,
     supply: Numbers = 1.0,
     limited: bool = True,
@@ -152,8 +258,8 @@ def torque_along(
     is."""
     if voltage:
         duty = np.clip(asked, -1, 1) if limited else asked
-        return stall * duty * supply - (stall / no_load * v if np.isfinite(no_load) else 0.0)
-    if not limited or not np.isfinite(stall):
+        return stall * duty * supply - (stall / no_load * v if np.all(np.isfinite(no_load)) else 0.0)
+    if not limited or not np.all(np.isfinite(stall)):
         return asked
     limit = stall * np.maximum(1 - np.abs(v) / no_load, 0.0)
     return np.clip(asked, -limit, limit)
@@ -229,6 +335,23 @@ def dry_friction(
     return level
 
 
+def friction_acts(
+    p: Mapping[str, Numbers],
+    q: Numbers,
+    v: Numbers,
+    features: Collection[str] = FEATURES,
+    step: Step | None = None,
+) -> tuple[Numbers, Numbers]:
+    """(share [...] by which the level moving positive is above the mean of both directions, how far [...] rad the joint
+    gives way before it slides): of all terms of `laws.friction_acts`.
+
+    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
+    count; step: None from rest."""
+    step = step or Step()
+    uneven, give = 0.5 * p["friction_asymmetry"], p["presliding"] if "presliding" in features else np.zeros(())
+    return uneven, give
+
+
 def viscous(p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES) -> Numbers:
     """Friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`.
 
@@ -281,7 +404,7 @@ def servo(
     shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as `kernel.py` defines them, and the next
     of what is remembered, of `rotor`, `line_a`, `line_b`, `integral` and `taken`.
     """
-    play, rare = "play" in features, "rare" in features
+    play = "play" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     first = np.asarray(fresh) != 0.0
@@ -295,14 +418,14 @@ def servo(
     )
     on_rotor = two & np.asarray(loop_motor)
     turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
-    q_m, scale = measured_position(p, turned, features)
-    v_m = scale * turning
     step = Step(dt, first)
     step.memory |= memory or {}
+    tau0, no_load, efficiency, friction_factor = warm_motor(p, last, voltage, features, step)
+    q_m, scale = shown_position(p, turned, features, step)
+    v_m = scale * turning
     heard, then, kd_blend = heard_speed(p, turning, features, step)
     v_d, v_next = scale * heard, scale * then
-    if rare:
-        target = target + p["coupling"] * dragging
+    target = target + dragged_target(p, dragging, features, step)
 
     lost, bend, acts = lost_error(p, target, target - q_m, features, step)
     e, heeded = target - q_m - lost, 1.0 - bend
@@ -314,18 +437,7 @@ def servo(
     pd = np.where(damped, -p["kd"] * v_next, np.where(dead, 0.0, pd))
     slope = np.where(damped, scale * kd_blend * p["kd"], np.where(dead, 0.0, slope))
 
-    tau0, supply, no_load, efficiency = p["torque_limit"], p["supply"], p["no_load_speed"], p["efficiency"]
-    friction_factor = np.ones_like(v)
-    if rare:
-        torque_factor = 1.0 + p["thermal_torque"] * p["warmth"]
-        friction_factor = np.maximum(1.0 + p["thermal_friction"] * p["warmth"], 0.0)
-        tau0 = tau0 * torque_factor
-        if voltage:
-            tau0, no_load = tau0 / np.maximum(1.0 + p["thermal_resistance"] * p["warmth"], 0.1), no_load / torque_factor
-        else:
-            efficiency = efficiency * torque_factor
-    if "sag" in features:
-        supply = supply * np.maximum(1.0 - p["sag"] * others, 0.05)
+    supply = supply_left(p, p["supply"], others, features, step)
     upper, lower = np.ones_like(v), np.ones_like(v)  # limits of the duty, or of the torque
     if not voltage:
         with np.errstate(invalid="ignore"):
@@ -373,8 +485,10 @@ def servo(
             on_drive = np.where(np.abs(pd) > limit, np.maximum(slope * size / np.abs(pd), line), 0.0)
             damping = np.where(np.abs(pd) > limit, on_drive, slope)
 
+    gives_now, gives_then, passes = amplifier(p, motor_now, motor, features, step)
+    given = gives_now, gives_then, passes * damping, passes * on_drive
     on = np.asarray(enabled) != 0.0
-    motor_now, motor, damping, on_drive = (np.where(on, x, 0.0) for x in (motor_now, motor, damping, on_drive))
+    motor_now, motor, damping, on_drive = (np.where(on, x, 0.0) for x in given)
 
     blend = dt / (p["lag"] + dt)
     motor_now = last + blend * (motor_now - last)
@@ -402,17 +516,18 @@ def servo(
     level = base_frictionloss + own
     grease = friction_factor * viscous(p, v_drive, features)
 
-    gives = ("presliding" in features) & (p["presliding"] > 0.0)
-    y = v_drive * dt / np.where(gives, p["presliding"], 1.0)
+    uneven, give = friction_acts(p, q, v_drive, features, step)
+    gives = ("presliding" in features) & np.greater(give, 0.0)
+    y = v_drive * dt / np.where(gives, give, 1.0)
     taken = np.where(gives & ~first, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
     sliding = np.where(gives, np.where(two, own, level), 0.0)
-    grease = grease + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (
+    grease = grease + sliding * dt / np.where(gives, give, 1.0) * (1.0 - taken * np.sign(v_drive)) / (
         1.0 + np.abs(y)
     )
     of_motor = of_motor - sliding * taken
 
     one = {
-        "qfrc_applied": applied - 0.5 * p["friction_asymmetry"] * level - sliding * taken + damping * v,
+        "qfrc_applied": applied - uneven * level - sliding * taken + damping * v,
         "dof_damping": base_damping + grease + damping,
         "dof_frictionloss": np.where(gives, 0.0, level),
         "line_a": np.zeros_like(v), "line_b": np.ones_like(v),
@@ -422,7 +537,7 @@ def servo(
         with np.errstate(divide="ignore", invalid="ignore"):
             other = _rotor(
                 p,
-                of_motor - 0.5 * p["friction_asymmetry"] * own,
+                of_motor - uneven * own,
                 slope_motor,
                 on_drive,
                 on_rotor,

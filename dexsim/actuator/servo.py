@@ -10,7 +10,18 @@ import mujoco
 import torch
 import warp as wp
 
-from dexsim.actuator.columns import COLUMNS, ENCODER, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
+from dexsim.actuator.columns import (
+    COLUMNS,
+    DELAYS,
+    ENCODER,
+    FEATURE_OF,
+    FEATURES,
+    INDEX,
+    MEMORY,
+    NAMES,
+    column,
+    did_you_mean,
+)
 from dexsim.actuator.kernel import (
     EXTENDED,
     EXTRA_SLOTS,
@@ -22,7 +33,7 @@ from dexsim.actuator.kernel import (
     send_kernel,
     servo_kernel,
 )
-from dexsim.actuator.reference import measured_position
+from dexsim.actuator.reference import Step, measured_position
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.sim.launches import Launches
@@ -57,6 +68,7 @@ class Servo:
             which the servo's are added (an armature loses its rotor where there is play). Randomize these, not the
             model fields: the servo overwrites them before each physics step, the armature only where play is simulated;
         misread: whether the encoders may report other positions than the joints have;
+        first_memory: the slot of the first number of `columns.MEMORY` in a state; -1 where nothing is remembered;
         home [N, J] positions [rad] from which a joint that drags another is counted (default: the model's qpos0);
         inertia [N, J] about the joints [kg.m2], for the integration only: an estimate serves.
     """
@@ -92,7 +104,7 @@ class Servo:
         self.queue, self.control_period = 8, control_period
         # the newest entry, one a period through the longest delay, and one before (three, where they have rates)
         if control_period:
-            longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
+            longest = table.bounds(self.joints)[1][:, [INDEX[name] for name in DELAYS]].sum(1).max()
             self.queue = max(8, math.ceil(longest / control_period) + 3 + 2 * ("controller" in self.features))
         self.slots = {name: i for i, name in enumerate(SLOTS)}
         for k in range(self.queue):
@@ -102,8 +114,9 @@ class Servo:
         self._bent = bool(named & ENCODER)  # what an encoder shows may be no straight line in the position
         self.misread = before_play or self._bent or bool(named & {"position_offset", "position_scale"})
         extended = bool(self.features & EXTENDED)
+        self.first_memory = QUEUE + 2 * self.queue if extended else -1
         if extended:
-            self.slots |= {name: QUEUE + 2 * self.queue + i for i, name in enumerate(EXTRA_SLOTS)}
+            self.slots |= {name: self.first_memory + i for i, name in enumerate(EXTRA_SLOTS)}
 
         j, c, s = len(self.joints), len(NAMES), len(self.slots)
         zeros = lambda *shape: wp.zeros(shape, dtype=real, device=device)  # noqa: E731
@@ -245,11 +258,11 @@ class Servo:
     def velocity(self) -> torch.Tensor:
         """[N, J] velocity that the encoders report [rad/s]."""
         q, v = self._turned()
-        return measured_position(self._by_name, q, self.features, torch)[1] * v
+        return measured_position(self._by_name, q, self.features, torch, self._remembered())[1] * v
 
     def measured(self, q: torch.Tensor) -> torch.Tensor:
         """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
-        shown: torch.Tensor = measured_position(self._by_name, q, self.features, torch)[0]
+        shown: torch.Tensor = measured_position(self._by_name, q, self.features, torch, self._remembered())[0]
         return shown
 
     def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
@@ -259,6 +272,13 @@ class Servo:
         for _ in range(6 if self._bent else 0):
             q = q + (reported - self.measured(q)) / self.column("position_scale")
         return q
+
+    def _remembered(self) -> Step | None:
+        """What the encoders remember; None where none does."""
+        if not self._bent or self.first_memory < 0:
+            return None
+        of = {name: self.state[:, :, self.slots[name]] for name in MEMORY}
+        return Step(self.engine.dt, self.state[:, :, self.slots["fresh"]] != 0, of)
 
     @property
     def at_rotor(self) -> bool:

@@ -14,7 +14,8 @@ import warp as wp
 import yaml
 
 from dexsim import outputs, yaml_text
-from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
+from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY, NAMES
+from dexsim.actuator.kernel import EXTENDED, FRESH
 from dexsim.actuator.laws import encoder_error
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -31,7 +32,19 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
     object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph.
     features: of the servo, those of `columns.FEATURES`."""
-    encoder = encoder_error(features)
+    encoder, Memory = encoder_error(features), wp.types.vector(len(MEMORY), real)
+    remembers = bool(features & EXTENDED)
+
+    @wp.func
+    def remembered(w: int, j: int, first: int, state: wp.array3d(dtype=real)):
+        """(what a joint's drive remembers, whether that is nothing yet)."""
+        memory = Memory()
+        fresh = bool(True)
+        if wp.static(remembers):
+            for k in range(wp.static(len(MEMORY))):
+                memory[k] = state[w, j, first + k]
+            fresh = state[w, j, first + FRESH] != real(0.0)
+        return memory, fresh
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_rows(
@@ -44,6 +57,8 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel
         qvel: wp.array2d(dtype=real),
         torque: wp.array2d(dtype=real),
         params: wp.array3d(dtype=real),
+        state: wp.array3d(dtype=real),
+        first_memory: int,  # of the state's slots
         slot: wp.array(dtype=int),
         rows: wp.array3d(dtype=real),
     ):
@@ -53,12 +68,14 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel
         value = time[w]
         if c >= 1 and c <= joints:
             j = c - 1
-            error = encoder(params[w, j], qpos[w, q_index[j]])
+            memory, fresh = remembered(w, j, first_memory, state)
+            error = encoder(params[w, j], qpos[w, q_index[j]], memory, fresh)
             value = params[w, j, SCALE] * qpos[w, q_index[j]] + params[w, j, OFFSET]
             value += error[0] + error[1]
         elif c > joints and c <= 2 * joints:
             j = c - 1 - joints
-            slope = params[w, j, SCALE] + encoder(params[w, j], qpos[w, q_index[j]])[2]
+            memory, fresh = remembered(w, j, first_memory, state)
+            slope = params[w, j, SCALE] + encoder(params[w, j], qpos[w, q_index[j]], memory, fresh)[2]
             value = slope * qvel[w, v_index[j]]
         elif c > 2 * joints and c <= 3 * joints:
             value = torque[w, c - 1 - 2 * joints]
@@ -112,7 +129,8 @@ class PlayRecorder:
                 wp.array(chosen, dtype=int), wp.array(engine.qpos_index(self.joints), dtype=int),
                 wp.array(engine.dof_index(self.joints), dtype=int),
                 int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]),
-                engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params,
+                engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params, servo._state,
+                servo.first_memory,
                 wp.zeros(1, dtype=int), wp.zeros((K, count, 1 + 3 * J + 7), dtype=engine.real),
             ]  # fmt: skip
         self._slot, self._rows = self._args[-2], self._args[-1]

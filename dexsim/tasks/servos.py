@@ -8,7 +8,7 @@ from functools import cache
 import torch
 import warp as wp
 
-from dexsim.actuator.columns import INDEX, column, simulated
+from dexsim.actuator.columns import DELAYS, INDEX, column, simulated
 from dexsim.actuator.servo import Servo
 from dexsim.errors import UserError
 from dexsim.tasks.randomize import Sampler
@@ -105,8 +105,9 @@ class ServoRandomizer:
         ends = torch.stack([value * low, value * high] if name in RELATIVE else [value + low, value + high])
         least, most, top = float(ends.min()), float(ends.max()), col.high
         how = "times" if name in RELATIVE else "added to"
-        if name == "delay" and self.servo.control_period:
-            top = min(top, (self.servo.queue - 3) * self.servo.control_period)  # targets older than that are forgotten
+        if name in DELAYS and self.servo.control_period:  # targets older than the queue are forgotten
+            others = self.high[:, [INDEX[x] for x in DELAYS if x != name]].sum(1).max()
+            top = min(top, (self.servo.queue - 3) * self.servo.control_period - float(others))
         if least < col.low - 1e-9 or most > top + 1e-9:
             raise UserError(
                 f"randomize.servo.{name}=[{low:g}, {high:g}] {how} the nominal gives {least:g} to {most:g} {col.unit}: "

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 import torch
 
-from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.columns import COLUMNS, DELAYS
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
@@ -283,7 +283,8 @@ def _batch(
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in worlds])
     table = copy.deepcopy(worlds[0].table)
-    table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
+    for name in DELAYS:  # the queue must hold the longest
+        table.set(joints[0], name, float(rows[:, :, SERVO_INDEX[name]].max()))
     spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
     spacing = spacing[spacing > 1e-6]
     varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]

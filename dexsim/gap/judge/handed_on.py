@@ -13,13 +13,19 @@ import numpy as np
 from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
 from dexsim.actuator.reference import (
+    amplifier,
+    command_delay,
+    dragged_target,
     dry_friction,
+    friction_acts,
     lagged,
     lost_error,
     over_time,
     parasitic_torque,
+    supply_left,
     torque_along,
     viscous,
+    warm_motor,
 )
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
@@ -302,16 +308,25 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     grid = t[0] + plant.dt * np.arange(plant._grid[run + 1] - plant._grid[run])
     series = plant.series[plant._grid[run] : plant._grid[run + 1]]
     s = lambda name: np.interp(t, grid, series[:, SERIES_INDEX[name]])  # noqa: E731
-    cmd = r.command_at(t - p("delay"))[:, j]
     columns = {n: row[i] for n, i in INDEX.items()}
+    cmd = r.command_at(t - over_time(command_delay, columns, t, t))[:, j]
+    away = np.interp(t, grid, series[:, SERIES_INDEX["drag0"] + max(int(p("coupling_from")), 0)])
+    cmd = cmd + over_time(dragged_target, columns, t, away)
     error = cmd - shown[1]
     lost, _, acts = over_time(lost_error, columns, t, cmd, error, features=KINDLESS)
     damped = p("kd") * shown[2]
     asked = np.where(acts > 1.5, p("kp") * (error - lost) - damped, np.where(acts > 0.5, -damped, 0.0))
-    supply = s("supply") if plant.voltage else 1.0
-    motor = torque_along(asked, v, p("torque_limit"), p("no_load_speed"), plant.voltage, supply)
-    if p("lag") > 0:
-        motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
+    supply = over_time(supply_left, columns, t, s("supply"), s("others_torque")) if plant.voltage else 1.0
+    able = lambda of, gave, *rest: warm_motor(of, gave, plant.voltage, *rest)  # noqa: E731
+    motor = np.zeros_like(asked)
+    for _ in range(2):
+        tau0, no_load, efficiency, rubs = now = over_time(able, columns, t, motor)
+        motor = torque_along(asked, v, tau0, no_load, plant.voltage, supply)
+        motor, _, _ = over_time(amplifier, columns, t, motor, motor)
+        if p("lag") > 0:
+            motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
+        if not any(map(np.ndim, now)):  # else what it can give follows from what it gave, known from now on
+            break
     slope = 0.05 * max(case.scales.speed, 1e-9)
     beside, _, _ = over_time(parasitic_torque, columns, t, q, v)
     inertia = s("inertia") * p("inertia_scale") + p("armature")
@@ -322,17 +337,18 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
     )
-    level = over_time(dry_friction, columns, t, q, v, motor, inertia * a - needed) + case.constants.friction
+    level = rubs * over_time(dry_friction, columns, t, q, v, motor, inertia * a - needed) + case.constants.friction
+    uneven, _ = over_time(friction_acts, columns, t, q, v)
     friction = (
         level * np.sign(v)
-        + 0.5 * p("friction_asymmetry") * level
-        + (viscous(columns, v) + case.constants.damping) * v
+        + uneven * level
+        + (rubs * viscous(columns, v) + case.constants.damping) * v
     )
     on = np.abs(v) > slope
     if r.enabled is not None:
         on &= r.enabled[:, j] > 0.5
     on[:3] = on[-3:] = False
-    return needed + friction - p("efficiency") * motor - beside, on
+    return needed + friction - efficiency * motor - beside, on
 
 
 def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:

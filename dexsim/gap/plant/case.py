@@ -12,7 +12,7 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
-from dexsim.actuator.reference import measured_position, torque_along
+from dexsim.actuator.reference import over_time, shown_position, torque_along
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
@@ -727,9 +727,9 @@ def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndar
     p = {name: row[i] for name, i in INDEX.items()}
     x = (q - p["position_offset"]) / p["position_scale"]
     for _ in range(3):
-        x = x + (q - measured_position(p, x)[0]) / p["position_scale"]
-    rate = measured_position(p, x)[1]
-    before, after = (measured_position(p, x + step)[1] for step in (-TURN, TURN))
+        x = x + (q - over_time(shown_position, p, t, x)[0]) / p["position_scale"]
+    rate = over_time(shown_position, p, t, x)[1]
+    before, after = (over_time(shown_position, p, t, x + step)[1] for step in (-TURN, TURN))
     speed = v / rate
     return t, x, speed, (a - (after - before) / (2 * TURN) * speed**2) / rate
 

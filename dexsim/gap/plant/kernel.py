@@ -19,10 +19,15 @@ import warp as wp
 from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
+    amplifier,
     arrived,
+    command_delay,
     difference,
+    dragged_target,
     dry_friction,
     encoder_error,
+    encoder_memory,
+    friction_acts,
     heard_speed,
     hold,
     lag_share,
@@ -33,8 +38,8 @@ from dexsim.actuator.laws import (
     pd,
     preslide,
     preslide_speed,
-    sagging,
     stage_before,
+    supply_left,
     torque_limits,
     transmission,
     transmission_damping,
@@ -48,8 +53,15 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
 encoder = encoder_error(frozenset(SERVO_FEATURES))
+remember = encoder_memory(frozenset(SERVO_FEATURES))
+late = command_delay(frozenset(SERVO_FEATURES))
 hears = heard_speed(frozenset(SERVO_FEATURES), skips=True)
 lost = lost_error(frozenset(SERVO_FEATURES))
+drags = dragged_target(frozenset(SERVO_FEATURES))
+motor = warm_motor(frozenset(SERVO_FEATURES))
+leaves = supply_left(frozenset(SERVO_FEATURES))
+given = amplifier(frozenset(SERVO_FEATURES))
+acts = friction_acts(frozenset(SERVO_FEATURES))
 dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
 LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
@@ -58,19 +70,18 @@ TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
 CONSTS = 10  # of them
-P_KP, P_KD, P_DELAY, P_LAG, P_SUPPLY = (INDEX[n] for n in ("kp", "kd", "delay", "lag", "supply"))
-P_ASYM, P_VISC = INDEX["friction_asymmetry"], INDEX["viscous_friction"]
+P_KP, P_KD, P_LAG, P_SUPPLY, P_VISC = (INDEX[n] for n in ("kp", "kd", "lag", "supply", "viscous_friction"))
 P_THINS, P_THINSPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 P_LOADOUT = INDEX["load_friction_external"]  # the first of `FEATURES["load"]`, which stand in a row
 P_OFFSET, P_SCALE = INDEX["position_offset"], INDEX["position_scale"]
-P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, P_SAG = (
+P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR = (
     INDEX[n]
     for n in (
         "inertia_scale", "gravity_scale", "armature", "payload", "tilt_x", "tilt_y", "tilt_z", "backlash", "softness",
-        "rotor", "sag",
+        "rotor",
     )
 )  # fmt: skip
-P_COUPLING, P_BIAS, P_AGE, P_LIMITSPEED = (INDEX[n] for n in ("coupling", "bias", "feedback_delay", "limit_speed"))
+P_BIAS, P_AGE, P_LIMITSPEED = (INDEX[n] for n in ("bias", "feedback_delay", "limit_speed"))
 X = SERIES_INDEX
 XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
     X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
@@ -91,7 +102,7 @@ P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FRESH = INDEX["effort_fresh"]
 P_READSCALE, P_READOFFSET = INDEX["readout_scale"], INDEX["readout_offset"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
-P_PRESLIDE, P_BRAKING = INDEX["presliding"], INDEX["braking_slope"]
+P_BRAKING = INDEX["braking_slope"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
@@ -147,7 +158,6 @@ class Guess:  # the columns of one guess that every step asks for
     read_offset: f64
     scale: f64
     offset: f64
-    delay: f64
     dt: f64  # of a sub-step
     age: f64
     ki: f64
@@ -159,7 +169,6 @@ class Guess:  # the columns of one guess that every step asks for
     gap2: f64
     soft: f64
     two: bool  # rotor and link are two bodies
-    give: f64  # presliding
     viscous: f64
     thins: f64  # of it, what is less the faster it turns, and
     thin_speed: f64  # the speed at which half of that is left
@@ -168,7 +177,6 @@ class Guess:  # the columns of one guess that every step asks for
     gear_back: f64  # back-driven
     gear_power: f64
     gear_unit: f64
-    uneven: f64  # half the friction's asymmetry
     bias: f64
     spring: f64
     preload: f64
@@ -266,7 +274,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.read_scale = c.params[h, P_READSCALE]
     p.read_offset = c.params[h, P_READOFFSET]
     p.offset = c.params[h, P_OFFSET]
-    p.delay = c.params[h, P_DELAY]
     p.age = c.params[h, P_AGE]
     p.ki = c.params[h, P_KI]
     p.steep = c.params[h, P_BRAKING]
@@ -279,7 +286,6 @@ def guess(c: Recorded, h: int, dt: f64):
         p.dt = dt / f64(TWO_BODY_STEPS)
     p.staged = c.params[h, P_STAGES] > f64(1.5)
     p.lag = lag_share(c.params[h, P_LAG] / c.params[h, P_STAGES], p.dt)
-    p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
     p.thins = c.params[h, P_THINS]
     p.thin_speed = c.params[h, P_THINSPEED]
@@ -289,7 +295,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.gear_back = c.params[h, P_GEARBACK]
     p.gear_power = c.params[h, P_GEARPOWER]
     p.gear_unit = c.params[h, P_GEARUNIT]
-    p.uneven = f64(0.5) * c.params[h, P_ASYM]
     p.bias = c.params[h, P_BIAS]
     p.spring = c.params[h, P_SPRING]
     p.preload = c.params[h, P_PRELOAD]
@@ -323,22 +328,22 @@ def guess(c: Recorded, h: int, dt: f64):
 
 
 @wp.func
-def shown(of: wp.array(dtype=f64), q: f64, p: Guess):
+def shown(of: wp.array(dtype=f64), q: f64, x: State, p: Guess):
     """(what the encoder shows at position q, what it shows of a speed there over that speed)."""
-    error = encoder(of, q)
+    error = encoder(of, q, x.memory, x.fresh != f64(0.0))
     m = p.scale * q + p.offset
     m += error[0] + error[1]
     return wp.vec2d(m, p.scale + error[2])
 
 
 @wp.func
-def position(of: wp.array(dtype=f64), m: f64, p: Guess):
+def position(of: wp.array(dtype=f64), m: f64, x: State, p: Guess):
     """Where m is reported: its inverse, by two fixed-point steps."""
     at = unread(m, p) - p.offset
     q = at / p.scale
-    error = encoder(of, q)
+    error = encoder(of, q, x.memory, x.fresh != f64(0.0))
     q = (at - error[0] - error[1]) / p.scale
-    error = encoder(of, q)
+    error = encoder(of, q, x.memory, x.fresh != f64(0.0))
     q = (at - error[0] - error[1]) / p.scale
     return q
 
@@ -394,10 +399,13 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
 
 
 @wp.func
-def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
-    """`n` with what the supply, the temperature and the other joints make of the drive at grid point g."""
+def drive_now(c: Recorded, h: int, g: int, dt: f64, x: State, p: Guess, n: Now):
+    """(`n` with what the supply, the temperature and the other joints make of the drive at grid point g, what the
+    drive remembers)."""
     dragger = int(c.params[h, P_FROM])
-    n.target += c.params[h, P_COUPLING] * c.series[g, XDRAG + dragger]
+    fresh = x.fresh != f64(0.0)
+    shift, kept = drags(c.params[h], c.series[g, XDRAG + dragger], x.memory, fresh, dt)
+    n.target += shift
     n.carried = c.params[h, P_LINKAGE] * c.series[g, XDV + dragger]
     if p.loop_motor:
         n.target += c.params[h, P_LINKAGE] * c.series[g, XDRAG + dragger]
@@ -405,17 +413,19 @@ def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * p.rotor
     n.load = c.series[g, XR] + n.load
 
-    warm = warm_motor(c.params[h], c.series[g, XWARM], p.voltage)
+    warm, kept = motor(c.params[h], c.series[g, XWARM], x.last, p.voltage, kept, fresh, dt)
     n.tau0 = warm[0]
     n.no_load = warm[1]
     n.efficiency = warm[2]
     n.friction = warm[3]
-    n.supply = sagging(c.params[h, P_SUPPLY] * c.series[g, XSUP], c.params[h, P_SAG], c.series[g, XOTH])
+    supply = c.params[h, P_SUPPLY] * c.series[g, XSUP]
+    supply, kept = leaves(c.params[h], supply, c.series[g, XOTH], kept, fresh, dt)
+    n.supply = supply
     n.weak = c.params[h, P_WEAK] * c.series[g, XOTH]
     if p.open_ > f64(0.0):
         n.drive = c.series[g, XDRIVE]
     n.enabled = c.series[g, XON] >= f64(0.5)
-    return n
+    return n, kept
 
 
 @wp.func
@@ -563,10 +573,11 @@ def borne_friction(borne: f64, v: f64, p: Guess):
 
 
 @wp.func
-def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, grease: f64, theta: f64,
-             dt: f64, p: Guess, n: Now):  # fmt: skip
-    """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]; visc: all that
-    is by its speed, grease: of it, what is by the motor's [N.m.s/rad]."""
+def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64, stop_d: f64, visc: f64, grease: f64,
+             theta: f64, dt: f64, p: Guess, n: Now):  # fmt: skip
+    """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]; level, give: of
+    dry friction (`friction_acts`); visc: all that is by its speed, grease: of it, what is by the motor's
+    [N.m.s/rad]."""
     begun = x.v
     damping = n.efficiency * t.on_loop + n.efficiency * t.on_drive
     level += p.base_friction
@@ -574,14 +585,14 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
     free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + grease * n.carried) / a
     free -= n.carried  # dry friction acts where the motor turns
     if n.held:
-        if p.give > f64(0.0):
-            x.taken = preslide(x.taken, (x.v - n.carried) * dt / p.give)
+        if give > f64(0.0):
+            x.taken = preslide(x.taken, (x.v - n.carried) * dt / give)
     else:
         went = n.carried  # speed in the middle of the step, or at its end
-        if p.give > f64(0.0):
-            free = preslide_speed(free, a, level, x.taken, p.give / dt)
+        if give > f64(0.0):
+            free = preslide_speed(free, a, level, x.taken, give / dt)
             went = free + n.carried
-            x.taken = preslide(x.taken, free * dt / p.give)
+            x.taken = preslide(x.taken, free * dt / give)
             x.q += dt * (free + n.carried)
             x.v = x.v + (free + n.carried - x.v) / theta
             if (x.v - n.carried) * free < f64(0.0):
@@ -604,7 +615,7 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 
 
 @wp.func
-def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, drag: f64,
+def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64, stop_d: f64, drag: f64,
                grease: f64, dt: f64, p: Guess, n: Now, b: Pair):  # fmt: skip
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
     the step. grease: viscous friction, drag: what else is by the speed of the rotor [N.m.s/rad]."""
@@ -641,9 +652,9 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
     x1 = (b1 * a22 - a12 * b2) / det
     x2 = zero
     gain = a22 / det
-    if p.give > zero:
-        x1 = preslide_speed(x1, f64(1.0) / gain, level, x.taken, p.give / dt)
-        x.taken = preslide(x.taken, x1 * dt / p.give)
+    if give > zero:
+        x1 = preslide_speed(x1, f64(1.0) / gain, level, x.taken, give / dt)
+        x.taken = preslide(x.taken, x1 * dt / give)
         x2 = (b2 - a21 * x1) / a22
     elif wp.abs(x1) <= gain * level:
         x1 = zero
@@ -691,9 +702,10 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         v_drive = x.v - n.carried
         if p.loop_motor:
             v_l = v_drive
-    seen = shown(c.params[h], q_l, p)
-    shows = seen[1]
     fresh = x.fresh != zero
+    x.memory = remember(c.params[h], q_l, x.memory, fresh, dt)
+    seen = shown(c.params[h], q_l, x, p)
+    shows = seen[1]
     heard, kept = hears(c.params[h], v_l, x.memory, fresh, dt)
     e = n.target - seen[0] + p.age * shows * v_l  # a sampled loop acts on where the joint was
     rate = shows * heard[0]
@@ -764,6 +776,11 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         x.older = p.kp * p.age * shows * v_l
         if p.voltage:
             x.older = n.tau0 * n.supply * x.older
+    gives, kept = given(c.params[h], t.now, t.end, kept, fresh, dt)
+    t.now = gives[0]
+    t.end = gives[1]
+    t.on_loop = gives[2] * t.on_loop
+    t.on_drive = gives[2] * t.on_drive
     t = opened(t, v_drive, p, n)
     if not n.enabled:
         x.integral = zero
@@ -787,11 +804,12 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     applied += beside[0]
     applied += p.bias
     parts, kept = dry(c.params[h], x.q, v_drive, before, p.bias - load, p.carries, f64(1.0), kept, fresh, dt)
+    how, kept = acts(c.params[h], x.q, v_drive, kept, fresh, dt)
     x.memory = kept
     level = (parts[0] + parts[1] + (parts[2] + parts[3])) * n.friction
     if by_gear:
         level += borne_friction(x.borne, v_drive, p) * n.friction
-    applied -= p.uneven * level
+    applied -= how[0] * level
     if drag > zero:
         applied += drag * v_drive
     stop_d = zero
@@ -807,9 +825,9 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         if p.gap2 > zero:  # a spring behind the play would keep it closed: one that leaves it open is before it
             on_motor = p.preload + p.spring * (x.qm + half * dt * x.vm)
             load -= pulled
-        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, drag, grease, dt, p, n, b)
+        x = two_bodies(c, x, t, applied - on_motor, load, level, how[1], stop_d, drag, grease, dt, p, n, b)
     else:
-        x = one_body(x, t, applied, load, level, stop_d, visc, grease, theta, dt, p, n)
+        x = one_body(x, t, applied, load, level, how[1], stop_d, visc, grease, theta, dt, p, n)
     if p.staged:
         x.stage = stage_before(before, x.last, p.lag)
     if by_gear and not n.held:
@@ -822,24 +840,24 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
 def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
     """The joint at the begin of a window: where it was measured."""
     x = State()
-    x.q = position(c.params[h], c.series[g, XQ], p)
-    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, p)[1])
+    x.fresh = f64(1.0)
+    x.q = position(c.params[h], c.series[g, XQ], x, p)
+    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
     if warm == 0:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
     x.qm = x.q
     x.vm = x.v
-    x.fresh = f64(1.0)
     return x
 
 
 @wp.func
 def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
     """The joint on its recorded motion, while the drive's own state settles; last: it is let go now."""
-    error = encoder(c.params[h], x.q)
+    error = encoder(c.params[h], x.q, x.memory, x.fresh != f64(0.0))
     m = unread(c.series[g, XQ], p) - error[0] - error[1]
     x.q = (m - p.offset) / p.scale
-    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, p)[1])
+    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
     if last:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
@@ -850,16 +868,17 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
 
 
 @wp.func
-def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, p: Guess):
+def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, x: State, p: Guess):
     """Steps of dt [s] before t [s] in which a command changed that the drive's lag still holds some of; k, last: the
     command from which on to look, and the end of the run's."""
-    begin = t - p.delay - f64(SETTLES) * c.params[h, P_LAG]
+    waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
+    begin = t - waits - f64(SETTLES) * c.params[h, P_LAG]
     kk = int(k)
     while kk + 1 < last and acts_at(c, kk + 1, p) <= begin:
         kk += 1
     if kk + 1 >= last:
         return 0
-    since = t - p.delay - acts_at(c, kk + 1, p)
+    since = t - waits - acts_at(c, kk + 1, p)
     if since <= f64(0.0):
         return 0
     return int(wp.ceil(since / dt)) + 1
@@ -887,10 +906,10 @@ def plant_kernel() -> wp.Kernel:
         x = begun(c, h, g0, warm, p)
         lead = int(0)
         if warm == 0:
-            lead = asked_before(c, h, k, c_end, t, dt, p)
+            lead = asked_before(c, h, k, c_end, t, dt, x, p)
             t -= f64(lead) * dt
         on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
-        after = shown(c.params[h], x.q, p)[0]  # at the end of the step
+        after = shown(c.params[h], x.q, x, p)[0]  # at the end of the step
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
@@ -902,25 +921,28 @@ def plant_kernel() -> wp.Kernel:
                     x.last = torque
                     x.stage = stage
                     x.fresh = f64(2.0)
-                after = shown(c.params[h], x.q, p)[0]
+                after = shown(c.params[h], x.q, x, p)[0]
             if i >= 0 and i <= warm and warm > 0:
                 x = held(c, h, g, i == warm, x, p)
                 if i == 0:
                     x.qm = x.q
                     x.vm = x.v
-                after = shown(c.params[h], x.q, p)[0]
+                after = shown(c.params[h], x.q, x, p)[0]
                 if on_motor:
-                    after = shown(c.params[h], x.qm, p)[0]
+                    after = shown(c.params[h], x.qm, x, p)[0]
             reported = after
             n = Now()
             n.held = i < warm or i < 0
-            end = t + dt - p.delay
+            waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
+            x.memory = kept
+            end = t + dt - waits
             while k + 1 < c_end and acts_at(c, k + 1, p) <= end - dt:
                 k += 1
             aim = command(c, c_begin, k, c_end, end, dt, p)
             n.target = aim[0]
             n.feed = aim[1]
-            n = drive_now(c, h, g, p, n)
+            n, kept = drive_now(c, h, g, dt, x, p, n)
+            x.memory = kept
             n = body_now(c, h, g, p, n)
             b = pair_now(c, h, p, n)
             n_sub = int(ONE_BODY_STEPS)
@@ -934,9 +956,9 @@ def plant_kernel() -> wp.Kernel:
                 x.v = f64(0.0)
                 x.qm = x.q
                 x.vm = f64(0.0)
-            after = shown(c.params[h], x.q, p)[0]
+            after = shown(c.params[h], x.q, x, p)[0]
             if on_motor:
-                after = shown(c.params[h], x.qm, p)[0]
+                after = shown(c.params[h], x.qm, x, p)[0]
             elif i < warm:
                 after = reported
             while s < s_end and c.sample_step[s] == i:
