@@ -11,7 +11,7 @@ from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import TouchResult
-from dexsim.gap.judge import kept_out
+from dexsim.gap.judge import conclude, kept_out
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import diagnosis as touch_report
 
@@ -31,6 +31,15 @@ def test_names_on_joints_that_need_no_effect_are_hints():
     assert [f.get("hint", False) for f in found] == [True, False, True]
     assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
     assert kept_out.firm(found) == [found[1]]
+
+
+def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a_quiet_joint():
+    """The motion of such a joint needs no effect, and that says nothing of its sensor; a whisper stays one."""
+    found = [finding(c) | {"effect": "current_sensor"} for c in (0.9, 0.45)] + [finding(0.9)]
+    conclude.mark_hints(found, quiet={"a"})
+    assert [f.get("hint", False) for f in found] == [False, True, True]
+    assert [f["confidence"] for f in found[:2]] == [0.9, 0.45]
+    assert kept_out.verdict(found[1:2], 1.0, 1.15, 1.1, 1.14, True) == "none"
 
 
 @pytest.mark.parametrize(

@@ -118,11 +118,19 @@ def into_diagnosis(
         data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
-    kept_out.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
+    mark_hints(findings, quiet)
     findings.sort(key=lambda f: f.get("hint", False))
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     _verdict(d, answers, kept, findings, refuted, noise.floor, how, s.seed, len(quiet) == len(answers))
     d.sentence = sentence(data, d, noise.floor)
+
+
+def mark_hints(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
+    """Which findings are hints (`kept_out.settle`). quiet: joints followed to their floor without any effect, which
+    says nothing of what is wrong with the reading of the effort alone."""
+    by_effort = [f for f in findings if EFFECTS[f["effect"]].effort_only]
+    kept_out.settle([f for f in findings if f not in by_effort], quiet)
+    kept_out.settle(by_effort, set())
 
 
 def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
