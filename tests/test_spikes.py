@@ -133,3 +133,16 @@ def test_values_that_no_joint_has_are_said_where_they_are_too_many_for_spikes(qu
     assert [(f.joint, f.topic, f.severity) for f in said] == [(r.joints[0], series.topic, "error")]
     series.value[:, 0] = np.where(np.arange(len(series.t)) % 50 == 25, 1e300, T[: len(series.t)])
     assert not [f for f in audit_values.units(r) if "farther than any joint" in f.text], "single ones are spikes"
+
+
+def test_the_crest_of_a_fast_reversal_with_a_message_missing_has_no_spike():
+    """Three samples are far from the median of their neighbours, and were reached in two large steps: one over the gap,
+    one behind the crest. They are where the joint was."""
+    before = -0.28 + 0.0 * np.arange(60)
+    before[-6:] = [-0.2807, -0.2730, -0.2592, -0.2393, -0.2163, -0.1948]
+    crest = [-0.1381, -0.1227, -0.1488]
+    after = np.r_[-0.1994, -0.2608, -0.3068, -0.3436, -0.3636, -0.3774, -0.3804, -0.3774, np.full(60, -0.375)]
+    x = np.r_[before, crest, after]
+    assert not spiked(x, "position").any()
+    x[[30, 31]] = 0.5  # two that are
+    assert np.flatnonzero(spiked(x, "position")).tolist() == [30, 31]

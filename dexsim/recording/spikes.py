@@ -23,6 +23,8 @@ MOST = 0.12
 NEARBY, JUMP = 10, 2.0
 """A spike is reached and left by more than so many times what the samples so near it (on each side) change by: the
 crest of a fast chirp is as far from the median of its neighbours, and is reached in steps like any other."""
+ROW = 2
+"""Spikes beside each other; a longer row is the crest of a fast reversal, where a message may be missing too."""
 LEVELS = 5
 """Plateaus at one value from which on it is a level that a command (a pulse train, a pseudo-random binary sequence)
 goes to on purpose."""
@@ -73,12 +75,15 @@ def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
 
 
 def _jumps(v: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """[n] bool: of samples `far`, those of a stretch that begins and ends with a jump (`JUMP`); False elsewhere."""
+    """[n] bool: of samples `far`, those of a stretch of at most `ROW` that begins and ends with a jump (`JUMP`); False
+    elsewhere."""
     out = np.zeros(len(v), bool)
     step = np.abs(np.diff(v))
     usual = np.where(far[1:] | far[:-1], np.nan, step)
     edge = np.flatnonzero(np.diff(np.r_[0, far.astype(int), 0]))
     for a, b in zip(edge[::2], edge[1::2], strict=True):
+        if b - a > ROW:
+            continue
         ordinary = usual[max(a - NEARBY, 0) : b + NEARBY]
         ordinary = ordinary[np.isfinite(ordinary)]
         most = float(np.quantile(ordinary, 0.8)) if len(ordinary) else 0.0
