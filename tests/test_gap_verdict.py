@@ -12,6 +12,7 @@ from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import TouchResult
 from dexsim.gap.judge import conclude, kept_out
+from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import diagnosis as touch_report
 
@@ -227,3 +228,33 @@ def test_touch_with_nothing_but_hints_within_its_noise_is_none():
         [{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03
     )
     assert touch_report._verdict(felt) == "none" and felt.findings[0]["hint"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "kinds", "dropped"),
+    [
+        ({"a": 3.0, "b": 0.7}, {}, "b"),  # what was kept out is followed better without b
+        ({"a": 3.0, "b": 1.2}, {}, None),  # each lowers the error
+        ({"a": 0.8, "b": 0.7}, {}, "b"),  # the one that harms most
+        ({"a": 3.0, "b": 0.7}, {"b": "rings"}, None),
+        ({"a": 3.0, "b": 0.7}, {"b": "effort_only"}, None),
+        ({"a": 0.5}, {}, None),  # a joint's only effect is judged with the joint
+        ({"a": 3.0, "b": None}, {}, None),  # better on the whole by one moment: it may remove much elsewhere
+    ],
+)
+def test_what_was_kept_out_takes_one_of_several_effects_back(errors, kinds, dropped):
+    """errors: rms error without an effect, with all 1; None: half of it, but for a moment in which it is 8 with all."""
+    t = np.arange(0.0, 20.0, 0.01)
+    answer = object.__new__(JointAnswer)
+    answer.t, answer.measured = t, np.zeros(len(t))
+    moment = (t > 3.0) & (t < 3.5)
+    answer.after = np.where(moment & (None in errors.values()), 64.0, 1.0) * np.ones(len(t))
+    members = []
+    answer._trials = {}
+    for name, error in errors.items():
+        kind = {k: kinds.get(name) == k for k in ("rings", "effort_only")}
+        members.append(SimpleNamespace(id=name, effect=SimpleNamespace(**kind)))
+        q = np.where(moment, 0.5, 1.5) if error is None else np.full(len(t), error)
+        answer._trials[name] = name, q, q
+    answer.best = SimpleNamespace(members=members)
+    assert answer._without_refuted() == dropped

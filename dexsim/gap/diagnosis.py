@@ -341,7 +341,7 @@ class Drives(Steps):
     def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
         """A joint on what was kept out."""
         known = self.ahead.get(id(search))
-        return known[0] if known else JointAnswer(search.case, search, found, self.kept)
+        return known[0] if known else JointAnswer.of(search.case, search, found, self.kept)
 
     def _plain(self, search: JointSearch) -> baseline.Baseline | None:
         """What a plain model of a joint leaves of what was kept out."""

@@ -79,6 +79,7 @@ class JointAnswer:
         )
         self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
+        self._trials: dict[str, tuple[Trial, np.ndarray, np.ndarray]] = {}  # of `_without`
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}
         self.found: list[dict[str, Any]] = []
@@ -120,6 +121,42 @@ class JointAnswer:
                 out[runs[i].name] = float(before), float(after)
         return out
 
+    @classmethod
+    def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: Kept) -> JointAnswer:
+        """The answer without those of several effects on the joint that what was kept out refutes: `outcome` loses
+        them, the one that harms most first."""
+        answer = cls(case, search, outcome, kept)
+        while (better := answer._without_refuted()) is not None:
+            outcome.best = better
+            answer = cls(case, search, outcome, kept)
+        return answer
+
+    def _without_refuted(self) -> Trial | None:
+        """The best hypothesis without the effect whose absence follows what was kept out best; None where each lowers
+        that error, or may remove as much of it as a name has to. No free run keeps step with what makes a joint ring,
+        and a reading of the effort moves nothing."""
+        if len(self.best.members) < 2 or not len(self.after):
+            return None
+        best, least = None, float(np.mean(self.after))
+        for mm in self.best.members:
+            if mm.effect.effort_only or mm.effect.rings:
+                continue
+            trial, q, _ = self._without(mm)
+            lost = (self.measured - q) ** 2
+            if np.mean(lost) < least and kept_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part:
+                best, least = trial, float(np.mean(lost))
+        return best
+
+    def _without(self, mm: Member) -> tuple[Trial, np.ndarray, np.ndarray]:
+        """(the best hypothesis without an effect, position and effort (rows,) of its free run)."""
+        if mm.id not in self._trials:
+            rest = tuple(x for x in self.best.members if x is not mm)
+            trial = without(self.search, self.best, mm) if rest else self.none
+            fixed = [f for x in rest for f in x.variant.fixed]
+            run = free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, fixed, True)
+            self._trials[mm.id] = trial, *run
+        return self._trials[mm.id]
+
     def judge(self, m: Mechanism) -> None:
         """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each."""
         self.found = [self._finding(mm, m) for mm in self.best.members]
@@ -128,11 +165,7 @@ class JointAnswer:
         case, best = self.case, self.best
         raw, spread = self._fitted(mm, self.bounds)
         self.raw[mm.id] = raw
-        rest = tuple(x for x in best.members if x is not mm)
-        trial = without(self.search, best, mm) if rest else self.none
-        q, effort = free_run(
-            self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True
-        )
+        trial, q, effort = self._without(mm)
         lost = (self.measured - q) ** 2
         effort_only = mm.effect.effort_only
         of_effort = self.effort_after if effort_only else None
