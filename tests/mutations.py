@@ -308,6 +308,35 @@ MUTATIONS = (
         "",
         "tests/test_gap_rules.py::test_every_kind_of_a_dead_zone_is_tried",
     ),
+    Mutation(
+        "the crest of a fast reversal is cut off as spikes",
+        "dexsim/recording/spikes.py",
+        "        if b - a > ROW:\n            continue\n",
+        "",
+        "tests/test_spikes.py::test_the_crest_of_a_fast_reversal_with_a_message_missing_has_no_spike",
+    ),
+    Mutation(
+        "an effect is taken back that one moment of what was kept out speaks against",
+        "dexsim/gap/judge/joint_answer.py",
+        "kept_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part",
+        "True",
+        "tests/test_gap_verdict.py::test_what_was_kept_out_takes_one_of_several_effects_back",
+    ),
+    Mutation(
+        "what makes a joint ring is taken back by a free run that cannot keep step",
+        "dexsim/gap/judge/joint_answer.py",
+        "            if mm.effect.effort_only or mm.effect.rings:\n                continue\n",
+        "",
+        "tests/test_gap_verdict.py::test_what_was_kept_out_takes_one_of_several_effects_back",
+    ),
+    Mutation(
+        "a whisper about an effort's sensor decides the verdict",
+        "dexsim/gap/judge/conclude.py",
+        "    kept_out.settle(by_effort, set())\n",
+        "",
+        "tests/test_gap_verdict.py::"
+        "test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a_quiet_joint",
+    ),
 )
 
 
