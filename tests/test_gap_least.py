@@ -35,6 +35,7 @@ class Judged(JointAnswer):
         self.without, self.after = np.full(ROWS, before), np.full(ROWS, after**2)
         self.before = self.without**2
         self.effort_after, self.raw, self.spans, self.evidence, self._trials = None, {}, {}, [], {}
+        self.earlier = None
 
     def _fitted(self, mm, bounds):
         return {}, {}

@@ -258,3 +258,33 @@ def test_what_was_kept_out_takes_one_of_several_effects_back(errors, kinds, drop
         answer._trials[name] = name, q, q
     answer.best = SimpleNamespace(members=members)
     assert answer._without_refuted() == dropped
+
+
+@pytest.mark.parametrize(
+    ("alone", "now", "before", "said"),
+    [
+        (1.0, 0.97, 0.48, 0.97),  # what went explains nothing by itself: it was in the way
+        (1.0, 0.70, 0.99, 0.99),  # what is left was known with it, too
+        (0.7, 0.82, 0.48, 0.48),  # by itself it explains half of the squared error: another explanation
+    ],
+)
+def test_what_is_left_is_believed_as_with_or_without_what_was_taken_back(alone, now, before, said):
+    """alone: rms error of what was kept out with the other effect alone, of 1 without any; confidences of what is left,
+    judged without the other and with it."""
+
+    class Answer(JointAnswer):
+        def __init__(self, confidence, earlier=None):
+            self.earlier, self.evidence, self.before = earlier, [], np.ones(100)
+            self.measured, self.sure = np.zeros(100), confidence
+            self.best = SimpleNamespace(members=[SimpleNamespace(id="lag")])
+
+        def _finding(self, mm, m):
+            self.evidence.append(SimpleNamespace(effect=mm.id, confidence=self.sure))
+            return {"confidence": self.sure}
+
+        def _without_id(self, effect):
+            return np.full(100, alone)
+
+    answer = Answer(now, Answer(before))
+    answer.judge(None)
+    assert answer.found[0]["confidence"] == answer.evidence[0].confidence == said

@@ -80,6 +80,7 @@ class JointAnswer:
         self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
         self._trials: dict[str, tuple[Trial, np.ndarray, np.ndarray]] = {}  # of `_without`
+        self.earlier: JointAnswer | None = None  # with an effect that was taken back since
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}
         self.found: list[dict[str, Any]] = []
@@ -127,8 +128,9 @@ class JointAnswer:
         them, the one that harms most first."""
         answer = cls(case, search, outcome, kept)
         while (better := answer._without_refuted()) is not None:
-            outcome.best = better
+            outcome.best, earlier = better, answer
             answer = cls(case, search, outcome, kept)
+            answer.earlier = earlier
         return answer
 
     def _without_refuted(self) -> Trial | None:
@@ -147,6 +149,10 @@ class JointAnswer:
                 best, least = trial, float(np.mean(lost))
         return best
 
+    def _without_id(self, effect: str) -> np.ndarray:
+        """Position (rows,) of a free run by the best hypothesis without an effect of this id."""
+        return self._without(next(mm for mm in self.best.members if mm.id == effect))[1]
+
     def _without(self, mm: Member) -> tuple[Trial, np.ndarray, np.ndarray]:
         """(the best hypothesis without an effect, position and effort (rows,) of its free run)."""
         if mm.id not in self._trials:
@@ -158,8 +164,21 @@ class JointAnswer:
         return self._trials[mm.id]
 
     def judge(self, m: Mechanism) -> None:
-        """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each."""
+        """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each.
+
+        Where an effect was taken back, what is left is judged with it and without, and believed the more: unless the
+        one that went explains a part of what was kept out by itself. It is another explanation then, and the less
+        counts."""
         self.found = [self._finding(mm, m) for mm in self.best.members]
+        if self.earlier is None:
+            return
+        self.earlier.judge(m)
+        for k, mm in enumerate(self.best.members):
+            with_it = next(e for e in self.earlier.evidence if e.effect == mm.id)
+            lost = np.mean((self.measured - self.earlier._without_id(mm.id)) ** 2)
+            other = lost <= (1 - JUDGE.part) * np.mean(self.before)
+            chosen = (min if other else max)(self.evidence[k], with_it, key=lambda e: e.confidence)
+            self.evidence[k], self.found[k]["confidence"] = chosen, chosen.confidence
 
     def _finding(self, mm: Member, m: Mechanism) -> dict[str, Any]:
         case, best = self.case, self.best
