@@ -127,7 +127,7 @@ def test_a_joint_that_is_not_searched_again_is_judged_ahead(seconds, stopped, se
     """Not where time is limited, nor one that may be searched again; what is judged ahead is not judged twice."""
     judged: list[str] = []
     monkeypatch.setattr(
-        "dexsim.gap.diagnosis.JointAnswer", lambda *x: judged.append("answer") or SimpleNamespace(of=x[1])
+        "dexsim.gap.diagnosis.JointAnswer.of", lambda *x: judged.append("answer") or SimpleNamespace(of=x[1])
     )
     monkeypatch.setattr("dexsim.gap.diagnosis.baseline.judged", lambda *x: judged.append("plain") or x[0])
     drives = object.__new__(Drives)
