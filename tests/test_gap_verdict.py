@@ -14,6 +14,7 @@ from dexsim.gap.inquiry import TouchResult
 from dexsim.gap.judge import conclude, kept_out
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
+from dexsim.gap.search.hypotheses import Outcome
 from dexsim.gap.touch import diagnosis as touch_report
 
 
@@ -288,3 +289,28 @@ def test_what_is_left_is_believed_as_with_or_without_what_was_taken_back(alone, 
     answer = Answer(now, Answer(before))
     answer.judge(None)
     assert answer.found[0]["confidence"] == answer.evidence[0].confidence == said
+
+
+def test_what_is_taken_back_does_not_reach_a_search():
+    """Joints are judged while others are still searched by what was found of them: only what follows the searches goes
+    on from what stands."""
+
+    class Answer(JointAnswer):
+        def __init__(self, case, search, outcome, kept):
+            self.outcome, self.earlier = outcome, None
+
+        def _without_refuted(self):
+            return {"three": "two", "two": "one"}.get(self.outcome.best)
+
+        def locate(self, rng, seed):
+            pass
+
+    found = Outcome("j", "none", "three", {}, {}, {}, {}, [])
+    answer = Answer.of(None, None, found, None)
+    assert (found.best, answer.outcome.best) == ("three", "one")
+    assert [answer.earlier.outcome.best, answer.earlier.earlier.outcome.best] == ["two", "three"]
+    drives = object.__new__(Drives)
+    drives.outcomes, drives._answer = [("case", "search", found)], lambda search, outcome: answer
+    drives.w = SimpleNamespace(settings=SimpleNamespace(seed=0))
+    drives.locate()
+    assert drives.outcomes == [("case", "search", answer.outcome)] and found.best == "three"

@@ -510,6 +510,8 @@ class Drives(Steps):
         seed = self.w.settings.seed
         rng = np.random.default_rng(seed)
         self.answers = compute.each(len(self.outcomes), lambda k: self._answer(*self.outcomes[k][1:]))
+        # nothing is searched any more: what follows goes on from what stands
+        self.outcomes = [(*x[:2], a.outcome) for x, a in zip(self.outcomes, self.answers, strict=True)]
         for a in self.answers:
             a.locate(rng, seed)
 

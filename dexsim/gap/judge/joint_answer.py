@@ -124,12 +124,12 @@ class JointAnswer:
 
     @classmethod
     def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: Kept) -> JointAnswer:
-        """The answer without those of several effects on the joint that what was kept out refutes: `outcome` loses
-        them, the one that harms most first."""
+        """The answer without those of several effects on the joint that what was kept out refutes, the one that harms
+        most first. `outcome` stays as it is: others may still be searched by it, and must not learn of what was kept
+        out."""
         answer = cls(case, search, outcome, kept)
         while (better := answer._without_refuted()) is not None:
-            outcome.best, earlier = better, answer
-            answer = cls(case, search, outcome, kept)
+            earlier, answer = answer, cls(case, search, replace(answer.outcome, best=better), kept)
             answer.earlier = earlier
         return answer
 
