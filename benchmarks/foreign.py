@@ -254,7 +254,11 @@ def report(plant: Path, out: Path) -> dict:
         (json.loads(p.read_text()) for p in (out / "truth").glob("*.json")), key=lambda t: (t["seed"], t["index"])
     )
     truths = [t for t in truths if (out / "diagnoses" / t["id"] / "run.json").is_file()]
-    read = lambda i: json.loads(p.read_text()) if (p := out / "diagnoses" / i / "diagnosis.json").is_file() else None  # noqa: E731
+
+    def read(i: str) -> dict | None:
+        path = out / "diagnoses" / i / "diagnosis.json"
+        return json.loads(path.read_text()) if path.is_file() else None
+
     answers = {t["id"]: read(t["id"]) for t in truths}
     seconds = {t["id"]: json.loads((out / "diagnoses" / t["id"] / "run.json").read_text())["seconds"] for t in truths}
     (out / "table.md").write_text(table(truths, answers, seconds), encoding="utf-8")

@@ -122,7 +122,8 @@ def test_a_gain_for_every_taxel_has_a_price():
 
 def test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken():
     for other, found in ((1.01, "thermal"), (1.03, "tactile_delay")):
-        loss = lambda ids, other=other: {(): (10.0, 10.0), ("tactile_delay",): (1.0, 2.0)}.get(ids, (other, 1.0))  # noqa: E731
+        known = {(): (10.0, 10.0), ("tactile_delay",): (1.0, 2.0)}
+        loss = lambda ids, known=known, other=other: known.get(ids, (other, 1.0))  # noqa: E731
         assert chosen(loss, "tactile_delay", "thermal")[0] == found, other
 
 
@@ -284,7 +285,8 @@ def test_what_is_left_of_a_pad_goes_with_something():
 
 
 def test_a_little_crosstalk_may_be_another_law():
-    doubt = lambda low: TOUCH_EFFECTS["tactile_crosstalk"].doubt({"parameters": {"fraction": {"low": low}}})  # noqa: E731
+    crosstalk = TOUCH_EFFECTS["tactile_crosstalk"]
+    doubt = lambda low: crosstalk.doubt({"parameters": {"fraction": {"low": low}}})  # noqa: E731
     assert doubt(0.13) and not doubt(0.17)
 
 

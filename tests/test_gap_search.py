@@ -168,7 +168,8 @@ def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
     fitter, params = valley()
     astray = fitter.fit(params, x0=np.array([0.7, 1.6, 1.0]), iterations=0)
     home = fitter.toward_prior(params, astray)
-    score = lambda f: f.loss + prior_weight(params) @ (f.x - np.array([p.start for p in params])) ** 2 / len(f.residual)  # noqa: E731
+    starts = np.array([p.start for p in params])
+    score = lambda f: f.loss + prior_weight(params) @ (f.x - starts) ** 2 / len(f.residual)  # noqa: E731
     assert abs(home.x[1] - 1.0) < 0.02 and abs(home.x[0] - 1.3) < 0.03 and score(home) < 0.1 * score(astray)
     assert fitter.toward_prior(params, home) is home  # there is nothing to gain
 

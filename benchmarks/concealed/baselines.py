@@ -199,7 +199,9 @@ def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tupl
 
     try:
         from mujoco import sysid as s
-        from mujoco.sysid import ParameterDict  # noqa: F401  (the package is there without its dependencies too, but empty)
+
+        # the package is there without its dependencies too, but empty
+        from mujoco.sysid import ParameterDict  # noqa: F401
         from mujoco.sysid._src.timeseries import SignalType  # noqa: F401
     except ImportError:
         return None

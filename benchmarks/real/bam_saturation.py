@@ -79,7 +79,10 @@ def load(folder: Path) -> Recorded:
     if not rows:
         raise UserError(f"{folder}: no BAM recordings (*.json); give the folder that holds bam/data.bak/raw")
     n = max(len(r[0]) for r in rows)
-    wide = lambda k, fill: np.stack([np.pad(r[k], (0, n - len(r[k])), constant_values=fill) for r in rows])  # noqa: E731
+
+    def wide(k, fill):
+        return np.stack([np.pad(r[k], (0, n - len(r[k])), constant_values=fill) for r in rows])
+
     register = np.array([r[4] for r in rows])
     return Recorded(wide(0, 0.0), wide(1, 1.0), wide(2, 0.0), wide(3, np.nan), register * DUTY_PER_RAD, register,
                     np.array([r[5] for r in rows]), np.array([r[6] for r in rows]))  # fmt: skip

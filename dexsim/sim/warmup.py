@@ -66,7 +66,8 @@ def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
         )
     ]
     wp.launch = context.launch = launch
-    wp.capture_while, wp.get_suggested_block_size = once, suggested  # type: ignore[assignment]  # what is called of them
+    # what is called of them
+    wp.capture_while, wp.get_suggested_block_size = once, suggested  # type: ignore[assignment]
     try:
         yield
     finally:

@@ -123,7 +123,8 @@ class NanDump:
         }
         try:
             with files.beside(path) as part, open(part, "wb") as file:
-                np.savez_compressed(file, world=int(self._world), config=json.dumps(cfg), **data)  # type: ignore[arg-type]  # as the stub has it
+                about = {"world": int(self._world), "config": json.dumps(cfg)}
+                np.savez_compressed(file, **about, **data)  # type: ignore[arg-type]  # as the stub has it
         except OSError as error:  # a full disk must not end the training over this
             print(f"{path}: a world that was not finite could not be written ({error.strerror})", flush=True)
             path.unlink(missing_ok=True)

@@ -392,7 +392,10 @@ def fit_stand_in(
     ridge = 1e-3 * len(y) * np.eye(4)
     solve = lambda k: np.linalg.solve(gram[k].sum(0) + ridge, right[k].sum(0)) / scale  # noqa: E731
     value = solve(np.arange(count))
-    each = lambda index, axis=-1: np.moveaxis(np.apply_along_axis(solve, axis, index.astype(int)), axis, 0)  # noqa: E731
+
+    def each(index: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.moveaxis(np.apply_along_axis(solve, axis, index.astype(int)), axis, 0)
+
     low, high = np.quantile(intervals.draws((np.arange(count),), each, seed, STAND_IN_DRAWS), [0.05, 0.95], axis=-1)
     before, after = _held_out(case, runs, trial, value, test, span_test)
     if not after < (1 - JUDGE.earns) * before:

@@ -707,7 +707,9 @@ def refine_motion_by_fits(
     misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
-        shown = lambda j, i: true_motion(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]  # noqa: E731
+        def shown(j: int, i: int) -> tuple[np.ndarray, ...]:
+            return true_motion(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]
+
         _refine(runs, [[shown(j, i) for i in range(len(runs))] for j in range(len(cases))])
         return build(model, runs, device=device, dt=dt)
 

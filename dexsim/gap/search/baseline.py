@@ -56,7 +56,11 @@ class Baseline:
 
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
-        unit = lambda n: UNITS.get(n, "1").replace("N.m", "N").replace("rad", "m") if self.slide else UNITS.get(n, "1")  # noqa: E731
+
+        def unit(n: str) -> str:
+            hinge = UNITS.get(n, "1")
+            return hinge.replace("N.m", "N").replace("rad", "m") if self.slide else hinge
+
         return {
             "error_before": self.error_before,
             "error": self.error,
