@@ -212,6 +212,9 @@ class Effect:
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
     jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
+    by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
+    # columns of the plant that training has no like of, and is given others in the place of (`instead_of_nearly`)
+    nearly: ClassVar[tuple[str, ...]] = ()
 
     def variants(self, s: Scales) -> list[Variant]:
         """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
@@ -236,6 +239,15 @@ class Effect:
     def size_by_torque(self, found: ByTorque) -> str:
         """Its size for the line about logged torque, with its unit; empty where the coefficient says it."""
         return ""
+
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        """Whether a coefficient of inverse dynamics can be what it is called. joint: as of `ByTorque`; slowest: the
+        lowest cutoff [Hz] of what was filtered."""
+        return True
+
+    def instead_of_nearly(self, row: np.ndarray, case: Case) -> dict[str, float]:
+        """Servo columns in the place of those `nearly`. row: the plant's, as fitted."""
+        return {}
 
     def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
         """What it does, in words, with its direction where its size tells that. believed: columns of the joint,

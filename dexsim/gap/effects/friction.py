@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects import ByTorque, Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.rules import BELIEF, JUDGE
 
@@ -54,6 +55,7 @@ class ViscousFriction(Effect):
     """Friction that grows with speed: b v, or (b + a / (1 + |v| / v_h)) v of grease that thins as it is sheared."""
 
     id = "viscous_friction"
+    by_torque = "viscous friction that differs by direction"
     words = "has friction that grows with speed"
     shows = "at high speed"
     experiment = "constant speeds from slow to fast"
@@ -111,6 +113,7 @@ class StribeckFriction(Effect):
     """Breakaway friction above the sliding level: peak exp(-|v / v_s|^n) sign(v), n 2 or 1."""
 
     id = "stribeck_friction"
+    by_torque = "stribeck_friction"
     words = "needs a breakaway torque above its sliding friction"
     shows = "at speeds between zero and v_s"
     experiment = "very slow ramps from rest, and the same faster"
@@ -138,11 +141,16 @@ class StribeckFriction(Effect):
         v_s = found.speed
         return {"peak": found.entry(found.force), "v_s": entry(v_s, 0.5 * v_s, 2 * v_s, f"{found.length}/s")}
 
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        return value > 0  # an excess is more
+
 
 class LoadFriction(Effect):
     """Friction that grows with the torque that a gear transmits, more or less where the load drives it."""
 
     id = "load_friction"
+    by_torque = "load_friction"
+    nearly = ("gear_load_friction", "gear_load_friction_backdriven")
     words = "has friction that grows with the load on its gear"
     shows = "at high load"
     experiment = "the same slow motion under two or more loads"
@@ -180,6 +188,20 @@ class LoadFriction(Effect):
 
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         return {"fraction": found.entry("1")}
+
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        return 0 < value < 1 and joint.get("coulomb_friction", 0.0) >= 0
+
+    def instead_of_nearly(self, row: np.ndarray, case: Case) -> dict[str, float]:
+        """Dry friction that grows with the torque on the joint, per torque from outside: the servo table knows that
+        torque without the joint's own inertia, and a line. As large as on average while the joint slid."""
+        share, back, power, unit = (
+            row[PLANT_INDEX[f"gear_load_{n}"]] for n in ("friction", "friction_backdriven", "power", "unit")
+        )
+        slides = case.regimes["speed"] > JUDGE.slides * case.scales.speed
+        load, speed = case.regimes["_load"][slides], case.regimes["_speed"][slides]
+        by_load = np.where(load * speed < 0.0, back, share) * unit * (np.abs(load) / unit) ** power
+        return {"load_friction_external": float(by_load.sum() / max(np.abs(load).sum(), 1e-12))}
 
 
 def give(s: Scales) -> float:

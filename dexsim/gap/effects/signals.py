@@ -42,6 +42,7 @@ class Lag(Effect):
     """A lag of the drive's torque, of first order or of second, or of the speed that its loop measures."""
 
     id = "lag"
+    by_torque = "lag"
     words = "builds its torque up with a lag"
     alike_by_torque = ("lag", "command_delay")
     shows = "at high acceleration"
@@ -83,6 +84,10 @@ class Lag(Effect):
 
     def size_by_torque(self, found: ByTorque) -> str:
         return f"{1e3 * found.value / found.joint['inertia']:.2g} ms"
+
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        # late, and its first term alone is fitted, which serves up to a radian of the lowest cutoff
+        return 0 < value < abs(joint["inertia"]) / (2 * np.pi * slowest)
 
 
 class PositionOffset(Effect):

@@ -66,22 +66,19 @@ def undamped(trial: Trial, kp: float) -> float:
     )
 
 
-NEARLY = ("gear_load_friction", "gear_load_friction_backdriven")  # handed on as `share_of_outside`
+NEARLY = frozenset(name for e in CATALOGUE for name in e.nearly)
 
 
-def share_of_outside(case: Case, trial: Trial) -> float:
-    """Dry friction of a trial that grows with the torque on the joint, per torque from outside: the servo table knows
-    that torque without the joint's own inertia, and a line. As large as on average while the joint slid."""
+def instead_of_nearly(case: Case, trial: Trial) -> dict[str, float]:
+    """Servo columns in the place of fitted ones that training has no like of."""
+    fitted = {name for p in trial.fit.params for name in p.columns}
+    wanted = [e for e in CATALOGUE if fitted & {*e.nearly}]
+    if not wanted:
+        return {}
     row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0].copy()
     for name, value in (f for m in trial.members for f in m.variant.fixed):
         row[PLANT_INDEX[name]] = value
-    share, back, power, unit = (
-        row[PLANT_INDEX[f"gear_load_{n}"]] for n in ("friction", "friction_backdriven", "power", "unit")
-    )
-    slides = case.regimes["speed"] > JUDGE.slides * case.scales.speed
-    load, speed = case.regimes["_load"][slides], case.regimes["_speed"][slides]
-    by_load = np.where(load * speed < 0.0, back, share) * unit * (np.abs(load) / unit) ** power
-    return float(by_load.sum() / max(np.abs(load).sum(), 1e-12))
+    return {name: value for e in wanted for name, value in e.instead_of_nearly(row, case).items()}
 
 
 def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
@@ -93,8 +90,7 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
         for name, value in x.variant.fixed:
             if name in INDEX:
                 out[name] = float(joints.index(x.variant.note["from_joint"])) if name == "coupling_from" else value
-    if "gear_load_friction" in fitted:
-        out["load_friction_external"] = share_of_outside(case, trial)
+    out |= instead_of_nearly(case, trial)
     if fitted & {"backlash", "softness"} and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out

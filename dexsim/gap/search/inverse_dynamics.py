@@ -21,7 +21,9 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
-from dexsim.gap.effects.friction import LoadFriction, StribeckFriction
+from dexsim.gap.effects.catalogue import CATALOGUE
+from dexsim.gap.effects.friction import LoadFriction, StribeckFriction, ViscousFriction
+from dexsim.gap.effects.signals import Lag
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
@@ -275,13 +277,11 @@ def unphysical(d: Columns) -> dict[str, str]:
 
 DRAWS = 300  # of a bootstrap
 QUARTERS = 4  # of a recording, each left out in turn
-BY_DIRECTION, SQUARE, LAG, STRIBECK = (
-    "viscous friction that differs by direction",
-    "friction with the square of the speed",
-    "lag",
-    StribeckFriction.id,
-)
-LOAD = LoadFriction.id
+EFFECT = {e.by_torque: e for e in CATALOGUE if e.by_torque}
+BY_DIRECTION, LAG, STRIBECK = ViscousFriction.by_torque, Lag.by_torque, StribeckFriction.by_torque
+LOAD = LoadFriction.by_torque
+# laws that the catalogue has no effect for
+SQUARE = "friction with the square of the speed"
 GIVES = "dry friction that gives way before it slides"
 DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # of the whole motion: over which it may give way (P. Dahl 1968)
 SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck's excess may be down to 1/e
@@ -449,7 +449,8 @@ def _name(
 
 
 def _effect(name: str) -> str:
-    return {BY_DIRECTION: "viscous_friction", LAG: "lag", STRIBECK: STRIBECK, LOAD: LOAD}.get(_kind(name), "")
+    kind = _kind(name)
+    return EFFECT[kind].id if kind in EFFECT else ""
 
 
 def _kind(name: str) -> str:
@@ -457,15 +458,11 @@ def _kind(name: str) -> str:
 
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Whether a coefficient can be what it is called: a lag is late, an excess is more, and what gives way is friction
-    that is there. Of a lag the first term alone is fitted, which serves up to a radian of the lowest cutoff."""
-    if name == LAG:
-        return 0 < c < abs(theta["inertia"]) / (2 * np.pi * LEAST)
-    if _kind(name) == GIVES:
+    """Whether a coefficient can be what it is called; what gives way is friction that is there."""
+    kind = _kind(name)
+    if kind == GIVES:
         return 0 < c < 2 * theta.get("coulomb_friction", 0.0)
-    if name == LOAD:
-        return 0 < c < 1 and theta.get("coulomb_friction", 0.0) >= 0
-    return c > 0 if _kind(name) == STRIBECK else True
+    return kind not in EFFECT or EFFECT[kind].possible_by_torque(c, theta, LEAST)
 
 
 def _intervals(
