@@ -24,7 +24,9 @@ from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint_answer, kept_out
 from dexsim.gap.judge.joint_answer import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
+from dexsim.gap.plant.case import coupled
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
+from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import search as selecting
 from dexsim.gap.search import shaking
@@ -680,6 +682,38 @@ def test_a_joint_must_shake_in_some_windows():
             assert (shaking.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, (fitted, kept)
     finally:
         shaking.Shaking = made
+
+
+def test_an_effect_must_plainly_tell_how_a_joint_rings():
+    made, catalogue = shaking.Shaking, shaking.CATALOGUE
+    p = param("softness", "softness", "set", 0.0, 1.0)
+    gives = SimpleNamespace(id="gives", rings=True, variants=lambda _: [Variant((p,), ((0.1,),))])
+    fit = SimpleNamespace(loss=100.0)
+    search = SimpleNamespace(
+        deadline=Deadline(), allowed=None, case=SimpleNamespace(scales=None), rng=np.random.default_rng(0),
+        _narrow=lambda v: v, _fix=lambda _: nullcontext(), fitter=SimpleNamespace(fit=lambda *_, **__: fit),
+    )  # fmt: skip
+    nothing = SimpleNamespace(joint="j", none=Trial((), fit), best=Trial((), fit), scanned=[])
+    try:
+        shaking.CATALOGUE = [gives]
+        for left, named in ((0.7, True), (0.8, False)):  # of what is missed without it
+            shaking.Shaking = lambda *_, left=left: SimpleNamespace(
+                loud=np.ones(10, bool),
+                of=lambda t: np.full(10, left if t.members else 1.0),
+                best=lambda *_: (10 * left, [], np.zeros(0)),
+            )
+            assert (shaking.answered(search, nothing).best.ids == ("gives",)) is named, left
+    finally:
+        shaking.Shaking, shaking.CATALOGUE = made, catalogue
+
+
+def test_joints_are_searched_again_that_feel_each_others_motion():
+    def felt(share: float) -> bool:
+        series = np.zeros((100, len(SERIES_INDEX)))
+        series[:, SERIES_INDEX["rest"]] = share * 2.0 * (-1.0) ** np.arange(100)
+        return coupled([SimpleNamespace(plant=SimpleNamespace(series=series), scales=SimpleNamespace(tau=2.0))])
+
+    assert felt(0.04) and not felt(0.02)
 
 
 def test_how_much_a_joint_shakes_counts_before_where_it_rests():

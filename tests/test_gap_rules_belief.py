@@ -70,6 +70,28 @@ def test_a_joint_that_rings_is_not_noisy():
     assert restless(8.0, 0.15, speed=1.0) is None  # readings whose times vary are noisier where it moves faster
 
 
+def with_quiet_parts(count: int) -> float | None:
+    """What `quiet_noise` says of 100 half seconds with noise of 1 mrad, of which a few, the fastest, have a tenth."""
+    t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
+    on = np.arange(5000) // 50 >= 100 - count
+    return quiet_noise([(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))], 0.0)
+
+
+def test_a_few_quiet_moments_are_no_accident_only_from_three_on():
+    assert with_quiet_parts(2) is None and with_quiet_parts(3) is not None
+
+
+def test_what_noise_is_usual_is_told_by_several_joints():
+    def told(others: int) -> bool:
+        rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
+        q = 0.3 * np.sin(0.4 * t)[:, None] + 1e-3 * rng.normal(size=(2000, others + 1))
+        q[:, -1] += 4e-3 * np.sqrt(2) * np.sin(2 * np.pi * 31.0 * t + 0.2)
+        run = SimpleNamespace(name="a", t=t, q=q, torque=None)
+        return usual_noise([run], others, 4e-3, np.ones(others + 1)) is not None
+
+    assert [told(n) for n in (2, 3)] == [False, True]
+
+
 def rattling(loud: float, swings: float, others: float = 0.3, torque: float | None = None,
              steady: bool = False) -> float | None:  # fmt: skip
     """What `usual_noise` says of the last of four joints with noise of 1 mrad, which scatters by `loud` times as much:

@@ -168,6 +168,21 @@ class SearchRules:
         "test_how_much_a_joint_shakes_counts_before_where_it_rests",
     )
 
+    coupled: float = _rule(
+        0.03,
+        "of a joint's typical torque: what reaches it from the motion of others: from it on it matters how well that "
+        "is known, and joints are searched again with what was found in the others",
+        "below `belief.tolerance`: were all of it wrong, the torque would be off by less than figures of a drive are",
+        "test_joints_are_searched_again_that_feel_each_others_motion",
+    )
+    plainly: float = _rule(
+        0.24,
+        "share that an effect must remove of what is missed of how a joint rings to be named by it; of the squared "
+        "error to be doubted only where a free run does not show it",
+        "twice `least`, and below a half, which what makes a made-up loop ring removes at least",
+        "test_an_effect_must_plainly_tell_how_a_joint_rings",
+    )
+
 
 @dataclass(frozen=True)
 class JudgeRules:
@@ -609,6 +624,18 @@ class BeliefRules:
         "share of half seconds in which a joint must ring for its noise to be told by the others",
         "as `rings`",
         "test_a_joint_that_rings_is_not_noisy",
+    )
+    quiet_parts: int = _rule(
+        2,
+        "half seconds that may be quieter by accident than what is usual where a joint moves as fast or faster",
+        "a stretch no longer than half a second touches two of them at most",
+        "test_a_few_quiet_moments_are_no_accident_only_from_three_on",
+    )
+    others: int = _rule(
+        3,
+        "joints of a machine that move as far, at least, by which it is told what noise is usual",
+        "the median of three is not moved by one that is off, that of two is",
+        "test_what_noise_is_usual_is_told_by_several_joints",
     )
     zero: float = _rule(
         2.0,

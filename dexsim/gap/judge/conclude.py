@@ -297,10 +297,10 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
-    if before > SEARCH.enough**2 and after < (1 - 2 * SEARCH.least) * before:
+    if before > SEARCH.enough**2 and after < (1 - SEARCH.plainly) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
-    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= 2 * SEARCH.least
+    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= SEARCH.plainly
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 

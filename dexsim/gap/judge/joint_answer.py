@@ -478,6 +478,7 @@ def _curve(
 # likelihood of all windows, its interval from where that falls by 1.35 (90 %). A likelihood-ratio test against s = 0
 # decides whether there is any to report.
 
+# numerics of this likelihood; what it must gain for jitter to be reported is `JUDGE.jitter`
 LATE = 2e-3  # s: by what a command is late to see what it does, at most a fifth of the time between commands
 WINDOWS = 24  # at most, evenly over the recordings
 ALIKE = (0.05, 0.2)  # s: over which times that are off may be alike

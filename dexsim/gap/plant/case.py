@@ -24,10 +24,10 @@ from dexsim.gap.rules import BELIEF, SEARCH
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 BESIDE = 3  # neighbours on each side by which a sample's noise is told
-HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples, of a part of a recording that may ring by itself
-FEWEST_OTHERS = 3  # joints that tell what noise is usual
-FEW = 2  # parts that may be quieter by accident than what is usual
-REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
+HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples: numerics of the parts of a recording that may ring by itself
+FEWEST_OF_ALL = 2 * FEWEST_SAMPLES  # of a whole recording, of whose differences a moment or a correlation is taken
+# whether a reading is rounded, a test of a signal: of its samples like the one before; others do not repeat
+REPEATS = 0.5
 
 
 @dataclass
@@ -127,7 +127,8 @@ def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray]], quantum: float
                 speeds.append(abs(float(np.polyfit(mid[on] - mid[on].mean(), q[on], 1)[0])))
     level = np.array(levels)[np.argsort(speeds)]
     # of the parts as fast or faster a few are needed to say what is usual there
-    usual = [np.partition(level[i:], FEW)[FEW] for i in range(len(level) - FEW)]
+    few = BELIEF.quiet_parts
+    usual = [np.partition(level[i:], few)[few] for i in range(len(level) - few)]
     if not usual or np.mean(level[: len(usual)] > BELIEF.rings * np.array(usual)) <= BELIEF.ringing:
         return None
     return float(np.median(level[level < 2 * np.quantile(level, 0.1)]))
@@ -148,7 +149,7 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     at its middle (`BELIEF.steady`), or its motor's torque scatters by even more than they do."""
     ways = np.mean([_way(r.t, r.q) for r in runs], 0)
     others = [k for k, way in enumerate(ways) if k != j and way > 0.5 * ways[j]]
-    if len(others) < FEWEST_OTHERS:
+    if len(others) < BELIEF.others:
         return None
     usual = float(np.median([_of_recordings(runs, [noise(r.t, r.q[:, k])[0] for r in runs]) for k in others]))
     if own <= BELIEF.noisier * usual:
@@ -164,7 +165,7 @@ def _kurtosis(x: np.ndarray) -> float:
     out; a normal distribution's where it is too short to tell."""
     second = np.abs(np.diff(x, 2))
     second = second[second < 4 * np.median(second) / 0.6745] if len(second) else second
-    if len(second) < FEWEST_SAMPLES * FEW:
+    if len(second) < FEWEST_OF_ALL:
         return 3.0
     return float(np.mean(second**4) / np.mean(second**2) ** 2)
 
@@ -190,7 +191,7 @@ def _coloured(x: np.ndarray) -> np.ndarray:
     too short to tell. What a sudden motion adds is cut off."""
     third = np.diff(x, 3)
     cut = 3 * float(np.median(np.abs(third))) / 0.6745 if len(third) else 0.0
-    if len(third) < FEWEST_SAMPLES * FEW or cut <= 0.0:
+    if len(third) < FEWEST_OF_ALL or cut <= 0.0:
         return np.array(WHITE)
     third = np.clip(third, -cut, cut)
     return np.array([np.mean(third[k:] * third[:-k]) for k in (2, 3, 4)]) / np.mean(third**2)
@@ -657,8 +658,6 @@ WIDTH = 0.06  # s: of the smoothing of the difference
 EVERY = 2e-3  # s between the samples of the refined motion
 TURN = 1e-4  # rad: over which the change of an encoder's slope is taken
 PASSES = 2  # of building the cases along the motion that they show
-# of a joint's typical torque: what reaches it from the motion of others before it matters how well that is known
-COUPLED = 0.03
 
 
 def refined_cases(
@@ -689,7 +688,7 @@ def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ..
 
 def coupled(cases: Sequence[Case]) -> bool:
     """Whether the joints' motions reach each other through the mechanism."""
-    return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > COUPLED * c.scales.tau for c in cases)
+    return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > SEARCH.coupled * c.scales.tau for c in cases)
 
 
 def refine_motion_by_fits(

@@ -28,6 +28,7 @@ from dexsim.gap.read import Run
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
+# what the tests of a signal go by
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
 BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judged before and after it
@@ -483,6 +484,7 @@ def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 # -- the rhythm of an encoder's readings ------------------------------------------------------------------------------
 # An encoder that is read more seldom than it is logged: the rhythm of its readings, and the samples between them.
 
+# what this test of a signal goes by
 LEAP = 3.0  # steps of the encoder: a reading that stood and changes by as many at once has been read anew
 LEAPS = 0.25  # of all its changes: so many leaps
 SELDOM = 4.0  # samples, at least, from one new reading to the next

@@ -427,6 +427,7 @@ def merged_spans(*several: dict[str, list[tuple[float, float]]]) -> dict[str, li
 # -- end stops --------------------------------------------------------------------------------------------------------
 # Ends of a joint's motion that the model does not have: a joint that its drive presses against something hard.
 
+# what this test of a signal goes by
 NEAR = 0.012  # of the joint's whole motion: as near to its outermost position
 PRESSED = 5.0  # x the usual error at rest: what no friction would hold
 AGAINST = 5.0  # x gravity, at least, of the torque asked for: what no load would hold

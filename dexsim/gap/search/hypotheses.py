@@ -105,6 +105,7 @@ def fits_beside(a: Member, b: Member) -> bool:
 # -- what is refitted with every hypothesis ---------------------------------------------------------------------------
 # What is refitted with every hypothesis: believed figures within their tolerance, stated ranges, what nobody knows.
 
+# figures of a drive, by column of the servo table: what is believed of them, no effect, is refitted; in this order
 USUAL = (
     "kp",
     "kd",

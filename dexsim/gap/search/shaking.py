@@ -29,7 +29,8 @@ from dexsim.gap.search.search import JointSearch
 
 APART = (1, 2, 3)  # samples between a reading and those that it is compared with
 SETTLES = 0.25  # s of a window before it is looked at: what was let go at a measured state swings in
-MOST_LOG, MOST_AWAY = 3.0, 5.0  # log ratio of what shakes, and x the usual miss of the mean: more counts as much
+# caps of a misfit: log ratio of what shakes, and x the usual miss of the mean: more counts as much
+MOST_LOG, MOST_AWAY = 3.0, 5.0
 # speed of a sine over its `levels[0]` and the time between samples: sqrt(2) wT / (1 - cos wT), within a tenth of this
 # from 1.6 to 3 rad a sample
 KICK = 2.1
@@ -200,7 +201,7 @@ def _starts(member: Member) -> list[tuple[float, ...]]:
 
 def answered(search: JointSearch, found: Outcome) -> Outcome:
     """What the search of a joint found; where it rings by itself and that is hardly followed, the effect that makes it
-    ring as measured in the place of what was found, if any does by at least `SEARCH.least` more."""
+    ring as measured in the place of what was found, if any does by at least `SEARCH.plainly` more."""
     followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
     if followed or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by
@@ -231,7 +232,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     gain = 1 - left[name].sum() / before.sum()
     draws = search.rng.integers(0, len(before), (DRAWS, len(before)))
     sums = {e: x[draws].sum(1) for e, x in left.items()}
-    if gain < 2 * SEARCH.least or np.mean(sums[name] < before[draws].sum(1)) < 1 - SEARCH.chance:
+    if gain < SEARCH.plainly or np.mean(sums[name] < before[draws].sum(1)) < 1 - SEARCH.chance:
         return found
     won = np.argmin(np.stack(list(sums.values())), 0)
     share = {e: float(np.mean(won == k)) for k, e in enumerate(sums)}
