@@ -83,6 +83,27 @@ def stretches(units: int, length: int, seed: Seed, count: int = 1000) -> np.ndar
     return ((starts[..., None] + np.arange(length)) % units).reshape(count, -1)
 
 
+def singles(units: int, seed: Seed, count: int = 1000) -> np.ndarray:
+    """[count, units] index of the units of each resample, drawn singly: for a statistic that compares several samples
+    over the same resamples."""
+    return stretches(units, 1, seed, count)
+
+
+def nested_means(groups: Sequence[np.ndarray], picks: np.ndarray, seed: Seed) -> np.ndarray:
+    """[count] averages of a two-stage bootstrap (Davison and Hinkley, 1997, section 3.8): `picks` [count, G] are the
+    groups of each resample (`singles(G, ...)`; the same for two sets of groups that are paired), and the values of each
+    picked group are drawn anew within it. groups: G arrays of values, of any length each; a group's mean counts once,
+    however many values it has."""
+    rng, out = np.random.default_rng(seed), np.zeros(len(picks))
+    for pick in picks.T:
+        for k, own in enumerate(groups):
+            chosen = pick == k
+            if not chosen.any():
+                continue
+            out[chosen] += own[singles(len(own), rng, int(chosen.sum()))].mean(1)
+    return out / picks.shape[1]
+
+
 def wins(losses: np.ndarray, index: np.ndarray, within: float) -> np.ndarray:
     """[H] share of the resamples `index` [count, m] in which the sum of each of H losses [H, E] is the least of all;
     those that are near it share a resample, one that is worse by `within` (relative) by 1 to e."""

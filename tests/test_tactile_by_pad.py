@@ -305,8 +305,8 @@ def test_recorded_sequences_replay_and_lanes_agree(monkeypatch):
 
 
 PADS = (
-    "+tactile.pads.index={gain:[0.5,0.9],crosstalk:[0.1,0.3],hysteresis:0.3,delay:[0.0,0.04],stuck:{5:1.0},swapped:[[66,67]],dead:[78],"
-    "rubber:{c10:8e4},taxels:{40:[0.2,0.4]}}"
+    "+tactile.pads.index={gain:[0.5,0.9],crosstalk:[0.1,0.3],hysteresis:0.3,delay:[0.0,0.04],stuck:{5:1.0},"
+    "swapped:[[66,67]],dead:[78],rubber:{c10:8e4},taxels:{40:[0.2,0.4]}}"
 )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from benchmarks.real.common import save
+from dexsim import intervals
 from dexsim.errors import UserError
 
 JOINTS = tuple(f"joint{k}" for k in range(1, 8))
@@ -59,7 +60,8 @@ def convert(data: Path, out: Path) -> Panda:
 def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:
     """What a plain least squares makes of the first `share` of the trajectory, by joint: Coulomb, viscous friction and
     offset on the torque less the rigid body (central derivatives by a local polynomial), with 90 % of a block
-    bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m). Shares no code with the tool."""
+    bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m). Shares no code with the tool but how blocks are
+    drawn."""
     raw = np.load(data / FILE)
     model = mujoco.MjModel.from_xml_path(str(data / "panda.xml"))
     state = mujoco.MjData(model)
@@ -76,7 +78,7 @@ def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:
         body[i] = state.qfrc_inverse
     on = slice(width, int(share * len(t)) - width)
     block = ((t[on] - t[on][0]) / BLOCK).astype(int)
-    pick = np.random.default_rng(0).integers(0, block.max() + 1, (DRAWS, block.max() + 1))
+    pick = intervals.singles(block.max() + 1, 0, DRAWS)
     out = {}
     for j, joint in enumerate(JOINTS):
         X = np.stack([savgol_filter(np.sign(v[:, j]), width, 3)[on], v[on, j], np.ones(on.stop - on.start)], 1)

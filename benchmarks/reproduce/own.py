@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.reproduce import jobs, report, rows
 from benchmarks.reproduce.jobs import Job, Plan
+from dexsim import intervals
 
 REFERENCE = rows.ROTATION[0]
 """What rows of our own are compared with; each differs from it in one setting."""
@@ -49,8 +50,9 @@ def lost(found: dict[str, list[dict]], rng: np.random.Generator) -> dict[str, An
     simulated, other = (report.trials(found[w])[0] if found.get(w) else [] for w in jobs.WORLDS)
     if not simulated or len(simulated) != len(other) or not all(s.mean() > 0 for s in simulated):
         return None
-    picks = [rng.integers(len(simulated), size=report.RESAMPLES) for _ in simulated]
-    draws = 1 - report.resampled(other, rng, picks) / np.maximum(report.resampled(simulated, rng, picks), 1e-9)
+    picks = intervals.singles(len(simulated), rng, report.RESAMPLES)
+    kept, all_of_it = (intervals.nested_means(x, picks, rng) for x in (other, simulated))
+    draws = 1 - kept / np.maximum(all_of_it, 1e-9)
     return {
         "lost": 1 - float(np.mean([s.mean() for s in other]) / np.mean([s.mean() for s in simulated])),
         "interval": [float(x) for x in np.percentile(draws, [2.5, 97.5])],

@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from benchmarks.reproduce import jobs, rows
 from benchmarks.reproduce.jobs import Job, Plan
 from benchmarks.reproduce.rows import Row
+from dexsim import intervals
 
 RESAMPLES = 4000
 SMOOTH = 15
@@ -32,24 +33,11 @@ def trials(found: list[dict]) -> tuple[list[np.ndarray], float, float]:
     return successes, fall, capped
 
 
-def resampled(
-    successes: list[np.ndarray], rng: np.random.Generator, picks: list[np.ndarray] | None = None
-) -> np.ndarray:
-    """[RESAMPLES] averages: seeds drawn anew with replacement (or as in `picks`, [RESAMPLES] for each seed), then
-    trials within each."""
-    out = np.zeros(RESAMPLES)
-    for pick in picks or [rng.integers(len(successes), size=RESAMPLES) for _ in successes]:
-        for k, own in enumerate(successes):
-            chosen = pick == k
-            out[chosen] += own[rng.integers(len(own), size=(int(chosen.sum()), len(own)))].mean(1)
-    return out / len(successes)
-
-
 def rotation_row(row: Row, found: list[dict], rng: np.random.Generator) -> dict[str, Any]:
     """One row of the rotation table in one world, trials of all seeds together."""
     successes, fall, capped = trials(found)
     everything = np.concatenate(successes)
-    draws = resampled(successes, rng)
+    draws = intervals.nested_means(successes, intervals.singles(len(successes), rng, RESAMPLES), rng)
     average = float(np.mean([s.mean() for s in successes]))
     return {
         "average": average, "interval": [float(x) for x in np.percentile(draws, [2.5, 97.5])],

@@ -16,6 +16,7 @@ from scipy import stats
 
 from benchmarks import tools
 from benchmarks.touch_matters import rows
+from dexsim import intervals
 from dexsim.errors import UserError
 
 DRAWS = 4000
@@ -45,13 +46,8 @@ def paired(a: Sequence[np.ndarray], b: Sequence[np.ndarray], rng: np.random.Gene
     if len(a) != len(b) or len(a) < 2:
         raise UserError(f"{len(a)} and {len(b)} seeds: a comparison needs at least two pairs")
     each = np.array([x.mean() - y.mean() for x, y in zip(a, b, strict=True)])
-    draws = np.empty(DRAWS)
-    for k in range(DRAWS):
-        picks = rng.integers(len(each), size=len(each))
-        draws[k] = np.mean([
-            a[i][rng.integers(len(a[i]), size=len(a[i]))].mean() - b[i][rng.integers(len(b[i]), size=len(b[i]))].mean()
-            for i in picks
-        ])  # fmt: skip
+    picks = intervals.singles(len(each), rng, DRAWS)
+    draws = intervals.nested_means(a, picks, rng) - intervals.nested_means(b, picks, rng)
     low, high = np.percentile(draws, [2.5, 97.5])
     student = over_seeds(each)
     low, high = min(low, student[0]), max(high, student[1])

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.columns import Param, expand, neutral_of
@@ -230,7 +231,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     left = {e: shaking.of(t) for e, (_, t) in tries.items()}
     name = min(left, key=lambda e: float(left[e].sum()))
     gain = 1 - left[name].sum() / before.sum()
-    draws = search.rng.integers(0, len(before), (DRAWS, len(before)))
+    draws = intervals.singles(len(before), search.rng, DRAWS)
     sums = {e: x[draws].sum(1) for e, x in left.items()}
     if gain < SEARCH.plainly or np.mean(sums[name] < before[draws].sum(1)) < 1 - SEARCH.chance:
         return found
