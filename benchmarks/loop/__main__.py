@@ -522,18 +522,12 @@ class Loop:
                 )
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
-                    add = lambda what, run, gpu, after, rank, behind=(), here=here, name=name, w=w: out.append(  # noqa: E731
-                        Job(
-                            f"{what} {name} {w}",
-                            here / f"{what.replace(' ', '_')}.done",
-                            run,
-                            gpu,
-                            after,
-                            rank,
-                            self.uses["train" if gpu else "judge"],
-                            list(behind),
-                        )
-                    )
+
+                    def add(what, run, gpu, after, rank, behind=(), here=here, name=name, w=w):
+                        uses = self.uses["train" if gpu else "judge"]
+                        done = here / f"{what.replace(' ', '_')}.done"
+                        out.append(Job(f"{what} {name} {w}", done, run, gpu, after, rank, uses, list(behind)))
+
                     add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8, diagnoses)
                     add(
                         "fitted",

@@ -217,7 +217,8 @@ HEAD = """\
 
 def text(world: dict[str, Any]) -> str:
     """The file of a drawn world."""
-    return HEAD.format(**world) + yaml.safe_dump(world, sort_keys=False, width=130, default_flow_style=None)
+    body = yaml.safe_dump(world, sort_keys=False, width=90, default_flow_style=None)  # soft: lines of up to 120
+    return HEAD.format(**world) + body
 
 
 def main(argv: list[str]) -> int:
