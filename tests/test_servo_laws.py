@@ -440,3 +440,32 @@ def test_the_torque_along_a_measured_motion_follows_the_kernels_laws():
     assert np.allclose(out.numpy(), np.stack([torque, duty], 1), atol=1e-6) and np.abs(torque).max() > 0.35
     assert np.array_equal(torque_along(asked, v, np.inf, np.inf, False), asked)
     assert np.array_equal(torque_along(asked, v, 0.4, 10.0, False, limited=False), asked)
+
+
+@wp.kernel
+def searched(torque: wp.array(dtype=wp.float64), v: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    one = wp.float64(1.0)
+    out[i, 0] = laws.sagged_torque(wp.float64(0.3), wp.float64(0.2), torque[i])
+    out[i, 1] = laws.gear_load_friction(
+        torque[i], v[i], wp.float64(0.1), wp.float64(0.4), wp.float64(1.5), wp.float64(2.0)
+    )
+    out[i, 2] = laws.gear_load_friction(torque[i], v[i], wp.float64(0.1), wp.float64(0.4), one, wp.float64(2.0))
+    out[i, 3] = laws.duty_torque(torque[i], wp.float64(0.4), wp.float64(1.2), wp.float64(0.04), v[i])
+
+
+def test_laws_that_only_the_search_has():
+    """A drive weakened by its own torque and by others', down to a fifth; a gear's friction by a power of the torque
+    that it hands on, linear at power 1; a motor at a duty beyond its supply."""
+    rng = np.random.default_rng(1)
+    torque, v = rng.uniform(-4.0, 4.0, 200), rng.uniform(-12.0, 12.0, 200)
+    out = wp.zeros((200, 4), dtype=wp.float64, device="cpu")
+    inputs = [wp.array(x, dtype=wp.float64, device="cpu") for x in (torque, v)]
+    wp.launch(searched, 200, inputs=[*inputs, out], device="cpu")
+    left, friction, linear, duty = out.numpy().T
+    size = np.abs(torque)
+    share = np.where(torque * v < 0, 0.4, 0.1)
+    assert np.allclose(left, np.maximum(0.7 - 0.2 * size, 0.2)) and (left == 0.2).any() and (left > 0.2).any()
+    assert np.allclose(friction, share * 2.0 * (size / 2.0) ** 1.5)
+    assert np.allclose(linear, share * size)
+    assert np.allclose(duty, 0.4 * (1.2 * torque) - 0.04 * v)

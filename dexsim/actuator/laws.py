@@ -294,11 +294,29 @@ def supply_left(features: frozenset[str] = frozenset()) -> Any:
     return left
 
 
+LEAST_LEFT = wp.constant(0.2)  # of what a drive gives: a supply that sags below that resets the drive
+
+
+@wp.func
+def sagged_torque(others: Any, per_own: Any, torque: Any):
+    """Share that is left of a drive's torque where it and the other motors load one supply: 1 - others - per_own
+    [1/N.m] * |torque| [N.m], at least LEAST_LEFT; others: the part that the other motors take, torque: the drive's own
+    in the step before. The source of `sagging`, seen at the torque instead of the supply: what a search can tell of a
+    drive whose supply is not in its model."""
+    return wp.max(type(torque)(1.0) - others - per_own * wp.abs(torque), type(torque)(LEAST_LEFT))
+
+
+@wp.func
+def duty_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
+    """Torque [N.m] of a DC motor at a duty of its supply: tau0 * supply * duty - line * v, line = stall torque over
+    no-load speed [N.m.s/rad]. The circuit R i = u - k v with torque = k i, without an inductance."""
+    return tau0 * supply * duty - line * v
+
+
 @wp.func
 def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
-    """Torque [N.m] of a DC motor at a duty (clipped to -1 .. 1) of its supply: tau0 * supply * duty - line * v, line =
-    stall torque over no-load speed [N.m.s/rad]. The circuit R i = u - k v with torque = k i, without an inductance."""
-    return tau0 * supply * wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)) - line * v
+    """`duty_torque` of a drive that cannot give more than its supply: the duty clipped to -1 .. 1."""
+    return duty_torque(wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)), tau0, supply, line, v)
 
 
 @wp.func
@@ -401,6 +419,15 @@ def gear_friction(motor: Any, outside: Any, share: Any, share_outside: Any):
     Extended friction models for the physics simulation of servo actuators, arXiv 2410.08650, 2024, section III; the
     shares weighted before they are subtracted, as in the authors' code)."""
     return wp.abs(share_outside * outside - share * motor)
+
+
+@wp.func
+def gear_load_friction(torque: Any, v: Any, driving: Any, backdriven: Any, power: Any, unit: Any):
+    """Dry friction [N.m] of a gear by the torque [N.m] that it hands to the joint at speed v [rad/s] of the motor:
+    `load_share` of it where that is linear (power 1), else share * unit * (|torque| / unit)^power, unit: a torque [N.m]
+    at which the power does not matter. Ours, for a friction that grows faster or slower than its load."""
+    share = load_share(torque, v, driving, backdriven)
+    return share * unit * wp.pow(wp.abs(torque) / unit, power)
 
 
 @wp.func

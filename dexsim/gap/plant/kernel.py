@@ -25,19 +25,21 @@ from dexsim.actuator.laws import (
     difference,
     dragged_target,
     dry_friction,
+    duty_torque,
     encoder_error,
     encoder_memory,
     friction_acts,
+    gear_load_friction,
     heard_speed,
     hold,
     lag_share,
-    load_share,
     lost_error,
     other_terms,
     parasitic_torque,
     pd,
     preslide,
     preslide_speed,
+    sagged_torque,
     stage_before,
     supply_left,
     torque_limits,
@@ -64,7 +66,6 @@ given = amplifier(frozenset(SERVO_FEATURES))
 acts = friction_acts(frozenset(SERVO_FEATURES))
 dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
-LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
@@ -551,7 +552,7 @@ def opened(t: Torque, v: f64, p: Guess, n: Now):
         t.on_drive = f64(0.0)
         if p.open_ > f64(1.5):  # that input is the duty
             line = n.tau0 / n.no_load
-            t.now = n.tau0 * n.supply * n.drive - line * v
+            t.now = duty_torque(n.drive, n.tau0, n.supply, line, v)
             t.end = t.now
             t.on_drive = line
     if not n.enabled:
@@ -560,13 +561,6 @@ def opened(t: Torque, v: f64, p: Guess, n: Now):
         t.on_loop = f64(0.0)
         t.on_drive = f64(0.0)
     return t
-
-
-@wp.func
-def borne_friction(borne: f64, v: f64, p: Guess):
-    """Level [N.m] by the torque that the gear hands to the joint."""
-    share = load_share(borne, v, p.gear_load, p.gear_back)
-    return share * p.gear_unit * wp.pow(wp.abs(borne) / p.gear_unit, p.gear_power)
 
 
 # -- the bodies --------------------------------------------------------------------------------------------------------
@@ -752,7 +746,7 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
     left = f64(1.0)  # of what the drive gives, where its supply sags
     if n.weak != zero or p.weak_own != zero:
-        left = wp.max(f64(1.0) - n.weak - p.weak_own * wp.abs(x.last), f64(LEAST_SUPPLY))
+        left = sagged_torque(n.weak, p.weak_own, x.last)
     if not p.voltage:
         speed = wp.abs(v_lim) / (n.no_load * n.supply * left)
         limits = torque_limits(n.tau0 * left, speed, v_lim, p.steep)
@@ -808,7 +802,8 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     x.memory = kept
     level = (parts[0] + parts[1] + (parts[2] + parts[3])) * n.friction
     if by_gear:
-        level += borne_friction(x.borne, v_drive, p) * n.friction
+        by_load = gear_load_friction(x.borne, v_drive, p.gear_load, p.gear_back, p.gear_power, p.gear_unit)
+        level += by_load * n.friction
     applied -= how[0] * level
     if drag > zero:
         applied += drag * v_drive
