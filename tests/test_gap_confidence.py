@@ -79,7 +79,7 @@ def test_a_size_at_its_bound_is_told_from_one_at_nothing():
 def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():
     assert "hardly above the noise" in confidence.too_small(1.2, 1.2, 1.0, 1.0, True)
     assert confidence.too_small(3.0, 3.0, 1.0, 1.0, True) == ""
-    assert "trifle" in confidence.too_small(10.0, 2.0, 1.2, 1.0, False)
+    assert "small beside" in confidence.too_small(10.0, 2.0, 1.2, 1.0, False)
     assert confidence.too_small(10.0, 4.0, 1.2, 1.0, False) == ""
 
 
@@ -111,7 +111,7 @@ def test_weigh_takes_every_doubt_into_account():
     assert confidence.weigh(evidence(earned=0.3), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)
 
 
-def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_is_a_crowd():
+def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_are_many():
     sure, doubtful = evidence(effect="backlash", confidence=0.99), evidence(effect="deadband", confidence=0.4)
     later = evidence(effect="supply_sag", confidence=0.99)
     confidence.doubt_beside_others([sure, doubtful])

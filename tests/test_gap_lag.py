@@ -1,5 +1,5 @@
 """The lag of a drive's torque: its second order in the search's plant against closed forms, the NumPy reference and an
-independent integration; what makes a loop swing by itself is told by it, and training gets its first-order likeness."""
+independent integration; what makes a loop swing by itself is told by it, and training gets one of first order."""
 
 from __future__ import annotations
 

@@ -225,7 +225,7 @@ class Selecting(Made):
     _on = cross = lambda *_: None
     thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
-    _instead = _more_general = lambda self, current: current  # noqa: E731
+    _approximate = _more_general = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
     _dear = lambda self, trial: 1.0  # noqa: E731
@@ -278,7 +278,7 @@ class Plainly(Selecting):
 @pytest.mark.parametrize("left, found", [(0.5, True), (0.95, False)])
 def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
     def effect(name, column):
-        variant = SimpleNamespace(refines=False, instead=False, params=[SimpleNamespace(columns=(column,))])
+        variant = SimpleNamespace(refines=False, approximate=False, params=[SimpleNamespace(columns=(column,))])
         return SimpleNamespace(id=name, plain=(column,), nests=(), variants=lambda scales: [variant])
 
     fitted = [effect(e.id, e.plain[0]) for e in selecting.CATALOGUE if e.plain]
@@ -485,9 +485,9 @@ def test_many_effects_on_one_joint_are_doubted():
     assert not any(crowded(pair)) and crowded(three) == [False, True, True] and all(crowded(five)[1:])
 
 
-def test_a_trifle_beside_another_effect_is_doubted():
+def test_what_is_small_beside_another_effect_is_doubted():
     said = lambda share: confidence.too_small(10.0, 9.0, np.sqrt(81 - 100 * share), 1.0, False)  # noqa: E731
-    assert "trifle" in said(0.035) and not said(0.045)
+    assert "small beside" in said(0.035) and not said(0.045)
 
 
 def test_what_stays_unexplained_costs_confidence():
@@ -760,15 +760,15 @@ def test_a_law_that_training_lacks_must_explain_far_more():
     class Beside(Selecting):
         _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
 
-    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), instead=True)
+    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), approximate=True)
     other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
     for before, after, taken in ((10.0, 4.0, True), (10.0, 6.0, False), (1.5, 0.1, False), (2.0, 1.2, True)):
         search = Beside(lambda ids, a=after, b=before: (a if "load_friction" in ids else b,) * 2)
         search.allowed, search.case.scales = None, None
-        current = search.fit((Member(EFFECTS["coulomb_friction"], replace(law, instead=False)),))
+        current = search.fit((Member(EFFECTS["coulomb_friction"], replace(law, approximate=False)),))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(selecting, "CATALOGUE", [other])
-            ids = JointSearch._instead(search, current).ids
+            ids = JointSearch._approximate(search, current).ids
         assert ids == (("load_friction",) if taken else ("coulomb_friction",)), (before, after)
 
 
@@ -777,9 +777,9 @@ def test_a_law_that_training_lacks_is_asked_in_the_place_of_what_imitates_its_li
         _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
         _earns = lambda self, new, old, further=True: self._left(new).sum() < 0.9 * self._left(old).sum()  # noqa: E731
 
-    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), instead=True)
+    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), approximate=True)
     other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
-    plain = replace(law, instead=False)
+    plain = replace(law, approximate=False)
     for found, taken in ((("stribeck_friction",), True), (("stribeck_friction", "deadband"), True), (("lag",), False)):
         search = Beside(lambda ids: (4.0 if ids == ("load_friction",) else 10.0,) * 2)
         search.allowed, search.case.scales = None, None
@@ -787,7 +787,7 @@ def test_a_law_that_training_lacks_is_asked_in_the_place_of_what_imitates_its_li
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(selecting, "CATALOGUE", [other, EFFECTS["coulomb_friction"]])
             patch.setattr(EFFECTS["coulomb_friction"].__class__, "variants", lambda self, _: [plain])
-            assert JointSearch._instead(search, search.fit(members)).ids == (("load_friction",) if taken else found)
+            assert JointSearch._approximate(search, search.fit(members)).ids == (("load_friction",) if taken else found)
 
 
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:

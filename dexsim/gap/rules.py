@@ -105,9 +105,9 @@ class SearchRules:
         "the square of what is within the noise (`judge.within`), rounded up",
         "test_joints_that_are_not_followed_are_looked_at_again",
     )
-    instead: float = _rule(
+    approximate: float = _rule(
         0.5,
-        "share of what likenesses leave beyond the noise, on what was left out, that a law which training has less "
+        "share of what stand-ins leave beyond the noise, on what was left out, that a law which training has less "
         "exactly may leave in their place",
         "between 0.16, the most of three where that law is the true one, and 1.5, the less of two where another "
         "friction and a late drive are: what training can be given goes before what explains a little more",
@@ -250,23 +250,23 @@ class JudgeRules:
         "cases of another plant)",
         "test_a_name_earns_its_confidence_by_what_it_removes",
     )
-    mutes: float = _rule(
+    most_left_out: float = _rule(
         0.2,
         "share of what was kept out that may say nothing of an effect: more of it is not a few moments",
         "made for a true dead zone that one half second at a limit, missed alike with it and without, had lost",
         "test_moments_that_nothing_follows_do_not_speak",
     )
-    crowd: int = _rule(
+    many_on_a_joint: int = _rule(
         3,
-        "effects on one joint from which on the smaller ones are taken for a series of likenesses",
+        "effects on one joint from which on the smaller ones are taken for a series of stand-ins",
         "of 36 names said third or later on a joint one is true, of 106 second ones 24 (five sets of cases)",
         "test_many_effects_on_one_joint_are_doubted",
     )
-    trifle: float = _rule(
+    least_share: float = _rule(
         0.04,
         "of the squared error before: a further effect that removes less may be what the first one's law gets wrong",
         "a law that is off by a fifth leaves as much",
-        "test_a_trifle_beside_another_effect_is_doubted",
+        "test_what_is_small_beside_another_effect_is_doubted",
     )
     left_costs: float = _rule(
         0.5,

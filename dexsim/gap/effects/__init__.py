@@ -63,7 +63,7 @@ def wide(fit: Fit, believed: float | None) -> Fit:
     return fit if believed is None else (fit[0], min(fit[1], believed), max(fit[2], believed))
 
 
-def instead(fit: Fit, believed: float) -> Fit:
+def absent(fit: Fit, believed: float) -> Fit:
     """What the other effect of a set would be in the place of the one named: best guess that it is not there, in a
     range that holds it."""
     return believed, min(fit[1], believed), max(fit[2], believed)
@@ -96,7 +96,7 @@ class Variant:
     fixed: tuple[tuple[str, float], ...] = ()
     note: dict = field(default_factory=dict)
     refines: bool = False  # adds parameters to the first variant: tried only where that one was found
-    instead: bool = False  # the servo table has it less exactly: tried only in the place of likenesses that leave much
+    approximate: bool = False  # the servo table has it less exactly: tried only where what stands in for it leaves much
     dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
     laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)
 
@@ -213,8 +213,8 @@ class Effect:
     jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
     by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
-    # columns of the plant that training has no like of, and is given others in the place of (`instead_of_nearly`)
-    nearly: ClassVar[tuple[str, ...]] = ()
+    # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
+    approximated: ClassVar[tuple[str, ...]] = ()
 
     def variants(self, s: Scales) -> list[Variant]:
         """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
@@ -245,8 +245,8 @@ class Effect:
         lowest cutoff [Hz] of what was filtered."""
         return True
 
-    def instead_of_nearly(self, row: np.ndarray, case: Case) -> dict[str, float]:
-        """Servo columns in the place of those `nearly`. row: the plant's, as fitted."""
+    def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
+        """Servo columns in the place of those `approximated`. row: the plant's, as fitted."""
         return {}
 
     def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:

@@ -150,7 +150,7 @@ class LoadFriction(Effect):
 
     id = "load_friction"
     by_torque = "load_friction"
-    nearly = ("gear_load_friction", "gear_load_friction_backdriven")
+    approximated = ("gear_load_friction", "gear_load_friction_backdriven")
     words = "has friction that grows with the load on its gear"
     shows = "at high load"
     experiment = "the same slow motion under two or more loads"
@@ -175,7 +175,7 @@ class LoadFriction(Effect):
             ((0.3, 0.3), (1.0, 1.0)),
             "of the torque on the joint",
             (("gear_load_unit", max(s.gravity, 0.3 * s.tau)),),
-            instead=True,
+            approximate=True,
             laws=(("Hertz contact", (("gear_load_power", 2 / 3),)),),
         )
         return [by_motor, by_gear]
@@ -192,7 +192,7 @@ class LoadFriction(Effect):
     def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
         return 0 < value < 1 and joint.get("coulomb_friction", 0.0) >= 0
 
-    def instead_of_nearly(self, row: np.ndarray, case: Case) -> dict[str, float]:
+    def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
         """Dry friction that grows with the torque on the joint, per torque from outside: the servo table knows that
         torque without the joint's own inertia, and a line. As large as on average while the joint slid."""
         share, back, power, unit = (

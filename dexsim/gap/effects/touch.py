@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects import Fit, PadFacts, PadSettings, TouchEffect, fitted, instead, ranged, times, wide
+from dexsim.gap.effects import Fit, PadFacts, PadSettings, TouchEffect, absent, fitted, ranged, times, wide
 from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import THICKNESS, readings, shear
 from dexsim.tactile.pads import PAD_COLUMNS
@@ -41,7 +41,7 @@ class TactileGain(TouchEffect):
         fact = pad.fact
         # without a load cell gain and stiffness are one factor
         if set(finding["indistinguishable"]) - {self.id} and fact.common is not None:
-            pad.shared["contact.stiffness"] = instead(times((fact.stiffness,) * 3, fact.common), fact.stiffness)
+            pad.shared["contact.stiffness"] = absent(times((fact.stiffness,) * 3, fact.common), fact.stiffness)
         return lost
 
 
@@ -199,7 +199,7 @@ class ContactStiffness(TouchEffect):
         p, believed = finding["parameters"]["stiffness"], pad.fact.stiffness
         pad.shared["contact.stiffness"] = fitted(p, believed if doubt else None)
         if set(finding["indistinguishable"]) - {self.id}:  # a gain would do as well
-            pad.values["gain"] = times(pad.values.get("gain"), instead(fitted(p, None, 1.0 / believed), 1.0))
+            pad.values["gain"] = times(pad.values.get("gain"), absent(fitted(p, None, 1.0 / believed), 1.0))
         return ""
 
 

@@ -97,7 +97,7 @@ def left_over(after: float, before: float, noise: float) -> float:
 def trusted(before: float, after: float, noise: float) -> float:
     """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses
     `JUDGE.left_costs` where that is `JUDGE.removed` or more, evenly less below. What follows only half of a gap may be
-    another effect's likeness."""
+    another effect that looks like it."""
     return kept_of(left_over(after, before, noise))
 
 
@@ -108,11 +108,11 @@ def kept_of(left: float) -> float:
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
     """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing
-    is asked for, or is a trifle beside what others removed of the error before; empty where it is not."""
+    is asked for, or is small beside what others removed of the error before; empty where it is not."""
     if without <= JUDGE.within * noise:
         return "without it the error kept out is hardly above the noise"
-    if not alone and without**2 - after**2 < JUDGE.trifle * max(before, without) ** 2:
-        return "it is a trifle beside what another effect explains, whose law need not be exact"
+    if not alone and without**2 - after**2 < JUDGE.least_share * max(before, without) ** 2:
+        return "it is small beside what another effect explains, whose law need not be exact"
     return ""
 
 
@@ -159,7 +159,7 @@ def doubt_beside_others(mine: list[Evidence]) -> None:
             e.hint(
                 "it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike"
             )
-        if len(mine) >= JUDGE.crowd and k > 0:
+        if len(mine) >= JUDGE.many_on_a_joint and k > 0:
             e.doubt(f"{len(mine)} effects on one joint: together they may stand for another")
 
 

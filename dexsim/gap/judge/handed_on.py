@@ -66,19 +66,19 @@ def undamped(trial: Trial, kp: float) -> float:
     )
 
 
-NEARLY = frozenset(name for e in CATALOGUE for name in e.nearly)
+APPROXIMATED = frozenset(name for e in CATALOGUE for name in e.approximated)
 
 
-def instead_of_nearly(case: Case, trial: Trial) -> dict[str, float]:
+def approximate_columns(case: Case, trial: Trial) -> dict[str, float]:
     """Servo columns in the place of fitted ones that training has no like of."""
     fitted = {name for p in trial.fit.params for name in p.columns}
-    wanted = [e for e in CATALOGUE if fitted & {*e.nearly}]
+    wanted = [e for e in CATALOGUE if fitted & {*e.approximated}]
     if not wanted:
         return {}
     row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0].copy()
     for name, value in (f for m in trial.members for f in m.variant.fixed):
         row[PLANT_INDEX[name]] = value
-    return {name: value for e in wanted for name, value in e.instead_of_nearly(row, case).items()}
+    return {name: value for e in wanted for name, value in e.approximate_columns(row, case).items()}
 
 
 def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
@@ -90,7 +90,7 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
         for name, value in x.variant.fixed:
             if name in INDEX:
                 out[name] = float(joints.index(x.variant.note["from_joint"])) if name == "coupling_from" else value
-    out |= instead_of_nearly(case, trial)
+    out |= approximate_columns(case, trial)
     if fitted & {"backlash", "softness"} and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out
@@ -130,7 +130,7 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
             continue
         for name in p.columns:
             if name not in INDEX:
-                if not p.nuisance and name not in fields and name not in NEARLY:
+                if not p.nuisance and name not in fields and name not in APPROXIMATED:
                     left.append(f"{name}@{case.joint}")
                 continue
             column = COLUMNS[INDEX[name]]

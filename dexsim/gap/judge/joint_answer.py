@@ -405,8 +405,8 @@ class JointAnswer:
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
     """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the
-    noise is known better than by all that might be off in it, what does not is the likeness of something else. The law
-    is from concealed cases (docs/concepts/gap.md)."""
+    noise is known better than by all that might be off in it, what does not only looks like it and is something else.
+    The law is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:
         return bounds
     low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))

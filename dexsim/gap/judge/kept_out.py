@@ -351,11 +351,11 @@ def telling(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, noise: 
     with it at times [n] s; noise: of one sample. Where a limit is reached in what was kept out alone, or one stick more
     sends a free run another way, neither follows, and half a second of that outweighs the rest: half-second blocks that
     are missed by more than `JUDGE.far` x the noise, alike with the effect and without (half of `JUDGE.part`), are left
-    out, as long as they are few (`JUDGE.mutes`)."""
+    out, as long as they are few (`JUDGE.most_left_out`)."""
     if not len(without):
         return np.ones(0, bool)
     b = _blocks(times, BLOCK)
     count = np.bincount(b)
     a, c = np.bincount(b, without) / count, np.bincount(b, with_it) / count
     mute = (np.minimum(a, c) > (JUDGE.far * noise) ** 2) & (np.abs(a - c) <= 0.5 * JUDGE.part * a)
-    return ~mute[b] if mute.mean() <= JUDGE.mutes else np.ones(len(b), bool)
+    return ~mute[b] if mute.mean() <= JUDGE.most_left_out else np.ones(len(b), bool)

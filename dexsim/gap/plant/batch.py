@@ -22,7 +22,7 @@ from dexsim.gap.plant.mechanics import JointConstants, on_lines
 # than there are; one of a scan has more, and takes a quarter longer in blocks of 32
 BLOCK = 64
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
-TOGETHER = 16  # of them that are copied in one call, and forgotten when all are
+CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
@@ -113,7 +113,7 @@ class Known:
         last = range(max(len(keys) - most, 0), len(keys))
         kept = [k for k in last if keys[k] not in rows]
         copies: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-        for some in (kept[a : a + TOGETHER] for a in range(0, len(kept), TOGETHER)):
+        for some in (kept[a : a + CHUNK] for a in range(0, len(kept), CHUNK)):
             copies |= {keys[k]: row for k, row in zip(some, zip(q[some], torque[some], strict=True), strict=True)}
         with self._lock:
             for k in last:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Hz at which the model is evaluated (along a refined motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0
-TOGETHER = 64  # samples of a motion that are evaluated in one call
+CHUNK = 64  # samples of a motion that are evaluated in one call
 ROWS = 512  # of what is interpolated at a time: they stay in a core's cache
 
 
@@ -192,7 +192,7 @@ def _evaluated(
     for flag in (bit.mjDSBL_CONTACT, bit.mjDSBL_CONSTRAINT, bit.mjDSBL_SENSOR):
         model.opt.disableflags |= int(flag)
     model.opt.gravity[:] = 0.0
-    batch = mujoco.batch.Batch(model, min(n, TOGETHER), 1)
+    batch = mujoco.batch.Batch(model, min(n, CHUNK), 1)
     qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
     fields = {name: batch.bind(name) for name in names}
     out = {name: np.empty((n, *x.shape[1:])) for name, x in fields.items()}

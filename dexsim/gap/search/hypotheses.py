@@ -295,7 +295,7 @@ class JointHypotheses:
         self.allowed = allowed
         self.deadline = deadline or Deadline()
         self.took = 0.0  # s that the search took
-        self.unasked: set[str] = set()  # effects whose likenesses the deadline left untried
+        self.unasked: set[str] = set()  # effects whose stand-ins the deadline left untried
         self.tell, self._part = tell or (lambda _: None), 0.0
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)

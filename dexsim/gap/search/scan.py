@@ -232,7 +232,7 @@ class JointScan(JointLosses):
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for whole in effect.variants(case.scales):
-                variant = None if whole.refines or whole.instead else self._narrow(whole)
+                variant = None if whole.refines or whole.approximate else self._narrow(whole)
                 if variant is None:
                     continue
                 member = Member(effect, variant)

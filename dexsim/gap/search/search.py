@@ -101,7 +101,7 @@ class JointSelection(JointScan):
                 current, level = self._swap(current, pool, level)
         current = self._from_plain(self._beside_alike(forks, current, shortlist, pool, price))
         if not self.deadline.over():
-            current = self._more_general(self._by_laws(self._refine(self._instead(self._drop(current)))))
+            current = self._more_general(self._by_laws(self._refine(self._approximate(self._drop(current)))))
         self._on(0.1)
         current, final = self._settled(current, pool)
         for m in current.members:
@@ -317,7 +317,7 @@ class JointSelection(JointScan):
             moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
             if not moved or (self.allowed is not None and effect.id not in self.allowed):
                 continue
-            variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.instead]
+            variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.approximate]
             variant = self._narrow(variants[0]) if variants else None
             if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
                 continue
@@ -435,9 +435,10 @@ class JointSelection(JointScan):
                     break
         return current
 
-    def _instead(self, current: Trial) -> Trial:
+    def _approximate(self, current: Trial) -> Trial:
         """The members that are confused with an effect replaced by a law of it that training has less exactly
-        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of what is more.
+        (`Variant.approximate`), where they leave more than noise and that law leaves but `SEARCH.approximate` of what
+        is more.
 
         Asked too in the place of what is confused with their likes: before that law is tried, which of several
         imitations follows best (dry friction, or one that falls off with speed) is an accident, and what it lacks
@@ -449,7 +450,7 @@ class JointSelection(JointScan):
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
         for effect in CATALOGUE:
-            laws = [v for v in effect.variants(self.case.scales) if v.instead]
+            laws = [v for v in effect.variants(self.case.scales) if v.approximate]
             if not laws or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             likes = [e.id for e in CATALOGUE if confusable(effect.id, e.id)]
@@ -470,7 +471,7 @@ class JointSelection(JointScan):
                     ]
                     trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
                     left = self._left(trial).sum()
-                    far_more = left - noise < SEARCH.instead * (mine - noise)
+                    far_more = left - noise < SEARCH.approximate * (mine - noise)
                     if far_more and left < self._left(best).sum() and not self._shrunk(trial):
                         best = trial
         return best if best is current else self._drop(best)  # what made up for the imitations may not be needed
