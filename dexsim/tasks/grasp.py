@@ -159,6 +159,9 @@ class GraspEnv(HandEnv):
         t, J, F = self.task, self.num_actions, self.fingers
         self.start = SimpleNamespace(hand=zeros(J), pose=zeros(7), velocity=zeros(6))  # of episodes that begin now
         self.sensed = SimpleNamespace(joint_position=zeros(J), joint_torque=zeros(J), tip=zeros(F, 3), seen=zeros())
+        names = ("q", "torque", "torque_bias", "effort", "tips", "z_delay")
+        self._truth = filled(kernels.Truth, z=self.object_pose[:, 2:3], **{name: getattr(self, name) for name in names})
+        self._sensed = filled(kernels.Sensed, z_history=self.z_history, **vars(self.sensed))
         self._dropped = zeros(dtype=torch.bool)
         self._measured = torch.zeros(len(grasp_rewards.METRICS) + 1, self.num_envs, device=self.device)
         names = ("command", "command_left", "push", "push_left", "push_wait")
@@ -336,10 +339,7 @@ class GraspEnv(HandEnv):
             tip=s.normal(3 * F),
             height=height,
         )
-        tips, seen_tips = (wp.from_torch(x, dtype=wp.vec3) for x in (self.tips, sensed.tip))
-        args = (self.q, self.torque, self.effort, self.torque_bias, tips, self.object_pose[:, 2:3], self.z_delay)
-        out = (self.z_history, sensed.joint_position, sensed.joint_torque, seen_tips, sensed.seen)
-        self._launch(kernels.sense, (self.num_envs, J + F + 1), advance, noise, *args, *out)
+        self._launch(kernels.sense, (self.num_envs, J + F + 1), advance, noise, self._truth, self._sensed)
         if advance:
             self.vz_seen.copy_(observations.height_speed(sensed.seen, self.z_seen, self.dt))
             self.z_seen.copy_(sensed.seen)

@@ -220,40 +220,54 @@ class Noise:
     height: wp.array(dtype=float)
 
 
+@wp.struct
+class Truth:
+    """What sensors are to show of each world."""
+
+    q: wp.array2d(dtype=float)  # [N, J] rad
+    torque: wp.array2d(dtype=float)  # [N, J] N.m
+    torque_bias: wp.array2d(dtype=float)  # [N, J] of tau_max
+    effort: wp.array(dtype=float)  # [J] N.m, tau_max
+    tips: wp.array2d(dtype=wp.vec3)  # [N, F] m
+    z: wp.array2d(dtype=float)  # [N, 1] m, of the object
+    z_delay: wp.array(dtype=wp.int64)  # [N] control steps, the camera's
+
+
+@wp.struct
+class Sensed:
+    """What they show of it."""
+
+    z_history: wp.array2d(dtype=float)  # [N, H] m, true: the camera's pictures, newest first
+    joint_position: wp.array2d(dtype=float)  # [N, J] rad
+    joint_torque: wp.array2d(dtype=float)  # [N, J] of tau_max
+    tip: wp.array2d(dtype=wp.vec3)  # [N, F] m
+    seen: wp.array(dtype=float)  # [N] m, height of the object
+
+
 @wp.kernel(enable_backward=False)
 def sense(
     advance: bool,  # a control step has passed: the camera's pictures move on
     noise: Noise,
-    q: wp.array2d(dtype=float),
-    torque: wp.array2d(dtype=float),
-    effort: wp.array(dtype=float),
-    torque_bias: wp.array2d(dtype=float),
-    tips: wp.array2d(dtype=wp.vec3),
-    z: wp.array2d(dtype=float),  # [N, 1] m, of the object
-    z_delay: wp.array(dtype=wp.int64),
+    t: Truth,
     # in and out
-    z_history: wp.array2d(dtype=float),  # newest first
-    # out
-    joint_position: wp.array2d(dtype=float),
-    joint_torque: wp.array2d(dtype=float),  # over tau_max
-    tip: wp.array2d(dtype=wp.vec3),
-    seen: wp.array(dtype=float),
+    s: Sensed,
 ):
     """What encoders, currents and a camera say of each world: noisy; the height late too."""
     w, k = wp.tid()
-    joints = q.shape[1]
+    joints = t.q.shape[1]
     if k < joints:
-        joint_position[w, k] = q[w, k] + noise.joint_size * noise.joint[w, k]
-        joint_torque[w, k] = torque[w, k] / effort[k] + torque_bias[w, k] + noise.torque_size * noise.torque[w, k]
+        s.joint_position[w, k] = t.q[w, k] + noise.joint_size * noise.joint[w, k]
+        torque = t.torque[w, k] / t.effort[k] + t.torque_bias[w, k]
+        s.joint_torque[w, k] = torque + noise.torque_size * noise.torque[w, k]
         return
     f = k - joints
-    if f < tips.shape[1]:
+    if f < t.tips.shape[1]:
         off = wp.vec3(noise.tip[w, 3 * f], noise.tip[w, 3 * f + 1], noise.tip[w, 3 * f + 2])
-        tip[w, f] = tips[w, f] + noise.tip_size * off
+        s.tip[w, f] = t.tips[w, f] + noise.tip_size * off
         return
     if advance:
-        for i in range(z_history.shape[1] - 1):
-            at = z_history.shape[1] - 1 - i
-            z_history[w, at] = z_history[w, at - 1]
-        z_history[w, 0] = z[w, 0]
-        seen[w] = z_history[w, int(z_delay[w])] + noise.height_size * noise.height[w]
+        for i in range(s.z_history.shape[1] - 1):
+            at = s.z_history.shape[1] - 1 - i
+            s.z_history[w, at] = s.z_history[w, at - 1]
+        s.z_history[w, 0] = t.z[w, 0]
+        s.seen[w] = s.z_history[w, int(t.z_delay[w])] + noise.height_size * noise.height[w]
