@@ -159,8 +159,8 @@ class GraspEnv(HandEnv):
         t, J, F = self.task, self.num_actions, self.fingers
         self.start = SimpleNamespace(hand=zeros(J), pose=zeros(7), velocity=zeros(6))  # of episodes that begin now
         self.sensed = SimpleNamespace(joint_position=zeros(J), joint_torque=zeros(J), tip=zeros(F, 3), seen=zeros())
-        names = ("q", "torque", "torque_bias", "effort", "tips", "z_delay")
-        self._truth = filled(kernels.Truth, z=self.object_pose[:, 2:3], **{name: getattr(self, name) for name in names})
+        true = {name: getattr(self, name) for name in ("q", "torque", "torque_bias", "effort", "tips", "z_delay")}
+        self._truth = filled(kernels.Truth, z=self.object_pose[:, 2:3], **true)
         self._sensed = filled(kernels.Sensed, z_history=self.z_history, **vars(self.sensed))
         self._dropped = zeros(dtype=torch.bool)
         self._measured = torch.zeros(len(grasp_rewards.METRICS) + 1, self.num_envs, device=self.device)
