@@ -10,6 +10,52 @@ from mujoco_warp._src.types import vec5
 from dexsim.sim.solver.source import LANES, text
 
 
+@wp.struct
+class Problem:
+    """What there is to solve, in MuJoCo-Warp's arrays: N worlds of V dofs and up to R rows, C contacts in all; M has E
+    entries, a Jacobian up to Z. Units are those of a slide; a hinge has N.m, kg.m2 and rad/s2. [N or 1]: 1 where all
+    worlds have the same."""
+
+    tolerance: wp.array(dtype=float)  # [N or 1]
+    ls_tolerance: wp.array(dtype=float)  # [N or 1]
+    impratio_invsqrt: wp.array(dtype=float)  # [N or 1]
+    M_rowind: wp.array(dtype=int)  # [E]
+    M_colind: wp.array(dtype=int)  # [E]
+    M: wp.array2d(dtype=float)  # [N, E] kg
+    qacc_warmstart: wp.array2d(dtype=float)  # [N, V] m/s2
+    qacc_smooth: wp.array2d(dtype=float)  # [N, V] m/s2
+    qfrc_smooth: wp.array2d(dtype=float)  # [N, V] N
+    dof_frictionadr: wp.array2d(dtype=int)  # [N, V] row of the dof's dry friction
+    nf: wp.array(dtype=int)  # [N] rows of dry friction, which come first, and
+    nefc: wp.array(dtype=int)  # [N] all that there are
+    nacon: wp.array(dtype=int)  # [1] contacts of all worlds
+    contact_friction: wp.array(dtype=vec5)  # [C]
+    contact_dim: wp.array(dtype=int)  # [C]
+    contact_efc_address: wp.array2d(dtype=int)  # [C, P] its rows; -1: none
+    type: wp.array2d(dtype=int)  # [N, R] `ConstraintType`
+    id: wp.array2d(dtype=int)  # [N, R] of the row's contact
+    J_rownnz: wp.array2d(dtype=int)  # [N, R]
+    J_rowadr: wp.array2d(dtype=int)  # [N, R]
+    J_colind: wp.array3d(dtype=int)  # [N, 1, Z]
+    J: wp.array3d(dtype=float)  # [N, 1, Z]
+    D: wp.array2d(dtype=float)  # [N, R] kg
+    aref: wp.array2d(dtype=float)  # [N, R] m/s2
+    frictionloss: wp.array2d(dtype=float)  # [N, R] N
+
+
+@wp.struct
+class Solution:
+    """What a solve leaves behind (out), in the same."""
+
+    qacc: wp.array2d(dtype=float)  # [N, V] m/s2
+    Ma: wp.array2d(dtype=float)  # [N, V] N
+    qfrc_constraint: wp.array2d(dtype=float)  # [N, V] N
+    force: wp.array2d(dtype=float)  # [N, R] N
+    state: wp.array2d(dtype=int)  # [N, R] `ConstraintState`
+    niter: wp.array(dtype=int)  # [N] iterations
+    overflow: wp.array(dtype=int)  # [N] bits: what ended before it had converged
+
+
 @cache
 def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False) -> wp.Kernel:
     """The kernel for models of `nv` dofs (at most 32); [N * 32] threads, in blocks of whole warps.
@@ -21,45 +67,9 @@ def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False
         raise ValueError(f"solve_kernel: nv {nv} must be 1 to {LANES}, rows {rows} a multiple of 4")
 
     def solve_world(
-        world: int,
-        above: int,
-        iterations: int,
-        ls_iterations: int,
-        warm: int,
-        njmax: int,
-        tolerance_in: wp.array(dtype=float),
-        ls_tolerance_in: wp.array(dtype=float),
-        impratio_invsqrt_in: wp.array(dtype=float),
-        M_rowind: wp.array(dtype=int),
-        M_colind: wp.array(dtype=int),
-        M_in: wp.array2d(dtype=float),
-        qacc_warmstart_in: wp.array2d(dtype=float),
-        qacc_smooth_in: wp.array2d(dtype=float),
-        qfrc_smooth_in: wp.array2d(dtype=float),
-        dof_frictionadr_in: wp.array2d(dtype=int),
-        nf_in: wp.array(dtype=int),
-        nefc_in: wp.array(dtype=int),
-        nacon_in: wp.array(dtype=int),
-        contact_friction: wp.array(dtype=vec5),
-        contact_dim: wp.array(dtype=int),
-        contact_efc_address: wp.array2d(dtype=int),
-        type_in: wp.array2d(dtype=int),
-        id_in: wp.array2d(dtype=int),
-        J_rownnz: wp.array2d(dtype=int),
-        J_rowadr: wp.array2d(dtype=int),
-        J_colind: wp.array3d(dtype=int),
-        J_in: wp.array3d(dtype=float),
-        D_in: wp.array2d(dtype=float),
-        aref_in: wp.array2d(dtype=float),
-        frictionloss_in: wp.array2d(dtype=float),
-        qacc_out: wp.array2d(dtype=float),
-        Ma_out: wp.array2d(dtype=float),
-        qfrc_constraint_out: wp.array2d(dtype=float),
-        force_out: wp.array2d(dtype=float),
-        state_out: wp.array2d(dtype=int),
-        niter_out: wp.array(dtype=int),
-        overflow_out: wp.array(dtype=int),
-    ): ...
+        world: int, above: int, iterations: int, ls_iterations: int, warm: int, njmax: int, problem: Problem,
+        solution: Solution,
+    ): ...  # fmt: skip
 
     solve_world.__name__ = solve_world.__qualname__ = f"solve_world_{nv}_{rows}"
     call = wp.func_native(text(nv, rows))(solve_world)
@@ -70,46 +80,11 @@ def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False
         ls_iterations: int,
         warm: int,
         njmax: int,
-        tolerance_in: wp.array(dtype=float),
-        ls_tolerance_in: wp.array(dtype=float),
-        impratio_invsqrt_in: wp.array(dtype=float),
-        M_rowind: wp.array(dtype=int),
-        M_colind: wp.array(dtype=int),
-        M_in: wp.array2d(dtype=float),
-        qacc_warmstart_in: wp.array2d(dtype=float),
-        qacc_smooth_in: wp.array2d(dtype=float),
-        qfrc_smooth_in: wp.array2d(dtype=float),
-        dof_frictionadr_in: wp.array2d(dtype=int),
-        nf_in: wp.array(dtype=int),
-        nefc_in: wp.array(dtype=int),
-        nacon_in: wp.array(dtype=int),
-        contact_friction: wp.array(dtype=vec5),
-        contact_dim: wp.array(dtype=int),
-        contact_efc_address: wp.array2d(dtype=int),
-        type_in: wp.array2d(dtype=int),
-        id_in: wp.array2d(dtype=int),
-        J_rownnz: wp.array2d(dtype=int),
-        J_rowadr: wp.array2d(dtype=int),
-        J_colind: wp.array3d(dtype=int),
-        J_in: wp.array3d(dtype=float),
-        D_in: wp.array2d(dtype=float),
-        aref_in: wp.array2d(dtype=float),
-        frictionloss_in: wp.array2d(dtype=float),
-        qacc_out: wp.array2d(dtype=float),
-        Ma_out: wp.array2d(dtype=float),
-        qfrc_constraint_out: wp.array2d(dtype=float),
-        force_out: wp.array2d(dtype=float),
-        state_out: wp.array2d(dtype=int),
-        niter_out: wp.array(dtype=int),
-        overflow_out: wp.array(dtype=int),
+        problem: Problem,
+        # out
+        solution: Solution,
     ):
-        call(
-            wp.tid() // wp.static(LANES), above, iterations, ls_iterations, warm, njmax, tolerance_in, ls_tolerance_in,
-            impratio_invsqrt_in, M_rowind, M_colind, M_in, qacc_warmstart_in, qacc_smooth_in, qfrc_smooth_in,
-            dof_frictionadr_in, nf_in, nefc_in, nacon_in, contact_friction, contact_dim, contact_efc_address, type_in,
-            id_in, J_rownnz, J_rowadr, J_colind, J_in, D_in, aref_in, frictionloss_in, qacc_out, Ma_out,
-            qfrc_constraint_out, force_out, state_out, niter_out, overflow_out,
-        )  # fmt: skip
+        call(wp.tid() // wp.static(LANES), above, iterations, ls_iterations, warm, njmax, problem, solution)
 
     return wp.kernel(
         solve,

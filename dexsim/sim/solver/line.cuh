@@ -298,20 +298,20 @@ for (;; ++iteration) {
 }
 
 if (mine) {
-    wp::index(qacc_out, world, lane) = acc;
-    wp::index(Ma_out, world, lane) = Ma;
-    wp::index(qfrc_constraint_out, world, lane) = constraint;
+    wp::index(solution.qacc, world, lane) = acc;
+    wp::index(solution.Ma, world, lane) = Ma;
+    wp::index(solution.qfrc_constraint, world, lane) = constraint;
 }
 if (dry) {
-    wp::index(force_out, world, friction_row) = f_force;
-    wp::index(state_out, world, friction_row) = f_state;
+    wp::index(solution.force, world, friction_row) = f_force;
+    wp::index(solution.state, world, friction_row) = f_state;
 }
 #pragma unroll 1
 for (int k = lane; k < rows; k += 32) {
-    wp::index(force_out, world, nf + k) = force[k];
-    wp::index(state_out, world, nf + k) = state[k];
+    wp::index(solution.force, world, nf + k) = force[k];
+    wp::index(solution.state, world, nf + k) = state[k];
 }
 if (lane == 0) {
-    wp::index(niter_out, world) = iteration;
-    if (overflow) wp::index(overflow_out, world) |= overflow;
+    wp::index(solution.niter, world) = iteration;
+    if (overflow) wp::index(solution.overflow, world) |= overflow;
 }

@@ -12,7 +12,7 @@ from mujoco_warp._src import smooth
 from mujoco_warp._src import solver as theirs
 from mujoco_warp._src.warp_util import event_scope
 
-from dexsim.sim.solver.kernel import solve_kernel
+from dexsim.sim.solver.kernel import Problem, Solution, solve_kernel
 from dexsim.sim.solver.source import LANES, shared_bytes
 
 VERSION = "4.0.0"
@@ -73,6 +73,7 @@ class NewtonSolver:
         # Approximate roots and quotients (2 units in the last place) on a GPU, as MuJoCo-Warp's line search has them. A
         # CPU's compiler takes more liberties: not to know what is not finite, for one
         self.fast_math = d.qacc.device.is_cuda
+        self._problem, self._solution = _problem(m, d), _solution(d)
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
@@ -103,14 +104,30 @@ class NewtonSolver:
             wp.launch(
                 solve_kernel(m.nv, rows, self.registers, self.fast_math),
                 dim=d.nworld * LANES,
-                inputs=[
-                    above, m.opt.iterations, m.opt.ls_iterations, warm, d.njmax, m.opt.tolerance, m.opt.ls_tolerance,
-                    m.opt.impratio_invsqrt, m.M_hinit_i, m.M_colind, d.M, d.qacc_warmstart, d.qacc_smooth,
-                    d.qfrc_smooth, d.dof_frictionadr, d.nf, d.nefc, d.nacon, d.contact.friction, d.contact.dim,
-                    d.contact.efc_address, d.efc.type, d.efc.id,
-                    d.efc.J_rownnz, d.efc.J_rowadr, d.efc.J_colind, d.efc.J, d.efc.D, d.efc.aref, d.efc.frictionloss,
-                ],
-                outputs=[d.qacc, d.efc.Ma, d.qfrc_constraint, d.efc.force, d.efc.state, d.solver_niter, d.overflow],
+                inputs=[above, m.opt.iterations, m.opt.ls_iterations, warm, d.njmax, self._problem, self._solution],
                 block_dim=worlds * LANES,
-            )  # fmt: skip
+            )
             above = rows
+
+
+def _problem(m: mjw.Model, d: mjw.Data) -> Problem:
+    """The arrays that MuJoCo-Warp's step fills before it solves."""
+    out = Problem()
+    for name in ("tolerance", "ls_tolerance", "impratio_invsqrt"):
+        setattr(out, name, getattr(m.opt, name))
+    out.M_rowind, out.M_colind = m.M_hinit_i, m.M_colind
+    for name in ("M", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "dof_frictionadr", "nf", "nefc", "nacon"):
+        setattr(out, name, getattr(d, name))
+    for name in ("friction", "dim", "efc_address"):
+        setattr(out, f"contact_{name}", getattr(d.contact, name))
+    for name in ("type", "id", "J_rownnz", "J_rowadr", "J_colind", "J", "D", "aref", "frictionloss"):
+        setattr(out, name, getattr(d.efc, name))
+    return out
+
+
+def _solution(d: mjw.Data) -> Solution:
+    """The arrays that it reads afterwards."""
+    out = Solution()
+    out.qacc, out.qfrc_constraint, out.niter, out.overflow = d.qacc, d.qfrc_constraint, d.solver_niter, d.overflow
+    out.Ma, out.force, out.state = d.efc.Ma, d.efc.force, d.efc.state
+    return out

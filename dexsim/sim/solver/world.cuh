@@ -54,9 +54,9 @@ auto total = [&](float v) {
 auto over = [](float x, float y) { return x / (y != 0.0f ? y : TINY); };
 auto larger = [](float x, float y) { return x > y ? x : y; };
 
-const int nefc_all = wp::index(nefc_in, world);
+const int nefc_all = wp::index(problem.nefc, world);
 const int nefc = nefc_all < njmax ? nefc_all : njmax;
-const int nf_all = wp::index(nf_in, world);
+const int nf_all = wp::index(problem.nf, world);
 const int nf = nf_all < nefc ? nf_all : nefc;
 const int rows = nefc - nf;  // limits and contacts; the rows of dry friction are the lanes' own
 if (rows <= above || rows > ROWS) return;
@@ -78,18 +78,18 @@ float* upper = vec + 32;
 constexpr int US = NV | 1;
 
 const bool mine = lane < NV;
-const float invsqrt = wp::index(impratio_invsqrt_in, world % impratio_invsqrt_in.shape[0]);
-const float tolerance = wp::index(tolerance_in, world % tolerance_in.shape[0]);
-const float ls_tolerance = wp::index(ls_tolerance_in, world % ls_tolerance_in.shape[0]);
+const float invsqrt = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
+const float tolerance = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
+const float ls_tolerance = wp::index(problem.ls_tolerance, world % problem.ls_tolerance.shape[0]);
 
 // ---- this lane's dof: inertia, dry friction
 for (int k = lane; k < NV * US; k += 32) upper[k] = 0.0f;
 sync();
-const int entries = M_colind.shape[0];
+const int entries = problem.M_colind.shape[0];
 #pragma unroll 1
 for (int e = lane; e < entries; e += 32) {
-    const int i = wp::index(M_rowind, e), j = wp::index(M_colind, e);
-    upper[i * US + j] = upper[j * US + i] = wp::index(M_in, world, e);
+    const int i = wp::index(problem.M_rowind, e), j = wp::index(problem.M_colind, e);
+    upper[i * US + j] = upper[j * US + i] = wp::index(problem.M, world, e);
 }
 sync();
 float M[NV];
@@ -100,21 +100,21 @@ const float inertia_scale = 1.0f / larger(TINY, total(diagonal));
 
 int friction_row = -1;
 if (mine && nf > 0) {
-    friction_row = wp::index(dof_frictionadr_in, world, lane);
+    friction_row = wp::index(problem.dof_frictionadr, world, lane);
     if (friction_row >= nefc) friction_row = -1;
 }
 const bool dry = friction_row >= 0;
 float f_D = 0.0f, f_loss = 0.0f, f_jar = 0.0f, f_edge = 0.0f;
 float acc = 0.0f, smooth = 0.0f;
 if (mine) {
-    acc = warm == 2 || (warm == 1 && nefc > 0) ? wp::index(qacc_warmstart_in, world, lane)
-                                               : wp::index(qacc_smooth_in, world, lane);
-    smooth = wp::index(qfrc_smooth_in, world, lane);
+    acc = warm == 2 || (warm == 1 && nefc > 0) ? wp::index(problem.qacc_warmstart, world, lane)
+                                               : wp::index(problem.qacc_smooth, world, lane);
+    smooth = wp::index(problem.qfrc_smooth, world, lane);
 }
 if (dry) {
-    f_D = wp::index(D_in, world, friction_row);
-    f_loss = wp::index(frictionloss_in, world, friction_row);
-    f_jar = acc - wp::index(aref_in, world, friction_row);
+    f_D = wp::index(problem.D, world, friction_row);
+    f_loss = wp::index(problem.frictionloss, world, friction_row);
+    f_jar = acc - wp::index(problem.aref, world, friction_row);
     f_edge = over(f_loss, f_D);
 }
 vec[lane] = acc;
@@ -123,35 +123,35 @@ vec[lane] = acc;
 #pragma unroll 1
 for (int k = lane; k < rows * STRIDE; k += 32) J[k] = 0.0f;
 sync();
-const int nacon = wp::index(nacon_in, 0);
+const int nacon = wp::index(problem.nacon, 0);
 #pragma unroll 1
 for (int k = lane; k < rows; k += 32) {
     const int row = nf + k;
-    const int nnz = wp::index(J_rownnz, world, row), adr = wp::index(J_rowadr, world, row);
+    const int nnz = wp::index(problem.J_rownnz, world, row), adr = wp::index(problem.J_rowadr, world, row);
     float product = 0.0f;
 #pragma unroll 1
     for (int e = 0; e < nnz; ++e) {
-        const int col = wp::index(J_colind, world, 0, adr + e);
-        const float value = wp::index(J_in, world, 0, adr + e);
+        const int col = wp::index(problem.J_colind, world, 0, adr + e);
+        const float value = wp::index(problem.J, world, 0, adr + e);
         J[k * STRIDE + col] = value;
         product += value * vec[col];
     }
-    jar[k] = product - wp::index(aref_in, world, row);
-    D[k] = wp::index(D_in, world, row);
+    jar[k] = product - wp::index(problem.aref, world, row);
+    D[k] = wp::index(problem.D, world, row);
     state[k] = SATISFIED;
     force[k] = 0.0f;
     int what = 1;
-    if (wp::index(type_in, world, row) == CONTACT_ELLIPTIC) {
-        const int contact = wp::index(id_in, world, row);
+    if (wp::index(problem.type, world, row) == CONTACT_ELLIPTIC) {
+        const int contact = wp::index(problem.id, world, row);
         what = 0;
         if (contact < nacon) {
-            const int first = wp::index(contact_efc_address, contact, 0);
+            const int first = wp::index(problem.contact_efc_address, contact, 0);
             const int place = row - first;
             if (place == 0) {
-                const int dim = wp::index(contact_dim, contact);
+                const int dim = wp::index(problem.contact_dim, contact);
                 what = dim <= rows - k ? dim : 0;  // one that njmax cut: no force, as in MuJoCo-Warp
             }
-            const float* friction = (const float*)&wp::index(contact_friction, contact);
+            const float* friction = (const float*)&wp::index(problem.contact_friction, contact);
             scale[k] = place == 0 ? friction[0] * invsqrt : (place > 0 && place < 6 ? friction[place - 1] : 0.0f);
         }
     }
