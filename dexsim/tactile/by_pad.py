@@ -23,6 +23,7 @@ from dexsim.tactile.kernel import (
     MAX_STRAIN,
     Law,
     Pads,
+    Surroundings,
     pose_in,
     spread_level,
     spread_weight,
@@ -101,6 +102,10 @@ class ByPad:
             tensor(own, torch.bool)[:, None],
         )
         with wp.ScopedDevice(device):
+            self._skins = skins = Skins()
+            skins.known = wp.array(rubber.astype(np.int32), dtype=int)
+            skins.thickness = wp.array(thickness.astype(np.float32), dtype=float)
+            skins.distance = wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float)
             self._m = SimpleNamespace(
                 values=wp.zeros((len(COLUMNS), n, f), dtype=float),
                 gain=wp.array(gain.astype(np.float32), dtype=wp.vec2),
@@ -108,9 +113,6 @@ class ByPad:
                 beside=wp.array(beside.astype(np.int32), dtype=int),
                 stuck=wp.array(np.array([s[:2] for s in stuck], dtype=np.int32).reshape(-1, 2), dtype=int),
                 stuck_at=wp.array(np.array([s[2] for s in stuck], dtype=np.float32), dtype=float),
-                thickness=wp.array(thickness.astype(np.float32), dtype=float),
-                rubber=wp.array(rubber.astype(np.int32), dtype=int),
-                depth=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
                 spread=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
                 skin=wp.zeros((n, f, t) if self.hysteresis else (1, 1, 1), dtype=float),
                 mixed=wp.zeros((n, f, t) if self.mixes else (1, 1, 1), dtype=float),
@@ -123,6 +125,7 @@ class ByPad:
             )
         self.values: torch.Tensor = wp.to_torch(self._m.values)
         self._row = {name: self._m.values[i] for i, name in enumerate(COLUMNS)}
+        skins.c10, skins.c01 = self._row["c10"], self._row["c01"]
 
     def column(self, name: str) -> torch.Tensor:
         """View [N, F] of one parameter; see `dexsim.tactile.pads.PAD_COLUMNS`."""
@@ -154,12 +157,8 @@ class ByPad:
         `Tactile`."""
         m, n, f = self._m, self.shape[0], self.shape[1]
         if self.rubber:
-            a, e = touch._a, touch.engine.wp
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
-            args = [e.xpos, e.xmat, touch._pair_normal, touch._pads, touch._law, touch.shapes.wp, a.object_body,
-                    a.shape_id, a.shape_size, a.pair_column,
-                    touch._row["stiffness_scale"], touch._row["threshold"], self._row["c10"], self._row["c01"],
-                    m.thickness, m.rubber, felt, m.depth, m.spread]  # fmt: skip
+            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, felt, m.spread]
             wp.launch(kernel, dim=(n, f), inputs=args, device=self.device)
             felt = m.spread
         if self.hysteresis:
@@ -226,6 +225,17 @@ def rubber_pressure(depth: float, thickness: float, c10: float, c01: float):
     return 2.0 * (1.0 / (l * l) - l) * (c10 + c01 / l)
 
 
+@wp.struct
+class Skins:
+    """Rubber of pads whose own is known."""
+
+    known: wp.array(dtype=int)  # [F] 0: it is the law's
+    thickness: wp.array(dtype=float)  # [F] m
+    c10: wp.array2d(dtype=float)  # [N, F] Pa
+    c01: wp.array2d(dtype=float)  # [N, F] Pa
+    distance: wp.array3d(dtype=float)  # [N, F, T] m, of the object's surface: scratch
+
+
 @cache
 def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
     """One thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under each
@@ -233,24 +243,12 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
     stays as it is. With sum=spring the taxels' forces are the rubber's own. One object."""
 
     def spread(
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        pair_normal: wp.array2d(dtype=float),
+        here: Surroundings,
         pads: Pads,
         law: Law,
         shapes: Shapes,
-        object_body: wp.array(dtype=int),
-        shape_id: wp.array2d(dtype=int),
-        shape_size: wp.array2d(dtype=wp.vec3),
-        pair_column: wp.array2d(dtype=int),
-        stiffness: wp.array(dtype=float),
-        threshold: wp.array(dtype=float),
-        c10: wp.array2d(dtype=float),
-        c01: wp.array2d(dtype=float),
-        thickness: wp.array(dtype=float),
-        rubber: wp.array(dtype=int),
+        skins: Skins,
         felt: wp.array3d(dtype=float),
-        scratch: wp.array3d(dtype=float),
         # out
         out: wp.array3d(dtype=float),
     ):
@@ -258,48 +256,48 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
         n = pads.count[f]
         for t in range(felt.shape[2]):
             out[w, f, t] = felt[w, f, t]
-        shape = shape_id[w, 0]
+        shape = here.shape_id[w, 0]
         pressed = float(1.0)
         if wp.static(solver):
-            pressed = pair_normal[w, pair_column[f, 0]]
-        if rubber[f] == 0 or shape < 0 or pressed <= 0.0:
+            pressed = here.pair_normal[w, here.pair_column[f, 0]]
+        if skins.known[f] == 0 or shape < 0 or pressed <= 0.0:
             return
         body = pads.body[f]
-        size = shape_size[w, 0]
-        a = turn_in(xmat, w, body, object_body[0])
-        b = pose_in(xpos, xmat, w, body, object_body[0])
+        size = here.shape_size[w, 0]
+        a = turn_in(here.xmat, w, body, here.object_body[0])
+        b = pose_in(here.xpos, here.xmat, w, body, here.object_body[0])
         nearest = float(1.0e9)
         total = float(0.0)
         for t in range(n):
             p = pads.taxel[f, t]
             d = distance(shapes, shape, size, a * xyz(p) + b)
-            scratch[w, f, t] = d
+            skins.distance[w, f, t] = d
             nearest = wp.min(nearest, d)
             if d < 0.0:
-                total += p[3] * rubber_pressure(-d, thickness[f], c10[w, f], c01[w, f])
+                total += p[3] * rubber_pressure(-d, skins.thickness[f], skins.c10[w, f], skins.c01[w, f])
         if total <= 0.0:
             return
         share = float(1.0)
         before = float(0.0)
         level = spread_level(nearest, law.reach)
-        k = stiffness[w] * law.stiffness[f]
+        k = law.scale[w] * law.stiffness[f]
         if wp.static(solver):
             share = pressed / total
             for t in range(n):
-                before += spread_weight(scratch[w, f, t], pads.taxel[f, t][3], level)
+                before += spread_weight(skins.distance[w, f, t], pads.taxel[f, t][3], level)
         for t in range(n):
-            d = scratch[w, f, t]
+            d = skins.distance[w, f, t]
             area = pads.taxel[f, t][3]
             z = float(0.0)
             if d < 0.0:
-                z = share * area * rubber_pressure(-d, thickness[f], c10[w, f], c01[w, f])
+                z = share * area * rubber_pressure(-d, skins.thickness[f], skins.c10[w, f], skins.c01[w, f])
             if wp.static(feel_others):
                 was = float(0.0)
                 if wp.static(solver):
                     was = pressed / before * spread_weight(d, area, level)
                 else:
                     if d < 0.0:
-                        was = taxel_force(wp.static(kind), law, k, -d, area, threshold[w])
+                        was = taxel_force(wp.static(kind), law, k, -d, area, law.threshold[w])
                 other = felt[w, f, t] - was
                 if other > wp.static(LEFT):
                     z += other

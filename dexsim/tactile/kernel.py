@@ -60,13 +60,50 @@ class Pads:
 
 @wp.struct
 class Law:
-    """Constants of the force law, the same in all worlds."""
+    """Constants of the force law."""
 
     stiffness: wp.array(dtype=float)  # [F] linear: N/m^3; hertz: N/m^2.5; mooney_rivlin: factor
+    scale: wp.array(dtype=float)  # [N] of the stiffness
+    threshold: wp.array(dtype=float)  # [N] N, at or under which a taxel is silent
     thickness: float  # m, of the rubber
     c10: float  # Pa
     c01: float  # Pa
     reach: float  # m, see spread_weight
+
+
+@wp.struct
+class Surroundings:
+    """What F pads may touch in N worlds of O objects and B bodies, and how the physics has them press it: C pairs."""
+
+    xpos: wp.array2d(dtype=wp.vec3)  # [N, B] m
+    xmat: wp.array2d(dtype=wp.mat33)  # [N, B]
+    pair_normal: wp.array2d(dtype=float)  # [N, C] N, the solver's; [1, 1] where nothing asks for it
+    object_body: wp.array(dtype=int)  # [O]
+    shape_id: wp.array2d(dtype=int)  # [N, O] -1: no object
+    shape_size: wp.array2d(dtype=wp.vec3)  # [N, O] m, of grids the scale first
+    pair_column: wp.array2d(dtype=int)  # [F, O] the pair of a pad and an object
+    tip_column: wp.array2d(dtype=int)  # [F, F] of a pad and another one's tip; -1: not declared
+
+
+@wp.struct
+class Felt:
+    """What pads feel (out)."""
+
+    force: wp.array2d(dtype=float)  # [N, F] N
+    centre: wp.array2d(dtype=wp.vec3)  # [N, F] m, world frame
+    force_other: wp.array2d(dtype=float)  # [N, F] N, of other pads' tips
+    felt: wp.array3d(dtype=float)  # [N, F, T] N, where every taxel's force is asked for
+    distance: wp.array3d(dtype=float)  # [N, F, T] m: scratch, where the solver's force is spread
+
+
+@wp.struct
+class FlatFelt:
+    """The same without axes: a warp a pad finds its place by one number, and keeps its distances."""
+
+    force: wp.array(dtype=float)
+    centre: wp.array(dtype=wp.vec3)
+    force_other: wp.array(dtype=float)
+    felt: wp.array(dtype=float)
 
 
 @wp.func
@@ -149,11 +186,11 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 
 @wp.func
-def may_meet(f: int, g: int, tip_column: wp.array2d(dtype=int), pair_normal: wp.array2d(dtype=float), w: int):
+def may_meet(f: int, g: int, here: Surroundings, w: int):
     """Whether pad f may touch the tip of pad g: another one, and pressed where the physics says so."""
     near = g != f
-    if near and tip_column[f, g] >= 0:
-        near = pair_normal[w, tip_column[f, g]] > 0.0
+    if near and here.tip_column[f, g] >= 0:
+        near = here.pair_normal[w, here.tip_column[f, g]] > 0.0
     return near
 
 
@@ -201,82 +238,61 @@ def _serial(
     solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
     rounds: int,
 ) -> Callable:  # fmt: skip
-    def serial(
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        pair_normal: wp.array2d(dtype=float),
-        pads: Pads,
-        law: Law,
-        shapes: Shapes,
-        object_body: wp.array(dtype=int),
-        shape_id: wp.array2d(dtype=int),
-        shape_size: wp.array2d(dtype=wp.vec3),
-        pair_column: wp.array2d(dtype=int),
-        tips: Shapes,
-        tip_column: wp.array2d(dtype=int),
-        stiffness: wp.array(dtype=float),
-        threshold: wp.array(dtype=float),
-        scratch: wp.array3d(dtype=float),
-        # out
-        force: wp.array2d(dtype=float),
-        centre: wp.array2d(dtype=wp.vec3),
-        force_other: wp.array2d(dtype=float),
-        felt: wp.array3d(dtype=float),
-    ):
+    def serial(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: Felt):
         w, f = wp.tid()
         body = pads.body[f]
         n = pads.count[f]
         bound = pads.bound[f]
-        k = stiffness[w] * law.stiffness[f]
+        k = law.scale[w] * law.stiffness[f]
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force
         if wp.static(raw):
-            for t in range(felt.shape[2]):
-                felt[w, f, t] = 0.0
-        for o in range(object_body.shape[0]):
-            shape = shape_id[w, o]
-            size = shape_size[w, o]
+            for t in range(out.felt.shape[2]):
+                out.felt[w, f, t] = 0.0
+        for o in range(here.object_body.shape[0]):
+            shape = here.shape_id[w, o]
+            size = here.shape_size[w, o]
             pressed = float(0.0)
             if wp.static(solver):
-                pressed = pair_normal[w, pair_column[f, o]]
+                pressed = here.pair_normal[w, here.pair_column[f, o]]
             if shape >= 0 and (pressed > 0.0 or not wp.static(solver)):
-                a = turn_in(xmat, w, body, object_body[o])
-                b = pose_in(xpos, xmat, w, body, object_body[o])
+                a = turn_in(here.xmat, w, body, here.object_body[o])
+                b = pose_in(here.xpos, here.xmat, w, body, here.object_body[o])
                 if wp.static(solver):
                     nearest = float(1.0e9)
                     for t in range(n):
                         d = distance(shapes, shape, size, a * xyz(pads.taxel[f, t]) + b)
-                        scratch[w, f, t] = d
+                        out.distance[w, f, t] = d
                         nearest = wp.min(nearest, d)
                     level = spread_level(nearest, law.reach)
                     s = wp.vec4(0.0, 0.0, 0.0, 0.0)
                     for t in range(n):
                         p = pads.taxel[f, t]
-                        c = spread_weight(scratch[w, f, t], p[3], level)
+                        c = spread_weight(out.distance[w, f, t], p[3], level)
                         s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                     c = pressed / s[3]
                     total += wp.vec4(c * s[0], c * s[1], c * s[2], pressed)
                     if wp.static(raw):
                         for t in range(n):
-                            share = spread_weight(scratch[w, f, t], pads.taxel[f, t][3], level)
-                            felt[w, f, t] = felt[w, f, t] + c * share
+                            share = spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
+                            out.felt[w, f, t] = out.felt[w, f, t] + c * share
                 else:
                     if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
                         for t in range(n):
                             p = pads.taxel[f, t]
                             d = distance(shapes, shape, size, a * xyz(p) + b)
                             if d < 0.0:
-                                c = taxel_force(wp.static(kind), law, k, -d, p[3], threshold[w])
+                                c = taxel_force(wp.static(kind), law, k, -d, p[3], law.threshold[w])
                                 total += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                                 if wp.static(raw):
-                                    felt[w, f, t] = felt[w, f, t] + c
-        force[w, f] = total[3]
-        centre[w, f] = xmat[w, body] * centre_of(pads, f, total) + xpos[w, body]
+                                    out.felt[w, f, t] = out.felt[w, f, t] + c
+        out.force[w, f] = total[3]
+        out.centre[w, f] = here.xmat[w, body] * centre_of(pads, f, total) + here.xpos[w, body]
         if wp.static(others):
             other = float(0.0)
             for g in range(pads.body.shape[0]):
-                if may_meet(f, g, tip_column, pair_normal, w):
-                    a = turn_in(xmat, w, body, pads.body[g])
-                    b = pose_in(xpos, xmat, w, body, pads.body[g])
+                if may_meet(f, g, here, w):
+                    a = turn_in(here.xmat, w, body, pads.body[g])
+                    b = pose_in(here.xpos, here.xmat, w, body, pads.body[g])
                     if not tips_apart(pads, tips, f, g, a, b):
                         for t in range(n):
                             p = pads.taxel[f, t]
@@ -284,11 +300,11 @@ def _serial(
                             if in_box(q, tips.middle[g], tips.half[g]):
                                 d = sd_grid(tips, g, 1.0, q)
                                 if d < 0.0:
-                                    c = taxel_force(wp.static(kind), law, k, -d, p[3], threshold[w])
+                                    c = taxel_force(wp.static(kind), law, k, -d, p[3], law.threshold[w])
                                     other += c
                                     if wp.static(raw and feel_others):
-                                        felt[w, f, t] = felt[w, f, t] + c
-            force_other[w, f] = other
+                                        out.felt[w, f, t] = out.felt[w, f, t] + c
+            out.force_other[w, f] = other
 
     return serial
 
@@ -326,28 +342,7 @@ def _lanes(
                 d[r] = sd_cells(s.data, offset, n, origin, h, size[0], a * wp.vec3(px[r], py[r], pz[r]) + b)
         return d
 
-    def lanes(
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        pair_normal: wp.array2d(dtype=float),
-        pads: Pads,
-        law: Law,
-        shapes: Shapes,
-        object_body: wp.array(dtype=int),
-        shape_id: wp.array2d(dtype=int),
-        shape_size: wp.array2d(dtype=wp.vec3),
-        pair_column: wp.array2d(dtype=int),
-        tips: Shapes,
-        tip_column: wp.array2d(dtype=int),
-        stiffness: wp.array(dtype=float),
-        threshold: wp.array(dtype=float),
-        scratch: wp.array3d(dtype=float),
-        # out
-        force: wp.array(dtype=float),
-        centre: wp.array(dtype=wp.vec3),
-        force_other: wp.array(dtype=float),
-        felt: wp.array(dtype=float),
-    ):
+    def lanes(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
         # Every branch around an exchange of lanes is the same for the whole warp.
         i = wp.tid()
         lane = i & 31
@@ -355,8 +350,8 @@ def _lanes(
         w = pad // wp.static(pad_count)
         f = pad - w * wp.static(pad_count)
         body = pads.body[f]
-        rot = xmat[w, body]
-        pos = xpos[w, body]
+        rot = here.xmat[w, body]
+        pos = here.xpos[w, body]
         px = Reals()
         py = Reals()
         pz = Reals()
@@ -370,13 +365,13 @@ def _lanes(
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force; the same in all lanes
         mine = Reals()  # forces of this lane's taxels
         for o in range(wp.static(objects)):
-            shape = shape_id[w, o]
-            size = shape_size[w, o]
-            turn = wp.transpose(xmat[w, object_body[o]])
+            shape = here.shape_id[w, o]
+            size = here.shape_size[w, o]
+            turn = wp.transpose(here.xmat[w, here.object_body[o]])
             a = turn * rot
-            b = turn * (pos - xpos[w, object_body[o]])
+            b = turn * (pos - here.xpos[w, here.object_body[o]])
             if wp.static(solver):
-                pressed = pair_normal[w, pair_column[f, o]]
+                pressed = here.pair_normal[w, here.pair_column[f, o]]
                 if shape >= 0 and pressed > 0.0:
                     d = distances(shapes, shape, size, a, b, px, py, pz)
                     nearest = d[0]
@@ -396,8 +391,8 @@ def _lanes(
                 if shape >= 0:
                     bound = pads.bound[f]
                     if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
-                        k = stiffness[w] * law.stiffness[f]
-                        quiet = threshold[w]
+                        k = law.scale[w] * law.stiffness[f]
+                        quiet = law.threshold[w]
                         d = distances(shapes, shape, size, a, b, px, py, pz)
                         s = wp.vec4(0.0, 0.0, 0.0, 0.0)
                         for r in range(wp.static(rounds)):
@@ -409,8 +404,8 @@ def _lanes(
                         total += lanes_sum4(s, lane)
                         mine += d
         if lane == 0:
-            force[pad] = total[3]
-            centre[pad] = rot * centre_of(pads, f, total) + pos
+            out.force[pad] = total[3]
+            out.centre[pad] = rot * centre_of(pads, f, total) + pos
         if wp.static(others):
             # Lane j asks whether tip j is near, all at once; then the warp feels the tips that are.
             other = float(0.0)
@@ -418,25 +413,25 @@ def _lanes(
                 j = wp.static(32) * block + lane
                 near = j < wp.static(pad_count)
                 if near:
-                    near = may_meet(f, j, tip_column, pair_normal, w)
+                    near = may_meet(f, j, here, w)
                 if near:
-                    turn = wp.transpose(xmat[w, pads.body[j]])
-                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - xpos[w, pads.body[j]]))
+                    turn = wp.transpose(here.xmat[w, pads.body[j]])
+                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - here.xpos[w, pads.body[j]]))
                 left = lane_ballot(near)
                 while left != 0:
                     g = 32 * block + lowest_bit(left)
                     left = left & (left - 1)
-                    turn = wp.transpose(xmat[w, pads.body[g]])
+                    turn = wp.transpose(here.xmat[w, pads.body[g]])
                     a = turn * rot
-                    b = turn * (pos - xpos[w, pads.body[g]])
+                    b = turn * (pos - here.xpos[w, pads.body[g]])
                     middle = tips.middle[g]
                     half = tips.half[g]
                     offset = tips.offset[g]
                     n = tips.dims[g]
                     origin = tips.origin[g]
                     h = tips.spacing[g]
-                    k = stiffness[w] * law.stiffness[f]
-                    quiet = threshold[w]
+                    k = law.scale[w] * law.stiffness[f]
+                    quiet = law.threshold[w]
                     for r in range(wp.static(rounds)):
                         q = a * wp.vec3(px[r], py[r], pz[r]) + b
                         if in_box(q, middle, half):
@@ -448,11 +443,11 @@ def _lanes(
                                     mine[r] += c
             other = lanes_sum(other)
             if lane == 0:
-                force_other[pad] = other
+                out.force_other[pad] = other
         if wp.static(raw):
             for r in range(wp.static(rounds)):
                 t = 32 * r + lane
                 if t < wp.static(taxels):
-                    felt[pad * wp.static(taxels) + t] = mine[r]
+                    out.felt[pad * wp.static(taxels) + t] = mine[r]
 
     return lanes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import MAX_ROUNDS, Law, Pads, touch_kernel
+from dexsim.tactile.kernel import MAX_ROUNDS, Felt, FlatFelt, Law, Pads, Surroundings, touch_kernel
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
@@ -118,11 +118,11 @@ class Tactile:
                 pair_column=wp.array(columns, dtype=int),
                 tip_column=wp.array(tip_columns, dtype=int),
                 params=wp.zeros((len(COLUMNS), n), dtype=float),
-                scratch=wp.zeros((n, f, t) if solver and not self.lanes else (1, 1, 1), dtype=float),
                 force=wp.zeros((n, f), dtype=float),
                 centre=wp.zeros((n, f), dtype=wp.vec3),
                 force_other=wp.zeros((n, f), dtype=float),
                 felt=wp.zeros((n, f, t) if store else (1, 1, 1), dtype=float),
+                distance=wp.zeros((n, f, t) if solver and not self.lanes else (1, 1, 1), dtype=float),
             )
         self._a = a
         self.shape_id, self.shape_size = wp.to_torch(a.shape_id), wp.to_torch(a.shape_size)
@@ -141,12 +141,17 @@ class Tactile:
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
         self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
-        # a warp a pad finds its place by one number: flat outputs
-        self._out = [a.force, a.centre, a.force_other, a.felt]
-        if self.lanes:
-            self._out = [x.flatten() for x in self._out]
+        felt: Any = FlatFelt if self.lanes else Felt
+        self._out = felt()
+        for name in felt.vars:
+            setattr(self._out, name, getattr(a, name).flatten() if self.lanes else getattr(a, name))
+        self._law.scale, self._law.threshold = self._row["stiffness_scale"], self._row["threshold"]
         contacts = solver or bool((tip_columns >= 0).any())
-        self._pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
+        self._around = here = Surroundings()
+        here.xpos, here.xmat = engine.wp.xpos, engine.wp.xmat
+        here.pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
+        for name in ("object_body", "shape_id", "shape_size", "pair_column", "tip_column"):
+            setattr(here, name, getattr(a, name))
         if measured:
             if cfg.shear and o != 1:
                 raise UserError(f"tactile.shear=true: works with one object, {o} were given")
@@ -265,11 +270,7 @@ class Tactile:
     def launch(self) -> None:
         """Feel: only launches, so it can be recorded in a graph."""
         a, n = self._a, self.engine.n
-        args = [
-            self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp,
-            a.object_body, a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column,
-            self._row["stiffness_scale"], self._row["threshold"], a.scratch, *self._out,
-        ]  # fmt: skip
+        args = [self._around, self._pads, self._law, self.shapes.wp, self.tips.wp, self._out]
         if self.lanes:
             dim = n * self.layout.pads * LANES
             wp.launch(self._kernel, dim=dim, inputs=args, block_dim=self.block_dim, device=self.device)
