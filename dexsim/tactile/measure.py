@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.tactile.kernel import Pads, pose_in, turn_in, xyz
+from dexsim.tactile.kernel import Pads, Surroundings, pose_in, turn_in, xyz
 
 NO_ANCHOR = 1.0e9  # m, x of an anchor that is not there
 NEVER = 1.0e30  # s, stamp of a slot that holds no reading
@@ -29,6 +29,25 @@ class Effects:
     hysteresis_time: wp.array(dtype=float)
     shear_stiffness: wp.array(dtype=float)
     friction: wp.array(dtype=float)
+
+
+@wp.struct
+class Measured:
+    """What sensors keep from one reading to the next, and their last S readings: N worlds, F pads, T taxels."""
+
+    seed: int
+    full_scale: float  # counts
+    gain: wp.array3d(dtype=float)  # [N, F, T] 0: dead
+    axes: wp.array3d(dtype=wp.vec3)  # [F, T, 2] tx, ty
+    tick: wp.array(dtype=int)  # [1] number of this reading
+    now: wp.array(dtype=float)  # [N] s, of this reading, and
+    last: wp.array(dtype=float)  # [N] s, of the one before; -1: none since reset
+    # in and out
+    state: wp.array3d(dtype=float)  # [N, F, T] N, to which the rubber has relaxed
+    anchor: wp.array3d(dtype=wp.vec3)  # [N, F, T] m, object frame: where the taxel sticks to it
+    # out
+    ring: wp.array4d(dtype=float)  # [S, N, F, T] N
+    ring_shear: wp.array4d(dtype=wp.vec2)  # [S, N, F, T] N, along tx, ty
 
 
 @wp.func
@@ -66,41 +85,28 @@ def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
 
     def measure_taxels(
         felt: wp.array3d(dtype=float),
-        gain: wp.array3d(dtype=float),
-        effects: Effects,
+        here: Surroundings,
         pads: Pads,
-        axes: wp.array3d(dtype=wp.vec3),  # [F, T, 2] tx, ty
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        object_body: wp.array(dtype=int),
-        time: wp.array(dtype=float),
-        last: wp.array(dtype=float),
-        tick: wp.array(dtype=int),
-        seed: int,
-        full_scale: float,
+        effects: Effects,
         # in and out
-        state: wp.array3d(dtype=float),
-        anchor: wp.array3d(dtype=wp.vec3),
-        # out
-        ring: wp.array4d(dtype=float),
-        ring_shear: wp.array4d(dtype=wp.vec2),
+        m: Measured,
     ):
         w, f, t = wp.tid()
-        slot = tick[0] % ring.shape[0]
+        slot = m.tick[0] % m.ring.shape[0]
         elastic = felt[w, f, t]
         z = elastic
         if wp.static(hysteresis):
             dt = float(0.0)
-            if last[w] >= 0.0:
-                dt = time[w] - last[w]
-            s = relax(state[w, f, t], elastic, dt, effects.hysteresis_time[w])
-            state[w, f, t] = s
+            if m.last[w] >= 0.0:
+                dt = m.now[w] - m.last[w]
+            s = relax(m.state[w, f, t], elastic, dt, effects.hysteresis_time[w])
+            m.state[w, f, t] = s
             z = rubber_force(elastic, s, effects.hysteresis[w])
-        g = gain[w, f, t]
+        g = m.gain[w, f, t]
         r = wp.vec3(0.0, 0.0, 0.0)
         if wp.static(noise):
             if t < pads.count[f]:
-                rng = wp.rand_init(seed + 7919 * tick[0], (w * felt.shape[1] + f) * felt.shape[2] + t)
+                rng = wp.rand_init(m.seed + 7919 * m.tick[0], (w * felt.shape[1] + f) * felt.shape[2] + t)
                 sigma = effects.noise[w]
                 r = wp.vec3(sigma * wp.randn(rng), sigma * wp.randn(rng), sigma * wp.randn(rng))
                 if g == 0.0:
@@ -109,31 +115,31 @@ def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
         out = wp.max(g * z + r[2], 0.0)
         if out <= effects.threshold[w]:
             out = 0.0
-        ring[slot, w, f, t] = counts(out, lsb, 0.0, full_scale)
+        m.ring[slot, w, f, t] = counts(out, lsb, 0.0, m.full_scale)
         if wp.static(shear):
             tangential = wp.vec2(0.0, 0.0)
             if elastic > 0.0:
                 body = pads.body[f]
                 p = pads.taxel[f, t]
-                a = turn_in(xmat, w, body, object_body[0])
-                q = a * xyz(p) + pose_in(xpos, xmat, w, body, object_body[0])
-                c = anchor[w, f, t]
+                a = turn_in(here.xmat, w, body, here.object_body[0])
+                q = a * xyz(p) + pose_in(here.xpos, here.xmat, w, body, here.object_body[0])
+                c = m.anchor[w, f, t]
                 if c[0] == wp.static(NO_ANCHOR):
                     c = q
                 u = wp.transpose(a) * (q - c)
                 k = effects.shear_stiffness[w] * p[3]
-                x = axes[f, t, 0]
-                y = axes[f, t, 1]
+                x = m.axes[f, t, 0]
+                y = m.axes[f, t, 1]
                 tangential = cap(wp.vec2(k * wp.dot(u, x), k * wp.dot(u, y)), effects.friction[w] * elastic)
                 # where the cap holds, the anchor is dragged along: slip
                 if k > 0.0:
-                    anchor[w, f, t] = q - a * (x * tangential[0] + y * tangential[1]) / k
+                    m.anchor[w, f, t] = q - a * (x * tangential[0] + y * tangential[1]) / k
                 else:
-                    anchor[w, f, t] = q
+                    m.anchor[w, f, t] = q
             else:
-                anchor[w, f, t] = wp.vec3(wp.static(NO_ANCHOR), 0.0, 0.0)
-            half = wp.floor(0.5 * full_scale)
-            ring_shear[slot, w, f, t] = wp.vec2(
+                m.anchor[w, f, t] = wp.vec3(wp.static(NO_ANCHOR), 0.0, 0.0)
+            half = wp.floor(0.5 * m.full_scale)
+            m.ring_shear[slot, w, f, t] = wp.vec2(
                 counts(g * tangential[0] + r[0], lsb, -half, half), counts(g * tangential[1] + r[1], lsb, -half, half)
             )
 

@@ -18,7 +18,7 @@ from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_
 from dexsim.tactile.kernel import MAX_ROUNDS, Felt, FlatFelt, Law, Pads, Surroundings, touch_kernel
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
-from dexsim.tactile.measure import Effects, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
+from dexsim.tactile.measure import Effects, Measured, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
 from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 BLOCK_DIM = 128
@@ -207,6 +207,10 @@ class Tactile:
                 taxel=taxel_kernel(cfg.shear, hysteresis and pad is None, noise),
                 report=report_kernel(self.lanes, cfg.shear, cfg.raw),
             )
+        m.measured = Measured()
+        m.measured.full_scale = float(cfg.full_scale)
+        for name in ("seed", "gain", "axes", "tick", "now", "last", "state", "anchor", "ring", "ring_shear"):
+            setattr(m.measured, name, getattr(m, name))
         self.force, self.centre = wp.to_torch(m.force), wp.to_torch(m.centre)
         self.gain = wp.to_torch(m.gain)
         self.raw = wp.to_torch(m.raw) if cfg.raw else None
@@ -283,10 +287,7 @@ class Tactile:
         wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
         pad = self.by_pad
         felt = a.felt if pad is None else pad.launch_skin(self, a.felt)
-        args = [
-            felt, m.gain, m.effects, self._pads, m.axes, xpos, xmat, a.object_body, m.now, m.last, m.tick, m.seed,
-            float(self.cfg.full_scale), m.state, m.anchor, m.ring, m.ring_shear,
-        ]  # fmt: skip
+        args = [felt, self._around, self._pads, m.effects, m.measured]
         wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
         if pad is not None:
             pad.launch_stuck(self)
