@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from dexsim.recording import schema
+
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
@@ -231,3 +233,17 @@ def test_the_check_sees_what_it_must(tmp_path):
     (house / "f.py").write_text("import dexsim.gone\n")
     with pytest.raises(AssertionError, match="dexsim.gone does not exist"):
         imported(house / "f.py", known)
+
+
+def test_topic_names_stand_in_the_schema_alone():
+    """A check that compares a topic with a name of its own would fall silent when the topic gets another."""
+    topics = [v for v in vars(schema).values() if isinstance(v, str) and re.fullmatch(r"/[a-z_]+", v)]
+    assert len(topics) >= 5
+    compared = re.compile(rf"""(==|\bin\b|,)\s*["']({"|".join(map(re.escape, topics))})["']""")
+    found = [
+        f"{p.relative_to(ROOT)}: {m[0]}"
+        for p in sorted((ROOT / "dexsim").rglob("*.py"))
+        if p.name != "schema.py"
+        for m in compared.finditer(p.read_text(encoding="utf-8"))
+    ]
+    assert not found

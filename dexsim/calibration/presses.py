@@ -8,7 +8,7 @@ import numpy as np
 from dexsim.calibration.line import Levels
 from dexsim.errors import UserError
 from dexsim.hand import Hand
-from dexsim.recording.schema import Recording, Series
+from dexsim.recording.schema import STATES, Recording, Series
 
 HOLD_S, SETTLE = 0.2, 0.5
 """A level is a constant command for at least HOLD_S [s]; its last SETTLE share is averaged."""
@@ -36,7 +36,7 @@ def levels_of(recording: Recording, hand: Hand) -> dict[str, Levels]:
     """
     effort = recording.signed_effort()
     if effort is None:
-        raise UserError(f"{recording.path}: has no effort in /joint_states: neither current nor torque to calibrate")
+        raise UserError(f"{recording.path}: has no effort in {STATES}: neither current nor torque to calibrate")
     force, full = finger_force(recording)
     if force.value.shape[1] != len(hand.fingers):
         raise UserError(

@@ -18,7 +18,7 @@ from dexsim.gap.effects.signals import CurrentSensor
 from dexsim.gap.read import Run
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
-from dexsim.recording.schema import COMMANDS_FIX, Recording, Series
+from dexsim.recording.schema import COMMANDS_FIX, DUTY, STATES, Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
@@ -56,7 +56,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     run.v = _at(recording.states.velocity, t, column)
     run.torque = _torque(recording, table, joints, t, column, notes)
     run.temperature = _at(recording.temperature, t, column)
-    if not any(f.kind == "wrap" and f.topic == "/joint_duty" for f in recording.findings):
+    if not any(f.kind == "wrap" and f.topic == DUTY for f in recording.findings):
         run.duty = _at(recording.duty, t, column)
     run.enabled = _at(recording.enabled, t, column, hold=True)
     if run.enabled is not None:
@@ -84,7 +84,7 @@ def _known_joints(recording: Recording, m: Mechanism, notes: list[str]) -> tuple
             f" {', '.join(m.joints)}; name them with remap.OURS=THEIRS or give its own model="
         )
     if not len(recording.states.position):
-        raise Unusable(f"{name}: commands without states: no /joint_states to compare with")
+        raise Unusable(f"{name}: commands without states: no {STATES} to compare with")
     if not len(recording.commands):
         raise Unusable(f"{name}: states without commands: what the servo was asked is unknown; {COMMANDS_FIX}")
     return joints
@@ -165,7 +165,7 @@ def _torque(
 ) -> np.ndarray | None:
     """[S, J] the effort in the unit of the drive's torque; None where none was recorded or it is not what it says."""
     effort = recording.signed_effort()
-    if effort is None or recording.effort_is == "none" or _bad(recording, "/joint_states", "effort"):
+    if effort is None or recording.effort_is == "none" or _bad(recording, STATES, "effort"):
         return None
     values = _at(effort, t, column)
     if values is not None and recording.effort_is == "current_A":
