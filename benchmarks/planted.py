@@ -7,9 +7,9 @@ planted; `cases` counts along the rounds (0: one round). This is the sanity chec
 simulator that trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity) 0.1 ms, with an
 encoder's quantum, noise and a jittered clock. Every believed figure is off by a draw from the very tolerance that the
 tool states for it (`_off`): gains, limits, friction, inertia and gravity by a normal deviate of 2.5 % cut at 5 %, delay
-and filters by fractions of a period or of 3 ms. Of a case's four recordings one is kept out that leads the others
+and filters by fractions of a period or of 3 ms. Of a case's four recordings one is held out that leads the others
 neither in error nor in speed nor in torque. Size of an effect: what a refit of all that the tool refits with every
-hypothesis leaves of it, in the recordings fitted and in the one kept out, in the search's own plant without noise, is
+hypothesis leaves of it, in the recordings fitted and in the one held out, in the search's own plant without noise, is
 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out recording
 differs by when it is made again from one encoder count away; a case in which that is more than twice the noise is drawn
 anew. limit: seconds after which no further case is waited for (0: all are). Resumable; prints a table and one JSON
@@ -352,7 +352,7 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
 
 
 def _not_the_hardest_last(b: dict, runs: list) -> list:
-    """The runs such that the one that is kept out asks for much, but for the most in nothing: what it alone reaches (a
+    """The runs such that the one that is held out asks for much, but for the most in nothing: what it alone reaches (a
     limit, braking at full speed) could be known by nobody. By the largest errors, speeds and torques of the loop as
     believed, of which each has one run that leads: of four runs one is always left."""
     _simulate(b, runs, [b["off"]], 1e-3, 2)

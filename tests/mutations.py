@@ -246,11 +246,11 @@ MUTATIONS = (
         "tests/test_gap_rules.py::test_an_effect_must_remove_a_least_share",
     ),
     Mutation(
-        "a name that removes nothing of what was kept out is sure",
+        "a name that removes nothing of what was held out is sure",
         "dexsim/gap/rules.py",
-        '0.2,\n        "share of the squared error on what was kept out',
-        '0.0,\n        "share of the squared error on what was kept out',
-        "tests/test_gap_least.py::test_an_effect_must_remove_a_part_of_what_was_kept_out",
+        '0.2,\n        "share of the squared error on what was held out',
+        '0.0,\n        "share of the squared error on what was held out',
+        "tests/test_gap_least.py::test_an_effect_must_remove_a_part_of_what_was_held_out",
     ),
     Mutation(
         "a touch effect that removes nothing is named",
@@ -269,8 +269,8 @@ MUTATIONS = (
     Mutation(
         "a torque that takes nothing off is offered",
         "dexsim/gap/rules.py",
-        '0.1,\n        "share of the error kept out that a name must cost',
-        '0.0,\n        "share of the error kept out that a name must cost',
+        '0.1,\n        "share of the error held out that a name must cost',
+        '0.0,\n        "share of the error held out that a name must cost',
         "tests/test_gap_rules.py::test_a_stand_in_must_take_a_least_share_off",
     ),
     Mutation(
@@ -316,23 +316,23 @@ MUTATIONS = (
         "tests/test_spikes.py::test_the_crest_of_a_fast_reversal_with_a_message_missing_has_no_spike",
     ),
     Mutation(
-        "an effect is taken back that one moment of what was kept out speaks against",
+        "an effect is taken back that one moment of what was held out speaks against",
         "dexsim/gap/judge/joint_answer.py",
-        "kept_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part",
+        "held_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part",
         "True",
-        "tests/test_gap_verdict.py::test_what_was_kept_out_takes_one_of_several_effects_back",
+        "tests/test_gap_verdict.py::test_what_was_held_out_takes_one_of_several_effects_back",
     ),
     Mutation(
         "what makes a joint ring is taken back by a free run that cannot keep step",
         "dexsim/gap/judge/joint_answer.py",
         "            if mm.effect.effort_only or mm.effect.rings:\n                continue\n",
         "",
-        "tests/test_gap_verdict.py::test_what_was_kept_out_takes_one_of_several_effects_back",
+        "tests/test_gap_verdict.py::test_what_was_held_out_takes_one_of_several_effects_back",
     ),
     Mutation(
         "a whisper about an effort's sensor decides the verdict",
         "dexsim/gap/judge/conclude.py",
-        "    kept_out.settle(by_effort, set())\n",
+        "    held_out.settle(by_effort, set())\n",
         "",
         "tests/test_gap_verdict.py::"
         "test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a_quiet_joint",

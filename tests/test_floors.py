@@ -164,8 +164,8 @@ def test_no_step_of_the_diagnosis_imports_from_a_later_one(graph):
     assert there >= {("dexsim.gap", k) for k in range(len(STEPS))}
     assert there >= {("dexsim.gap.touch", STEPS.index(n)) for n in ("read", "plant", "search", "judge")}
     assert later(graph) == []
-    assert later({"dexsim.gap.search.fit": {"dexsim.gap.judge.kept_out", "dexsim.gap.plant.case"}}) == [
-        "dexsim.gap.search.fit imports dexsim.gap.judge.kept_out"
+    assert later({"dexsim.gap.search.fit": {"dexsim.gap.judge.held_out", "dexsim.gap.plant.case"}}) == [
+        "dexsim.gap.search.fit imports dexsim.gap.judge.held_out"
     ]
 
 

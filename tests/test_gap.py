@@ -19,7 +19,7 @@ from dexsim.errors import UserError
 from dexsim.gap import command, demo, locate
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
-from dexsim.gap.judge import kept_out
+from dexsim.gap.judge import held_out
 from dexsim.gap.plant import case as case_of_joint
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build, noise
@@ -224,10 +224,10 @@ def test_floor_from_repeats_of_the_same_commands():
         r.smooth()
         runs.append(r)
     assert conditions(runs) == [0, 0]
-    value, how = kept_out.floor(runs, build(model(), runs))
+    value, how = held_out.floor(runs, build(model(), runs))
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
     runs[1].name = "a"  # two pieces of one recording
-    assert kept_out.floor(runs, build(model(), runs))[1] != "repeats"
+    assert held_out.floor(runs, build(model(), runs))[1] != "repeats"
 
 
 def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
@@ -238,12 +238,12 @@ def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
-    apart = kept_out.floors(runs, [case])[0]["joint"]
+    apart = held_out.floors(runs, [case])[0]["joint"]
     thermal = EFFECTS["thermal"].variants(case.scales)[0].params
     assert thermal[0].columns == ("thermal_torque",) and apart > 4 * case.sigma
-    assert kept_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
-    assert kept_out.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
-    assert kept_out.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
+    assert held_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
+    assert held_out.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
+    assert held_out.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
 
 
 def test_map_finds_the_regime_and_controls_false_discoveries():
@@ -295,7 +295,7 @@ def test_rms_interval_covers():
     rng = np.random.default_rng(4)
     t = np.arange(0, 60, 0.01)
     e = np.convolve(rng.standard_normal(len(t)), np.ones(20) / np.sqrt(20), "same")
-    value, low, high = kept_out.rms_interval([e**2], [t])
+    value, low, high = held_out.rms_interval([e**2], [t])
     assert low < 1.0 < high and low < value < high and high - low < 0.3
 
 

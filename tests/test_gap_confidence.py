@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
-from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.confidence import Evidence
 from dexsim.gap.plant.columns import INDEX, Param, at_bound
 from dexsim.gap.rules import JUDGE
@@ -76,7 +76,7 @@ def test_a_size_at_its_bound_is_told_from_one_at_nothing():
     assert at_bound([gap], {"gap": 0.004}, case) == ""
 
 
-def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():
+def test_what_the_error_held_out_does_not_ask_for_is_not_sure():
     assert "hardly above the noise" in confidence.too_small(1.2, 1.2, 1.0, 1.0, True)
     assert confidence.too_small(3.0, 3.0, 1.0, 1.0, True) == ""
     assert "small beside" in confidence.too_small(10.0, 2.0, 1.2, 1.0, False)
@@ -191,7 +191,7 @@ def test_temperature_that_follows_something_else(starts, gains, what):
 )
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
-    assert kept_out.verdict([], 1.0, before, low, before, structured) == word
+    assert held_out.verdict([], 1.0, before, low, before, structured) == word
 
 
 def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():

@@ -55,7 +55,7 @@ def test_one_meeting_may_be_a_hand_in_the_way():
     assert inputs.used_end_stops(model_of(), [run]) == []
 
 
-def test_an_end_met_only_in_what_is_kept_out_is_neither_used_nor_judged():
+def test_an_end_met_only_in_what_is_held_out_is_neither_used_nor_judged():
     model, held = model_of(more=' range="-2.7 2.7" limited="true"'), run_of(-1.03)
     assert inputs.used_end_stops(model, [run_of(None, reach=0.8)]) == []
     spans = inputs.unforeseen_end_stops(model, [held])["a.mcap"]

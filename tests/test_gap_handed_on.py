@@ -113,7 +113,7 @@ def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fit
     assert (now.value, now.low, now.high) == (fitted, *after) and (other.low, other.high) == (0.018, 0.022)
 
 
-def test_what_reproduces_what_was_kept_out_is_handed_on_as_fitted_whatever_its_name_is_worth():
+def test_what_reproduces_what_was_held_out_is_handed_on_as_fitted_whatever_its_name_is_worth():
     """By hand: half of a tenth less error earns 0.5, a rival with 0.4 takes 0.4 of it; at a confidence of 0.5 the way
     to the belief (1.09) is then 1 - 0.3 of 0.84."""
     from types import SimpleNamespace

@@ -57,8 +57,8 @@ def judged(answer: Judged) -> dict:
 
 
 @pytest.mark.parametrize(("share", "hint"), [(0.02, True), (0.1, True), (0.19, True), (0.21, False), (0.6, False)])
-def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
-    """share: of the squared error on what was kept out."""
+def test_an_effect_must_remove_a_part_of_what_was_held_out(share, hint):
+    """share: of the squared error on what was held out."""
     answer = Judged(1.0, np.sqrt(1 - share))
     assert (judged(answer)["confidence"] <= JUDGE.hinted) is hint
     reasons = answer.evidence[0].reasons
@@ -67,7 +67,7 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
 
 @pytest.mark.parametrize("share", [0.1, 0.6])
 def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
-    """A moment of what was kept out is missed by a hundred times the noise with the effect and without it; elsewhere it
+    """A moment of what was held out is missed by a hundred times the noise with the effect and without it; elsewhere it
     removes a share of the squared error. It is a hint for the moment, as it is for removing little."""
     answer = Judged(1.0, np.sqrt(1 - share))
     answer.without[:50], answer.after[:50] = 100.0, 100.0**2
@@ -79,7 +79,7 @@ def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
     assert reasons[-1] == joint_answer.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
 
 
-def test_what_removes_much_of_all_that_was_kept_out_needs_no_moments_left_out():
+def test_what_removes_much_of_all_that_was_held_out_needs_no_moments_left_out():
     answer = Judged(100.0, 1.0)
     answer.without[:50], answer.after[:50] = 1e3, 1e6  # alike there, and hardly more than all the rest
     answer.without[50:] = 3e3

@@ -21,7 +21,7 @@ from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.drive import temperature_follows
-from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint_answer, kept_out
+from dexsim.gap.judge import conclude, confidence, full_model, handed_on, held_out, joint_answer
 from dexsim.gap.judge.joint_answer import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import coupled
@@ -352,30 +352,30 @@ def named(**changes):
 
 
 def test_an_error_within_the_noise_asks_for_nothing():
-    word = lambda before: kept_out.verdict([], 1.0, before, before, before, True)  # noqa: E731
+    word = lambda before: held_out.verdict([], 1.0, before, before, before, True)  # noqa: E731
     assert word(1.25) == "none" and word(1.35) == "unknown"
     assert confidence.too_small(1.25, 1.25, 1.0, 1.0, True) and not confidence.too_small(1.35, 1.35, 1.0, 1.0, True)
 
 
 def test_a_large_error_is_never_nothing():
-    word = lambda before: kept_out.verdict([], 1.0, before, 1.0, before, True)  # noqa: E731
+    word = lambda before: held_out.verdict([], 1.0, before, 1.0, before, True)  # noqa: E731
     assert word(4.9) == "none" and word(5.1) == "unknown"
 
 
 def test_what_counts_as_a_part_of_the_answer():
-    word = lambda after: kept_out.verdict([named()], 1.0, 11.0, 10.0, after, True)  # noqa: E731
+    word = lambda after: held_out.verdict([named()], 1.0, 11.0, 10.0, after, True)  # noqa: E731
     assert word(8.1) == "unknown" and word(7.9) == "partly_explained"
 
 
 def test_names_below_firm_are_hints():
     found = [named(confidence=0.51), named(confidence=0.49)]
-    kept_out.settle(found, set())
+    held_out.settle(found, set())
     assert [f.get("hint", False) for f in found] == [False, True]
 
 
 def test_what_is_not_borne_out_keeps_little():
     found = [named()]
-    kept_out.settle(found, {"j"})
+    held_out.settle(found, {"j"})
     assert 0.4 < found[0]["confidence"] < 0.5 and found[0]["hint"]
 
 
@@ -398,7 +398,7 @@ def test_one_reason_against_a_name_makes_it_doubted():
 
 
 def test_nothing_is_explained_by_doubtful_names_alone():
-    word = lambda sure: kept_out.verdict([named(confidence=sure)], 1.0, 5.0, 4.0, 1.0, True)  # noqa: E731
+    word = lambda sure: held_out.verdict([named(confidence=sure)], 1.0, 5.0, 4.0, 1.0, True)  # noqa: E731
     assert word(0.74) == "partly_explained" and word(0.76) == "explained"
 
 
@@ -419,7 +419,7 @@ def test_a_name_earns_its_confidence_by_what_it_removes():
 
 
 class Refuted:
-    """An answer on what was kept out, by the error after it over that before, and what it removed where it was
+    """An answer on what was held out, by the error after it over that before, and what it removed where it was
     fitted."""
 
     def __init__(self, followed=1.0, gain=0.0, told=False):
@@ -445,7 +445,7 @@ def test_findings_that_do_not_help_are_taken_back():
         assert (conclude._take_back(d, [refuted], [named()], {}) == set()) is kept, ratio
 
 
-def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
+def test_what_most_of_what_was_held_out_bears_out_is_a_hint():
     for ratio, kept in ((0.985, True), (0.995, False)):
         e = doubtful(effect="deadband")
         joints = {"j": {"before": 1.0, "after": 1.0, "mae_before": 1.0, "told_before": 0.1, "told_after": 0.1 * ratio}}
@@ -457,7 +457,7 @@ def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
         assert (joint_answer.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
 
 
-def test_what_was_kept_out_may_side_with_neither():
+def test_what_was_held_out_may_side_with_neither():
     reason = lambda a, ratio: conclude._not_refuted(a, a.outcome, ratio, [], None)  # noqa: E731
     assert (
         reason(Refuted(gain=0.25), 1.01)
@@ -468,7 +468,7 @@ def test_what_was_kept_out_may_side_with_neither():
     assert not reason(Refuted(0.1, told=True), 1.0)
 
 
-def test_what_shows_in_what_was_kept_out_alone():
+def test_what_shows_in_what_was_held_out_alone():
     shown = lambda before, fitted: conclude._shown_there_alone(  # noqa: E731
         {"j": {"before": before, "sigma": 0.1, "fitted": fitted}}, []
     )
@@ -502,7 +502,7 @@ def test_a_rival_of_the_same_class_makes_a_set():
         assert (len(judged(answer)["indistinguishable"]) == 2) is together, share
 
 
-def test_an_effect_must_remove_a_part_of_what_was_kept_out():
+def test_an_effect_must_remove_a_part_of_what_was_held_out():
     for share, hint in ((0.19, True), (0.21, False)):
         assert (judged(Judged(1.0, np.sqrt(1 - share)))["confidence"] < 0.5) is hint
 
@@ -512,7 +512,7 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
     decides."""
     for lost, hint in ((0.015, False), (0.025, True)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kept_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
+            patch.setattr(held_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
             assert (judged(Judged(1.0, 0.1))["confidence"] < 0.5) is hint, lost
 
 
@@ -528,13 +528,13 @@ def test_an_effect_that_harms_some_recordings_is_a_hint():
         assert (JointAnswer._harmed(answer, "without it") != "") is hint
 
 
-def test_what_was_kept_out_surely_shows_is_doubted_only():
-    """An effect that harms some recordings, by what it surely removes of the error on what was kept out."""
+def test_what_was_held_out_surely_shows_is_doubted_only():
+    """An effect that harms some recordings, by what it surely removes of the error on what was held out."""
     for surely, hint in ((0.13, True), (0.17, False)):
         answer = Judged(1.0, 0.1)
         answer._harmed = lambda without_it: "it harms some"
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kept_out, "gain_interval", lambda *_, surely=surely: (surely, 0.9))
+            patch.setattr(held_out, "gain_interval", lambda *_, surely=surely: (surely, 0.9))
             sure = judged(answer)["confidence"]
         assert (sure < rules.JUDGE.firm) is hint and sure <= rules.JUDGE.doubted, surely
 
@@ -547,7 +547,7 @@ def test_moments_that_nothing_follows_do_not_speak():
         squares[: 10 * count] = missed**2
         with_it = squares.copy()
         with_it[: 10 * count] *= 1 - differs
-        on = kept_out.telling(squares, with_it, t, 1.0)
+        on = held_out.telling(squares, with_it, t, 1.0)
         assert on.all() or not on[: 10 * count].any() and on[10 * count :].all()
         return not on.all()
 
@@ -666,7 +666,7 @@ def test_a_joint_must_shake_in_some_windows():
     made, rings = shaking.Shaking, SimpleNamespace(effect=SimpleNamespace(rings=True))
     outcome = SimpleNamespace(none="none", best=SimpleNamespace(members=(rings,)))
     try:
-        # in what was fitted, in what was kept out, of which one must shake
+        # in what was fitted, in what was held out, of which one must shake
         for fitted, kept, told in ((1, 1, False), (2, 1, True), (1, 2, True), (4, 0, False)):
 
             def counted(search, none, runs=None, *_, fitted=fitted, kept=kept):
@@ -964,21 +964,21 @@ def test_a_little_friction_stays_in_the_model():
             assert handed_on.on_motor(SimpleNamespace(plant=None), made) == moved
 
 
-# -- what is kept out
+# -- what is held out
 
 
-def test_the_end_of_a_recording_is_kept_out():
+def test_the_end_of_a_recording_is_held_out():
     runs = [SimpleNamespace(name=n, duration=10.0) for n in "ab"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_out, "visits", lambda *_: ([], np.zeros((0, 2))))
-        parts = kept_out.split(runs, [], [0, 1], [])
+        patch.setattr(held_out, "visits", lambda *_: ([], np.zeros((0, 2))))
+        parts = held_out.split(runs, [], [0, 1], [])
     assert all(7.0 < parts.span_train[i][1] < 8.0 and parts.span_test[i][1] == 10.0 for i in (0, 1))
 
 
 def test_a_condition_that_is_most_of_the_time_is_fitted():
     for seconds, chosen in ((4.3, True), (4.7, False)):  # of the first of three, which visits all that the others do
         runs = [SimpleNamespace(duration=s) for s in (seconds, 2.9, 7.1 - seconds)]
-        found = kept_out._condition(runs, [0, 1, 2], np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]]))
+        found = held_out._condition(runs, [0, 1, 2], np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]]))
         assert (found == 0) is chosen, seconds
 
 
@@ -991,7 +991,7 @@ def moving_case(**regimes):
 
 
 def test_regimes_of_a_motion():
-    share = {k: float(x.mean()) for k, x in kept_out.regimes([moving_case()]).items()}
+    share = {k: float(x.mean()) for k, x in held_out.regimes([moving_case()]).items()}
     assert all(0.25 < share[f"large {k} of j"] < 0.35 for k in ("speed", "load", "acceleration"))
     assert all(0.12 < share[f"j at its {k} end"] < 0.18 for k in ("upper", "lower"))
     assert 0.87 < share["saturation of j while braking"] < 0.93
@@ -999,14 +999,14 @@ def test_regimes_of_a_motion():
 
 def test_regimes_of_heat():
     for span, there in ((5.5, True), (4.7, False)):  # 0.4 of it is more than 2 degC
-        found = kept_out.regimes([moving_case(temperature=np.linspace(20.0, 20.0 + span, 1000))])
+        found = held_out.regimes([moving_case(temperature=np.linspace(20.0, 20.0 + span, 1000))])
         assert ("a warm j" in found) is there, span
-    found = kept_out.regimes([moving_case(temperature=np.linspace(20.0, 40.0, 1000))])
+    found = held_out.regimes([moving_case(temperature=np.linspace(20.0, 40.0, 1000))])
     assert all(0.25 < found[f"a {k} j"].mean() < 0.35 for k in ("warm", "cold"))
 
 
 def test_a_regime_is_visited_for_a_while():
-    alone = lambda here, there: kept_out._alone(["x"], np.array([[here, there]]), [0], [1]) == ["x"]  # noqa: E731
+    alone = lambda here, there: held_out._alone(["x"], np.array([[here, there]]), [0], [1]) == ["x"]  # noqa: E731
     assert alone(0.3, 0.0) and not alone(0.2, 0.0) and alone(1.0, 0.2) and not alone(1.0, 0.3)
 
 

@@ -187,7 +187,7 @@ def test_a_drive_may_act_late_by_its_loops_period_or_the_readings():
 
 
 def handed(after: float, plain: float, sigma: float) -> bool:
-    """Whether an answer with an error `after` on what was kept out is handed on beside the plain model's `plain`."""
+    """Whether an answer with an error `after` on what was held out is handed on beside the plain model's `plain`."""
     scales = SimpleNamespace(nominal={"coulomb_friction": 1.0}, slide=False)
     case = SimpleNamespace(joint="j", plant=None, scales=scales)
     trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
@@ -291,7 +291,7 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
 
 
 def told(after: float) -> float:
-    """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was kept out."""
+    """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held out."""
     n = SimpleNamespace(effect=inverse_dynamics.LOAD, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
                         after=after, rival=None, text="friction that grows with the load")  # fmt: skip
     case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
@@ -306,7 +306,7 @@ def test_what_the_torque_names_is_never_certain():
     assert 0.8 < told(0.5) < 1.0
 
 
-def test_what_the_torque_names_must_help_in_what_was_kept_out():
+def test_what_the_torque_names_must_help_in_what_was_held_out():
     assert 0.4 < told(0.99) < JUDGE.firm
 
 

@@ -168,7 +168,7 @@ def test_touch_rivals_are_told_apart_by_what_they_lose():
 
 
 def claimed(after=0.5, share=0.0):
-    """The finding of a pad's gain that leaves so much of 1 N on what was kept out, its like having a share of the
+    """The finding of a pad's gain that leaves so much of 1 N on what was held out, its like having a share of the
     draws."""
     left = lambda _, trial, stage: (after if trial == "best" else 1.0, None, None)  # noqa: E731
     best = SimpleNamespace(ids=("tactile_gain",))

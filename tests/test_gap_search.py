@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
-from dexsim.gap.judge import conclude, kept_out
+from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
@@ -86,7 +86,7 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
 
 
 def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
-    """before, after: in windows of what was kept out; ratio: of a free run over it; gain: where it was fitted and on
+    """before, after: in windows of what was held out; ratio: of a free run over it; gain: where it was fitted and on
     conditions left out."""
 
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
@@ -109,7 +109,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     assert "moment to moment" in reason(1.4, 1.0, 1.0, 0.3, 1.1)
 
 
-def test_what_only_the_recording_kept_out_shows_is_said():
+def test_what_only_the_recording_held_out_shows_is_said():
     def alone(before: float, fitted: float, *found: dict) -> list[str]:
         return conclude._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
 
@@ -124,7 +124,7 @@ def test_what_only_the_recording_kept_out_shows_is_said():
 )
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
     finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
-    assert kept_out.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
+    assert held_out.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 
 def test_temperature_counts_from_that_of_a_data_sheet():
@@ -174,7 +174,7 @@ def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
     assert fitter.toward_prior(params, home) is home  # there is nothing to gain
 
 
-def test_intervals_follow_how_well_what_was_kept_out_is_followed():
+def test_intervals_follow_how_well_what_was_held_out_is_followed():
     params = [Param("a", ("kp",), "set", 0.0, 3.0, 0.0), Param("b", ("kd",), "set", 0.0, 100.0, 0.0)]
     f = Fitted(params, np.array([2.0, 50.0]), np.zeros(4), np.zeros((4, 2)), np.zeros(4, int), 1.0, np.zeros(1))
     bounds = np.array([[1.0, 2.5], [40.0, 60.0]])
@@ -182,7 +182,7 @@ def test_intervals_follow_how_well_what_was_kept_out_is_followed():
     assert np.allclose(width(1.0), JUDGE.stretch_least * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)
     # no farther than is physical, and than was seen to be needed
     assert np.allclose(stretched(bounds, f, 50.0), [[0.0, 3.0], [10.0, 90.0]])
-    assert stretched(bounds, f, 0.0) is bounds  # nothing was kept out
+    assert stretched(bounds, f, 0.0) is bounds  # nothing was held out
 
 
 def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeypatch):

@@ -24,7 +24,7 @@ SOFT = {"softness": 0.1, "rebound": 0.16}
 @pytest.fixture(scope="module")
 def soft() -> JointSearch:
     """Three recordings of a drive whose transmission gives, so that its loop rings once a step has begun it; the last
-    is kept out."""
+    is held out."""
     runs = [plant_run(f"run{k}", k, 4.0, SOFT, seed=k, servo=SERVO) for k in (1, 3, 2)]
     for r in runs:
         r.smooth()
@@ -139,7 +139,7 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
         return [f["effect"] for f in d.data["findings"]]
 
     assert claimed(0.0011, 1.1) == ["torque_ripple"]
-    assert claimed(0.005, 1.1) == ["external_force"]  # what was kept out is not followed
+    assert claimed(0.005, 1.1) == ["external_force"]  # what was held out is not followed
     assert claimed(0.0011, 9.0) == ["external_force"]  # nor what was fitted
     # nothing keeps step with a joint that rings by itself: what was found rings as it does
     assert claimed(0.005, 9.0, frozenset(("elbow",))) == ["torque_ripple"]

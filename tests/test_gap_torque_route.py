@@ -102,7 +102,7 @@ def test_a_heavier_arm_is_not_taken_for_friction():
     assert x.value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
 
-def test_what_is_kept_out_takes_no_part():
+def test_what_is_held_out_takes_no_part():
     model = arm()
     r = run(model, 0, 40.0)
     r.torque[r.t > 30, 0] += 5.0
@@ -113,7 +113,7 @@ def test_what_is_kept_out_takes_no_part():
 
 
 @pytest.mark.parametrize("fitted_weighs", (True, False))
-def test_gravity_may_matter_in_what_is_fitted_alone_or_in_what_is_kept_out_alone(fitted_weighs):
+def test_gravity_may_matter_in_what_is_fitted_alone_or_in_what_is_held_out_alone(fitted_weighs):
     heavy, light = arm(), arm()
     light.opt.gravity[2] = -0.01  # as good as lying
     runs = [run(heavy, 0), run(light, 1)] if fitted_weighs else [run(light, 0), run(heavy, 1)]

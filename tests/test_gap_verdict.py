@@ -1,4 +1,4 @@
-"""The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of
+"""The verdict follows the error on what was held out; what is held out leaves every regime to be fitted; limits of
 time."""
 
 import contextlib
@@ -11,7 +11,7 @@ from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import TouchResult
-from dexsim.gap.judge import conclude, kept_out
+from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.hypotheses import Outcome
@@ -29,10 +29,10 @@ def finding(confidence: float, joint: str = "a") -> dict:
 
 def test_names_on_joints_that_need_no_effect_are_hints():
     found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
-    kept_out.settle(found, quiet={"a"})
+    held_out.settle(found, quiet={"a"})
     assert [f.get("hint", False) for f in found] == [True, False, True]
     assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
-    assert kept_out.firm(found) == [found[1]]
+    assert held_out.firm(found) == [found[1]]
 
 
 def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a_quiet_joint():
@@ -41,7 +41,7 @@ def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a
     conclude.mark_hints(found, quiet={"a"})
     assert [f.get("hint", False) for f in found] == [False, True, True]
     assert [f["confidence"] for f in found[:2]] == [0.9, 0.45]
-    assert kept_out.verdict(found[1:2], 1.0, 1.15, 1.1, 1.14, True) == "none"
+    assert held_out.verdict(found[1:2], 1.0, 1.15, 1.1, 1.14, True) == "none"
 
 
 @pytest.mark.parametrize(
@@ -58,8 +58,8 @@ def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a
 )
 def test_no_verdict_by_a_whisper(before, after, confidence, word):
     found = [finding(confidence)]
-    kept_out.settle(found, set())
-    assert kept_out.verdict(found, 1.0, before, 0.9 * before, after, True) == word
+    held_out.settle(found, set())
+    assert held_out.verdict(found, 1.0, before, 0.9 * before, after, True) == word
 
 
 @pytest.mark.parametrize(
@@ -68,24 +68,24 @@ def test_no_verdict_by_a_whisper(before, after, confidence, word):
 def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):
     """`none` would say that nothing was amiss; where the rest is not followed either the signal does not explain it."""
     bad = finding(confidence) | {"effect": "bad_channel", "held_out": None}
-    assert kept_out.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
+    assert held_out.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
 
 
 def test_the_interval_of_a_gain_holds_it_and_knows_chance():
     rng = np.random.default_rng(1)
     t = np.arange(0, 20, 0.01)
     noise = rng.standard_normal(len(t)) ** 2
-    low, high = kept_out.gain_interval(4 * noise, noise, t)
+    low, high = held_out.gain_interval(4 * noise, noise, t)
     assert low < 0.75 < high and high - low < 0.15
     few = np.where(t > 18, 400.0, 1.0)  # what acts in a tenth of the time: draws without it show no loss
-    low, high = kept_out.gain_interval(few * noise, 1.02 * noise, t)
+    low, high = held_out.gain_interval(few * noise, 1.02 * noise, t)
     assert -0.01 < low < 0.5 < high
-    low, high = kept_out.gain_interval(noise, rng.permutation(noise), t)
+    low, high = held_out.gain_interval(noise, rng.permutation(noise), t)
     assert low < 0 < high
 
 
 class Held:
-    """Regimes of runs, as `kept_out.split` asks a case for them: T s of each at 100 Hz."""
+    """Regimes of runs, as `held_out.split` asks a case for them: T s of each at 100 Hz."""
 
     def __init__(self, saturated: list[tuple[float, float]], T: float = 10.0):
         n = int(100 * T)
@@ -109,35 +109,35 @@ class Held:
         ]
 
 
-def test_what_alone_visits_a_regime_is_not_kept_out_whole():
-    # the last, which used to be kept out, is the only one at its limit
+def test_what_alone_visits_a_regime_is_not_held_out_whole():
+    # the last, which used to be held out, is the only one at its limit
     case = Held([(0, 0), (0, 0), (0, 0), (1.0, 9.0)])
-    parts = kept_out.split(case.runs, [], [0, 1, 2, 3], [case])
+    parts = held_out.split(case.runs, [], [0, 1, 2, 3], [case])
     assert parts.test == [2, 3] and parts.train == [0, 1, 3] and not parts.not_judged
     assert parts.span_train[3][1] == parts.span_test[3][0] == 7.5 and parts.span_test[2][0] == 0.0
 
 
 def test_a_recording_whose_end_does_not_visit_a_regime_takes_no_others_place():
-    """The last is kept out and stays cold. Of two that are warm the first is at its begin alone: the second's end is
-    kept out, or nothing that drifts with temperature would show."""
+    """The last is held out and stays cold. Of two that are warm the first is at its begin alone: the second's end is
+    held out, or nothing that drifts with temperature would show."""
     case = Held([(0, 0), (0, 0), (1.0, 9.0), (0, 0), (1.0, 9.0)])
     warm = Held([(0, 0), (1.0, 4.0), (0, 0), (0, 9.9), (0, 0)]).regimes["saturation"] > 0
     case.regimes["temperature"] = 20.0 + 20.0 * warm
-    parts = kept_out.split(case.runs, [], [0, 1, 2, 3, 4], [case])
+    parts = held_out.split(case.runs, [], [0, 1, 2, 3, 4], [case])
     assert parts.test == [3, 4] and parts.span_test[3][0] == 7.5
 
 
 def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
     case = Held([(0, 0), (0, 0), (1.0, 9.0)])
-    parts = kept_out.split(case.runs, [2], [0, 1, 2], [case])
+    parts = held_out.split(case.runs, [2], [0, 1, 2], [case])
     assert parts.test == [2] and "saturation of a" in parts.not_judged
     both = Held([(0, 0), (2.0, 4.0), (1.0, 9.0)])
-    assert not kept_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
+    assert not held_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
 
 
 def test_ends_of_all_recordings_where_there_are_few():
     case = Held([(0, 0), (0, 0)])
-    parts = kept_out.split(case.runs, [], [0, 1], [case])
+    parts = held_out.split(case.runs, [], [0, 1], [case])
     assert parts.train == parts.test == [0, 1] and parts.span_train[0] == (0.0, 7.5)
 
 
@@ -234,7 +234,7 @@ def test_touch_with_nothing_but_hints_within_its_noise_is_none():
 @pytest.mark.parametrize(
     ("errors", "kinds", "dropped"),
     [
-        ({"a": 3.0, "b": 0.7}, {}, "b"),  # what was kept out is followed better without b
+        ({"a": 3.0, "b": 0.7}, {}, "b"),  # what was held out is followed better without b
         ({"a": 3.0, "b": 1.2}, {}, None),  # each lowers the error
         ({"a": 0.8, "b": 0.7}, {}, "b"),  # the one that harms most
         ({"a": 3.0, "b": 0.7}, {"b": "rings"}, None),
@@ -243,7 +243,7 @@ def test_touch_with_nothing_but_hints_within_its_noise_is_none():
         ({"a": 3.0, "b": None}, {}, None),  # better on the whole by one moment: it may remove much elsewhere
     ],
 )
-def test_what_was_kept_out_takes_one_of_several_effects_back(errors, kinds, dropped):
+def test_what_was_held_out_takes_one_of_several_effects_back(errors, kinds, dropped):
     """errors: rms error without an effect, with all 1; None: half of it, but for a moment in which it is 8 with all."""
     t = np.arange(0.0, 20.0, 0.01)
     answer = object.__new__(JointAnswer)
@@ -270,7 +270,7 @@ def test_what_was_kept_out_takes_one_of_several_effects_back(errors, kinds, drop
     ],
 )
 def test_what_is_left_is_believed_as_with_or_without_what_was_taken_back(alone, now, before, said):
-    """alone: rms error of what was kept out with the other effect alone, of 1 without any; confidences of what is left,
+    """alone: rms error of what was held out with the other effect alone, of 1 without any; confidences of what is left,
     judged without the other and with it."""
 
     class Answer(JointAnswer):

@@ -46,8 +46,8 @@ examples:
 settings (key=default):
   recordings=                 MCAP files, bag folders, or CSV and NPZ files with named columns: [a.mcap,b.csv,...] or
                               a pattern 'runs/*.mcap'
-  held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the
-                              time, is kept out
+  held_out=                   recordings held out of the fit; without them a condition, or the last quarter of the
+                              time, is held out
   model=                      MuJoCo or URDF file, or the folder of a hand; hand= by default
   hand=xhand                  a hand that comes with dexsim, or a folder; beside model=, the hand whose fingertips and
                               touch pads that model carries

@@ -1,5 +1,5 @@
 """The whole diagnosis: recordings in, verdict, findings, fitted servo and model, report out. Its drives are taken
-through their steps here, joint by joint, judged on recordings kept out; its touch in `gap.touch.diagnosis`."""
+through their steps here, joint by joint, judged on recordings held out; its touch in `gap.touch.diagnosis`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dexsim.gap.inquiry import (
     read_files,
     to_runs,
 )
-from dexsim.gap.judge import conclude, full_model, handed_on, kept_out
+from dexsim.gap.judge import conclude, full_model, handed_on, held_out
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint_answer import JointAnswer, Kept
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
@@ -128,7 +128,7 @@ class Drives(Steps):
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
         self.pushes: Sequence[logged_torque.Push] = ()  # from outside
-        # model: a case a joint, what is kept out of the fit, the noise
+        # model: a case a joint, what is held out of the fit, the noise
         self.cases: list[Case] = []
         self.left_out: dict[str, str] = {}  # effects that are not considered, with reasons
         # search: what recorded torque, duty and current say; joints whose closed loop says nothing of them; an answer a
@@ -167,7 +167,7 @@ class Drives(Steps):
         except inputs.Unusable as error:
             raise NothingToJudge(str(error)) from error
         if w.settings.held_out and not w.held:
-            w.notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
+            w.notes.append("none of the held_out recordings can be used; part of the others is held out instead")
         self.mj_model = w.m.spec.compile()
         self._within_the_stops()
         self._without_pushes()
@@ -179,7 +179,7 @@ class Drives(Steps):
             )
 
     def _within_the_stops(self) -> None:
-        """The runs without what only those kept out press: ends of a motion that no recording for the fit has shown."""
+        """The runs without what only those held out press: ends of a motion that no recording for the fit has shown."""
         w, model = self.w, self.mj_model
         fitted = [r for i, r in enumerate(w.runs) if i not in w.held]
         w.notes += _limits(model, w.runs) + inputs.used_end_stops(model, fitted)
@@ -188,7 +188,7 @@ class Drives(Steps):
             why = "presses against an end of its motion that no recording for the fit has shown"
             w.runs, w.held = inputs.free_air(w.runs, w.held, inputs.merged_spans(pressed), w.notes, why)
             if w.settings.held_out and not w.held:
-                raise NothingToJudge("the recordings kept out do nothing but press against an end of a joint's motion")
+                raise NothingToJudge("the recordings held out do nothing but press against an end of a joint's motion")
 
     def _without_pushes(self) -> None:
         """The runs without the stretches in which something outside pushes."""
@@ -201,7 +201,7 @@ class Drives(Steps):
     # -- model
     # -----------------------------------------------------------------------------------------------------------------
     def model(self) -> None:
-        """A case a joint: its plant along the motion, what is kept out of the fit, the noise floor."""
+        """A case a joint: its plant along the motion, what is held out of the fit, the noise floor."""
         w, s = self.w, self.w.settings
         count = len(w.runs[0].joints)
         w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
@@ -222,9 +222,9 @@ class Drives(Steps):
         group = conditions(w.runs)
         drives = [json.dumps(plain(r.servo.to_dict()), sort_keys=True) for r in w.runs]
         self.fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
-        self.parts = kept_out.split(w.runs, w.held, group, self.cases)
-        w.say(f"kept out of the fit: {self.parts.how}")
-        self.noise = Noise(*kept_out.floor(w.runs, self.cases), kept_out.floors(w.runs, self.cases)[0])
+        self.parts = held_out.split(w.runs, w.held, group, self.cases)
+        w.say(f"held out of the fit: {self.parts.how}")
+        self.noise = Noise(*held_out.floor(w.runs, self.cases), held_out.floors(w.runs, self.cases)[0])
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
 
     def _within_the_limit(self) -> None:
@@ -339,12 +339,12 @@ class Drives(Steps):
             self.ahead[id(search)] = self._answer(search, found), self._plain(search)
 
     def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
-        """A joint on what was kept out."""
+        """A joint on what was held out."""
         known = self.ahead.get(id(search))
         return known[0] if known else JointAnswer.of(search.case, search, found, self.kept)
 
     def _plain(self, search: JointSearch) -> baseline.Baseline | None:
-        """What a plain model of a joint leaves of what was kept out."""
+        """What a plain model of a joint leaves of what was held out."""
         case, p, known = search.case, self.parts, self.ahead.get(id(search))
         if known or not case.moved:
             return known[1] if known else None
@@ -516,7 +516,7 @@ class Drives(Steps):
             a.locate(rng, seed)
 
     def judge(self) -> None:
-        """The answers on what was kept out, and what a plain model of each joint leaves of it."""
+        """The answers on what was held out, and what a plain model of each joint leaves of it."""
         for a in self.answers:
             a.judge(self.w.m)
         self.plains = [b for b in compute.each(len(self.outcomes), lambda k: self._plain(self.outcomes[k][1])) if b]
@@ -529,7 +529,7 @@ class Drives(Steps):
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:
             w.notes.append(
-                f"not judged: {', '.join(p.not_judged)}; what was kept out visits it and no recording that is fitted "
+                f"not judged: {', '.join(p.not_judged)}; what was held out visits it and no recording that is fitted "
                 "does"
             )
         d.stages = [x.text for x in self.stages] + self.behind

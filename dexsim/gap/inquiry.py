@@ -135,7 +135,7 @@ class Diagnosis:
     untrained: list[str] = field(default_factory=list)
     confirmation: full_model.Confirmation | None = None
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
-    # joints that ring by themselves, as what was found of them does in what was kept out
+    # joints that ring by themselves, as what was found of them does in what was held out
     ringing: frozenset[str] = frozenset()
 
 
@@ -174,7 +174,7 @@ class Inquiry:
     """A diagnosis under way: what is asked, and what the recordings hold.
 
     recordings: as they are, None for one that cannot be read; runs: of those that can be used; held: numbers of the
-    runs that are kept out of the fit; channel: findings about signals; lengths: s, by recording; notes: what the page
+    runs that are held out of the fit; channel: findings about signals; lengths: s, by recording; notes: what the page
     says beside the findings."""
 
     settings: Settings
@@ -199,7 +199,7 @@ class Inquiry:
 
     @property
     def held_names(self) -> set[str]:
-        """Names of the recordings that are to be kept out of the fit."""
+        """Names of the recordings that are to be held out of the fit."""
         return {self.names[p] for p in self.settings.held_out or []}
 
     def nothing_left(self) -> bool:
@@ -224,7 +224,7 @@ class Steps(ABC):
 
     @abstractmethod
     def model(self) -> None:
-        """The plant that simulates it along the recordings, what is kept out of the fit, and the noise."""
+        """The plant that simulates it along the recordings, what is held out of the fit, and the noise."""
 
     @abstractmethod
     def search(self) -> None:
@@ -237,7 +237,7 @@ class Steps(ABC):
 
     @abstractmethod
     def judge(self) -> None:
-        """Findings, confidences and errors on what was kept out of the fit."""
+        """Findings, confidences and errors on what was held out of the fit."""
 
     @abstractmethod
     def report(self, d: Diagnosis) -> None:
@@ -342,7 +342,7 @@ def to_runs(w: Inquiry) -> None:
 
 
 def _in_turn(fitted: int, count: int) -> list[int]:
-    """Numbers of the recordings, the first `fitted` of them and those kept out in turn, each evenly: wherever one
+    """Numbers of the recordings, the first `fitted` of them and those held out in turn, each evenly: wherever one
     stops, there is of both."""
     share = [(i + 0.5) / fitted for i in range(fitted)]
     share += [(i + 0.5) / (count - fitted) for i in range(count - fitted)]

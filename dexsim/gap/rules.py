@@ -75,7 +75,7 @@ class SearchRules:
     )
     tie: float = _rule(
         0.02,
-        "of the loss: nearer than this, fits without each condition decide; of the squared error on what was kept out: "
+        "of the loss: nearer than this, fits without each condition decide; of the squared error on what was held out: "
         "nearer than this it speaks neither for an effect nor against it",
         "twice the 1 % at which fits to what is not left out end",
         "test_where_two_fits_are_close_fits_of_their_own_do_not_decide",
@@ -154,7 +154,7 @@ class SearchRules:
     )
     shaking: int = _rule(
         3,
-        "windows of a second in which a joint must shake for that to tell of an effect; one of them kept out where it "
+        "windows of a second in which a joint must shake for that to tell of an effect; one of them held out where it "
         "is judged",
         "of fewer windows more than one bootstrap in 20 draws none; one that rings does in five of six",
         "test_a_joint_must_shake_in_some_windows",
@@ -220,7 +220,7 @@ class JudgeRules:
     )
     hinted: float = _rule(
         0.45,
-        "confidence that a name keeps at most which the error on what was kept out does not bear out",
+        "confidence that a name keeps at most which the error on what was held out does not bear out",
         "below `firm`, so that it is a hint",
         "test_what_is_not_borne_out_keeps_little",
     )
@@ -244,7 +244,7 @@ class JudgeRules:
     )
     earns: float = _rule(
         0.1,
-        "share of the error kept out that a name must cost when dropped to keep all of its confidence; that a "
+        "share of the error held out that a name must cost when dropped to keep all of its confidence; that a "
         "stand-in torque must take off; that the engine may leave beside what the plant leaves, in squares",
         "wrong names remove 3 to 8 % of the error in the median, 19 of 20 right ones a fifth and more (four sets of "
         "cases of another plant)",
@@ -252,7 +252,7 @@ class JudgeRules:
     )
     most_left_out: float = _rule(
         0.2,
-        "share of what was kept out that may say nothing of an effect: more of it is not a few moments",
+        "share of what was held out that may say nothing of an effect: more of it is not a few moments",
         "made for a true dead zone that one half second at a limit, missed alike with it and without, had lost",
         "test_moments_that_nothing_follows_do_not_speak",
     )
@@ -286,19 +286,19 @@ class JudgeRules:
     )
     part: float = _rule(
         0.2,
-        "share of the squared error on what was kept out that an effect removes at least that is more than a hint; a "
+        "share of the squared error on what was held out that an effect removes at least that is more than a hint; a "
         "half second that it changes by half as much can speak of it; of several on a joint, one that surely removes "
         "less, and without which the error is lower, is taken back",
         "wrong names remove 0.07 to 0.16 in the median, 19 of 20 right ones 0.37 and more (four sets of cases of "
         "another plant)",
-        "test_an_effect_must_remove_a_part_of_what_was_kept_out",
+        "test_an_effect_must_remove_a_part_of_what_was_held_out",
     )
     borne_out: float = _rule(
         0.15,
-        "share of the squared error on what was kept out that an effect removes in all but a twentieth of its draws: "
+        "share of the squared error on what was held out that an effect removes in all but a twentieth of its draws: "
         "moving less than half a count of the encoder, or harming a recording, then makes it doubted, not a hint",
         "between 0.11, the most in 118 empty cases of another plant, and 0.19, the least of five small true effects",
-        "test_what_was_kept_out_surely_shows_is_doubted_only",
+        "test_what_was_held_out_surely_shows_is_doubted_only",
     )
     level: float = _rule(
         0.05,
@@ -310,7 +310,7 @@ class JudgeRules:
     )
     stretch: float = _rule(
         0.5,
-        "intervals grow by this, times the square of what is left of what was kept out over the noise",
+        "intervals grow by this, times the square of what is left of what was held out over the noise",
         "coverage of 90 % intervals on concealed cases (docs/concepts/gap.md)",
         "test_intervals_grow_with_what_is_left",
     )
@@ -365,13 +365,13 @@ class JudgeRules:
     )
     kept_end: float = _rule(
         0.25,
-        "of the time of a recording, where its end is kept out",
+        "of the time of a recording, where its end is held out",
         "the customary quarter",
-        "test_the_end_of_a_recording_is_kept_out",
+        "test_the_end_of_a_recording_is_held_out",
     )
     kept_most: float = _rule(
         0.45,
-        "of all time that may be kept out",
+        "of all time that may be held out",
         "below a half: what is fitted must be more than what judges",
         "test_a_condition_that_is_most_of_the_time_is_fitted",
     )
@@ -424,7 +424,7 @@ class TouchRules:
     )
     earned: float = _rule(
         0.2,
-        "of what keeps all confidence: an effect that earns no more on what was kept out is not claimed",
+        "of what keeps all confidence: an effect that earns no more on what was held out is not claimed",
         "2 % of the error: within what the plant is off by",
         "test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed",
     )

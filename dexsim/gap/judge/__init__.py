@@ -1,1 +1,1 @@
-"""Step 5: what is kept out, errors on it, confidence, findings, the verdict, and what is handed on to training."""
+"""Step 5: what is held out, errors on it, confidence, findings, the verdict, and what is handed on to training."""

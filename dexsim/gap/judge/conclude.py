@@ -15,7 +15,7 @@ from dexsim.gap import locate
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
 from dexsim.gap.inquiry import Diagnosis, Settings, TouchResult
-from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
@@ -59,7 +59,7 @@ def into_diagnosis(
 ) -> None:
     """The joints into a diagnosis that is empty but for its notes and its mechanism.
 
-    answers: of each joint, judged and located; how: what was kept out, in words; channel: findings about signals, of
+    answers: of each joint, judged and located; how: what was held out, in words; channel: findings about signals, of
     all joints; plains: the plain model of each joint. (One long list of steps: each needs what those before it found.)
     """
     data, notes, m = d.data, d.notes, d.mechanism
@@ -99,7 +99,7 @@ def into_diagnosis(
     for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
         v = d.joints[joint]
         notes.append(
-            f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by "
+            f"{joint}: the recordings held out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by "
             f"{1e3 * v['fitted']:.3g}: "
             "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with "
             "others held out"
@@ -126,11 +126,11 @@ def into_diagnosis(
 
 
 def mark_hints(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
-    """Which findings are hints (`kept_out.settle`). quiet: joints followed to their floor without any effect, which
+    """Which findings are hints (`held_out.settle`). quiet: joints followed to their floor without any effect, which
     says nothing of what is wrong with the reading of the effort alone."""
     by_effort = [f for f in findings if EFFECTS[f["effect"]].effort_only]
-    kept_out.settle([f for f in findings if f not in by_effort], quiet)
-    kept_out.settle(by_effort, set())
+    held_out.settle([f for f in findings if f not in by_effort], quiet)
+    held_out.settle(by_effort, set())
 
 
 def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
@@ -140,7 +140,7 @@ def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
     for e in d.evidence:
         if e.joint in rings and EFFECTS[e.effect].rings:
             e.left = 1.0 - rings[e.joint]
-            e.reasons = ["the joint rings by itself as it does in what was kept out, but no free run keeps step"]
+            e.reasons = ["the joint rings by itself as it does in what was held out, but no free run keeps step"]
             e.confidence = min(e.share * confidence.kept_of(e.left), JUDGE.doubted)
 
 
@@ -156,7 +156,7 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
 
 
 def _rings(a: JointAnswer) -> float:
-    """Share of what is missed of how a joint rings by itself in what was kept out that what was found takes away; 0
+    """Share of what is missed of how a joint rings by itself in what was held out that what was found takes away; 0
     where the error there is lower with it anyway."""
     if _less(a.numbers["after"], a.numbers["before"]):
         return 0.0
@@ -166,7 +166,7 @@ def _rings(a: JointAnswer) -> float:
 def _take_back(
     d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]], rings: dict[str, float]
 ) -> set[str]:
-    """Joints whose findings did not help on what was kept out: they keep none of them, and are left as they were
+    """Joints whose findings did not help on what was held out: they keep none of them, and are left as they were
     believed. rings: of `_rings`, by joint: no free run keeps step with those."""
     refuted = set()
     for a in answers:
@@ -187,7 +187,7 @@ def _take_back(
             continue
         refuted.add(joint)
         d.notes += [
-            f"{f['effect']} on {joint} earned its place on the training conditions but not on what was kept out; not "
+            f"{f['effect']} on {joint} earned its place on the training conditions but not on what was held out; not "
             "claimed"
             for f in mine
         ]
@@ -236,10 +236,10 @@ def _verdict(
     seed: int,
     quiet: bool,
 ) -> None:
-    """Errors over all joints on what was kept out, and the word for it."""
+    """Errors over all joints on what was held out, and the word for it."""
     data, times = d.data, [a.t for a in answers]
-    b, bl, bh = kept_out.rms_interval([a.before for a in answers], times, seed)
-    a, al, ah = kept_out.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
+    b, bl, bh = held_out.rms_interval([a.before for a in answers], times, seed)
+    a, al, ah = held_out.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
     slide = all(x.case.constants.slide for x in answers)
     data["held_out"] = {
         "recordings": [kept.runs[i].name for i in kept.test],
@@ -255,7 +255,7 @@ def _verdict(
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    data["verdict"] = kept_out.verdict(data["findings"], floor, b, bl, a, structured, quiet)
+    data["verdict"] = held_out.verdict(data["findings"], floor, b, bl, a, structured, quiet)
     findings = [f for f in findings if f["confidence"] >= JUDGE.firm]
     if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
@@ -279,8 +279,8 @@ def _verdict(
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
-    """Joints without a finding of which what was kept out is missed by far more than the noise, and what was fitted is
-    not: what is missing (a limit, a sag) shows there alone, and what is kept out must not be fitted."""
+    """Joints without a finding of which what was held out is missed by far more than the noise, and what was fitted is
+    not: what is missing (a limit, a sag) shows there alone, and what is held out must not be fitted."""
     found = {j for f in findings for j in f["where"]["joints"]}
     return [
         j
@@ -290,7 +290,7 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[
 
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
-    """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are
+    """Why findings that do not lessen the error of a free run over what was held out (after / before: `ratio`) are
     doubted, not dropped; empty where they are refuted. One stick more or less sends a free run another way; and a limit
     may just not have been reached there. What the recorded torque has told of a joint is known: nothing that is not
     shown goes beyond it."""
@@ -298,10 +298,10 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     if before > SEARCH.enough**2 and after < (1 - SEARCH.plainly) * before:
-        return "what was kept out is followed better from moment to moment, but not by a free run"
+        return "what was held out is followed better from moment to moment, but not by a free run"
     sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
     plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= SEARCH.plainly
-    return "what was kept out does not show it" if sides_with_neither and plain else ""
+    return "what was held out does not show it" if sides_with_neither and plain else ""
 
 
 def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str, Any]]) -> None:
@@ -368,7 +368,7 @@ def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) ->
 
 
 def _weight(f: dict, rings: dict[str, float]) -> float:
-    """How much of the error on what was kept out a finding removes; of a joint that rings (`_rings`), of how it
+    """How much of the error on what was held out a finding removes; of a joint that rings (`_rings`), of how it
     rings."""
     h, share = f["held_out"], rings.get(f["where"]["joints"][0]) if f["where"]["joints"] else None
     return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
@@ -376,7 +376,7 @@ def _weight(f: dict, rings: dict[str, float]) -> float:
 
 def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
     """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
-    that is left on the recording kept out, where the loop's own error shows nothing."""
+    that is left on the recording held out, where the loop's own error shows nothing."""
     if not findings:
         return
     data = d.data
@@ -418,7 +418,7 @@ def _followed(d: Diagnosis, joint: str) -> bool:
 
 def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
     """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
-    motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was kept out,
+    motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was held out,
     by what was found of it, nor of one that rings by itself as that does: nothing is left that could push."""
     followed = {p.joint for p in pushes if not p.cut and (p.joint in d.ringing or _followed(d, p.joint))}
     d.notes += [

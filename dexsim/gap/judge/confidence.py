@@ -24,7 +24,7 @@ EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 @dataclass
 class Evidence:
     """What speaks for and against one finding. share: of the bootstraps; earned: 1 where dropping it costs a tenth of
-    the error kept out; left, left_of_rest: squared error kept out that stays, over that before anything was named, and
+    the error held out; left, left_of_rest: squared error held out that stays, over that before anything was named, and
     over that without this effect alone; folds: relative cost of dropping it on each condition left out; reasons: why it
     is doubted."""
 
@@ -107,17 +107,17 @@ def kept_of(left: float) -> float:
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
-    """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing
+    """Why an effect is too small to be sure of: it leaves the error held out (rms, without and with it) where nothing
     is asked for, or is small beside what others removed of the error before; empty where it is not."""
     if without <= JUDGE.within * noise:
-        return "without it the error kept out is hardly above the noise"
+        return "without it the error held out is hardly above the noise"
     if not alone and without**2 - after**2 < JUDGE.least_share * max(before, without) ** 2:
         return "it is small beside what another effect explains, whose law need not be exact"
     return ""
 
 
 def unresolved(without: float, after: float, quantum: float) -> str:
-    """Why an effect is below what the encoder resolves: what it does to the motion kept out, rms, is less than half a
+    """Why an effect is below what the encoder resolves: what it does to the motion held out, rms, is less than half a
     count (`quantum`, rad or m), so that a reading seldom changes for it; empty where it is not. without, after: rms
     error without and with the effect."""
     moved = float(np.sqrt(max(without**2 - after**2, 0.0)))

@@ -1,6 +1,6 @@
 """The few final hypotheses once more, in the engine and the servo that train policies.
 
-The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out
+The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was held out
 of the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's
 columns and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one
 batch.
@@ -45,7 +45,7 @@ REPLAY = ("mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
-MOST = 8.0  # s of what was kept out that is replayed: a step of the engine is a turn of Python
+MOST = 8.0  # s of what was held out that is replayed: a step of the engine is a turn of Python
 PILOT, LEAST = 0.1, 1.0  # s that are replayed to see how long it takes, and at least
 
 
@@ -191,7 +191,7 @@ def missing_of(h: Hypothesis) -> list[str]:
 
 
 def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows: Windows) -> list[World]:
-    """One world a window (a whole run, or the part of it that was kept out)."""
+    """One world a window (a whole run, or the part of it that was held out)."""
     out = []
     at_rest = m.spec.compile()
     rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
@@ -450,7 +450,7 @@ def confirm(
     room: float = math.inf,
 ) -> Confirmation | None:
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over
-    what was kept out. finer: the cases with the plants in which the errors of the search's own plant are judged; room:
+    what was held out. finer: the cases with the plants in which the errors of the search's own plant are judged; room:
     s that it may take, by a pilot: of each recording less is replayed where it would take longer. None where nothing
     can be replayed. Raises UserError where the model or a drive does not serve, NoTime."""
     device = "cpu" if replay == "mujoco" else device

@@ -165,7 +165,7 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
 
 def earned(finding: dict[str, Any]) -> float:
     """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or
-    more off the error on what was kept out (against all others fitted again without it), less by what other names claim
+    more off the error on what was held out (against all others fitted again without it), less by what other names claim
     of it, which would go on in another way where nothing was recorded."""
     error, others = (
         finding.get("held_out") or {},
@@ -255,7 +255,7 @@ def save_model(spec: mujoco.MjSpec, path: Path) -> None:
 #     torque = constant + position * q + speed * v + drag * v |v|
 #
 # It names nothing. Inverse dynamics along the measured motion with the best hypothesis leaves a torque; the four
-# numbers are fitted to it, judged on recordings kept out, and written to `servo_standin.yaml` as the servo's
+# numbers are fitted to it, judged on recordings held out, and written to `servo_standin.yaml` as the servo's
 # `standin_*` columns.
 
 STAND_IN_COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")

@@ -1,4 +1,4 @@
-"""One joint's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, where
+"""One joint's answer judged on what was held out of the fit: errors before and after, findings with their doubts, where
 its residual lives, how much a delay varies."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dexsim.gap import locate
 from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.inquiry import Curve
-from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.plant.case import Case, intervals_of
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.plant.free_run import free_run
@@ -26,7 +26,7 @@ from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
-MUTE = "moments of what was kept out are followed neither with it nor without; the others alone speak for it"
+MUTE = "moments of what was held out are followed neither with it nor without; the others alone speak for it"
 
 
 @dataclass
@@ -42,11 +42,11 @@ class Kept:
 
 
 class JointAnswer:
-    """A searched joint on what was kept out.
+    """A searched joint on what was held out.
 
     before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at
     times t (rows,) [s]; effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 %
-    intervals of the fitted parameters; widest: as they are before it is known how well what was kept out is followed,
+    intervals of the fitted parameters; widest: as they are before it is known how well what was held out is followed,
     by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance:
     refitted beliefs; found, evidence: see `judge`; spots, depends_on: see `locate`."""
 
@@ -108,8 +108,8 @@ class JointAnswer:
 
     @property
     def told(self) -> tuple[float, float]:
-        """Errors before and after (rms) where what was kept out can speak of what was found (`kept_out.telling`)."""
-        on = kept_out.telling(self.before, self.after, self.t, self.case.sigma)
+        """Errors before and after (rms) where what was held out can speak of what was found (`held_out.telling`)."""
+        on = held_out.telling(self.before, self.after, self.t, self.case.sigma)
         return rms(self.before[on]), rms(self.after[on])
 
     def mae(self) -> dict[str, tuple[float, float]]:
@@ -124,7 +124,7 @@ class JointAnswer:
 
     @classmethod
     def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: Kept) -> JointAnswer:
-        """The answer without those of several effects on the joint that what was kept out refutes, the one that harms
+        """The answer without those of several effects on the joint that what was held out refutes, the one that harms
         most first. `outcome` stays as it is: others may still be searched by it, and must not learn of what was kept
         out."""
         answer = cls(case, search, outcome, kept)
@@ -134,7 +134,7 @@ class JointAnswer:
         return answer
 
     def _without_refuted(self) -> Trial | None:
-        """The best hypothesis without the effect whose absence follows what was kept out best; None where each lowers
+        """The best hypothesis without the effect whose absence follows what was held out best; None where each lowers
         that error, or may remove as much of it as a name has to. No free run keeps step with what makes a joint ring,
         and a reading of the effort moves nothing."""
         if len(self.best.members) < 2 or not len(self.after):
@@ -145,7 +145,7 @@ class JointAnswer:
                 continue
             trial, q, _ = self._without(mm)
             lost = (self.measured - q) ** 2
-            if np.mean(lost) < least and kept_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part:
+            if np.mean(lost) < least and held_out.gain_interval(lost, self.after, self.t)[1] < JUDGE.part:
                 best, least = trial, float(np.mean(lost))
         return best
 
@@ -167,7 +167,7 @@ class JointAnswer:
         """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each.
 
         Where an effect was taken back, what is left is judged with it and without, and believed the more: unless the
-        one that went explains a part of what was kept out by itself. It is another explanation then, and the less
+        one that went explains a part of what was held out by itself. It is another explanation then, and the less
         counts."""
         self.found = [self._finding(mm, m) for mm in self.best.members]
         if self.earlier is None:
@@ -192,11 +192,11 @@ class JointAnswer:
             was, left = rms((self.torque - effort)[self.sensed] ** 2), rms(of_effort)
         else:
             was, left = rms(lost), rms(self.after)
-        gain = kept_out.gain_interval(lost, self.after, self.t)
+        gain = held_out.gain_interval(lost, self.after, self.t)
         evidence = self._judged(mm, trial, raw, was, left, gain[0])
-        on = kept_out.telling(lost, self.after, self.t, self.case.sigma)
+        on = held_out.telling(lost, self.after, self.t, self.case.sigma)
         if not effort_only and not on.all():  # what the other moments say of it, as a hint
-            part = kept_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
+            part = held_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
             other = self._judged(mm, trial, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
             other.hint(MUTE)
             evidence = max(other, evidence, key=lambda e: e.confidence)
@@ -242,9 +242,9 @@ class JointAnswer:
         surely: float,
         before: float | None = None,
     ) -> confidence.Evidence:
-        """The evidence of one effect: was, left: rms error of what was kept out without and with it; surely: share of
+        """The evidence of one effect: was, left: rms error of what was held out without and with it; surely: share of
         the squared error that it removes in all but a twentieth of its draws; before: error before anything was named,
-        where that is not of all that was kept out."""
+        where that is not of all that was held out."""
         effort_only, borne_out = mm.effect.effort_only, surely >= JUDGE.borne_out
         before = rms(self.before) if before is None else before
         spread = self._fitted(mm, self.widest)[1]
@@ -252,10 +252,10 @@ class JointAnswer:
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
-                f"kept out, less than {100 * JUDGE.part:.0f} %"
+                f"held out, less than {100 * JUDGE.part:.0f} %"
             )
         elif not effort_only and surely < -SEARCH.tie:
-            evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
+            evidence.hint("the error on what was held out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(without_it)):
             (evidence.doubt if borne_out else evidence.hint)(harmed)
         return evidence
@@ -268,7 +268,7 @@ class JointAnswer:
         if len(runs) < 3:
             return ""
         sums = lambda *x, axis=-1: np.stack([one.sum(axis) for one in x])  # noqa: E731
-        gained, of = draws(((lost - mine)[runs], lost[runs]), sums, 0, kept_out.DRAWS)
+        gained, of = draws(((lost - mine)[runs], lost[runs]), sums, 0, held_out.DRAWS)
         harms = float(np.mean(gained < -SEARCH.tie * of)) > JUDGE.level
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
@@ -298,9 +298,9 @@ class JointAnswer:
         borne_out: bool,
         before: float,
     ) -> confidence.Evidence:
-        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out
+        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was held out
         without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the motion
-        then tells nothing of it). borne_out: whether what was kept out surely shows it; before: error of the motion
+        then tells nothing of it). borne_out: whether what was held out surely shows it; before: error of the motion
         before anything was named."""
         case, outcome = self.case, self.outcome
         # the one effect of the reading: nothing else explains the effort
@@ -349,7 +349,7 @@ class JointAnswer:
     def floor_beyond(self) -> float:
         """What repeats differ by beyond what was found [rad or m]; inf without repeats."""
         fixed = [f for mm in self.best.members for f in mm.variant.fixed]
-        return kept_out.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, fixed)
+        return held_out.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, fixed)
 
     def locate(self, rng: np.random.Generator, seed: int) -> None:
         """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is
@@ -404,7 +404,7 @@ class JointAnswer:
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
-    """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the
+    """Intervals [P, 2] about a fit, by how well it follows what was held out (left: x the noise): what follows to the
     noise is known better than by all that might be off in it, what does not only looks like it and is something else.
     The law is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:

@@ -466,7 +466,7 @@ def used_end_stops(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
 
 
 def unforeseen_end_stops(model: mujoco.MjModel, runs: list[Run]) -> dict[str, list[tuple[float, float]]]:
-    """By recording: the stretches (start, end in s) in which joints of `runs`, which are kept out of the fit, press
+    """By recording: the stretches (start, end in s) in which joints of `runs`, which are held out of the fit, press
     against ends that the model does not have. What nothing in the fit has shown is not used to simulate them, and not
     held against a drive either."""
     out: dict[str, list[tuple[float, float]]] = {}

@@ -244,7 +244,7 @@ class Where(Section):
 
     @property
     def unit_shown(self) -> str:
-        """Unit of the error on what was kept out."""
+        """Unit of the error on what was held out."""
         return unit_of(self.held_out["error"])[0]
 
     def _pads(self, taxels: np.ndarray, marked: set[str]) -> list[dict[str, Any]]:

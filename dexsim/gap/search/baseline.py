@@ -2,7 +2,7 @@
 delay.
 
 A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the
-bounds. Whatever else a diagnosis finds has to follow what was kept out better than this, or this is what is handed on.
+bounds. Whatever else a diagnosis finds has to follow what was held out better than this, or this is what is handed on.
 
 What recorded motions say against its friction: a stretch that begins at rest and moves the joint on needs, at its best
 moment, more driving torque than dry friction. The drive's part is known where the drive is off (0) or its torque was
@@ -41,7 +41,7 @@ UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "
 @dataclass
 class Baseline:
     """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over
-    what was kept out [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples,
+    what was held out [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples,
     of half a second a block [n]; at_bound: columns that stopped there."""
 
     joint: str
@@ -228,9 +228,9 @@ def refused(
     train: Sequence[int],
     floor: float,
 ) -> dict[str, str]:
-    """Joints of which what was fitted is not handed on, with the reason: it follows what was kept out worse than the
+    """Joints of which what was fitted is not handed on, with the reason: it follows what was held out worse than the
     plain model, or its friction forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); fits:
-    each joint's case, the trial that it would hand on and its squared errors on what was kept out, at the plain model's
+    each joint's case, the trial that it would hand on and its squared errors on what was held out, at the plain model's
     samples; floor: of the noise, as `joints`."""
     out = {}
     by = {b.joint: b for b in given}
@@ -251,7 +251,7 @@ def refused(
         ):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"
             out[joint] = (
-                "a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was kept out to "
+                "a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was held out to "
                 f"{k * plain.error:.3g} {unit}, "
                 f"what was found to {k * after:.3g}"
             )
@@ -286,7 +286,7 @@ def text(data: dict[str, Any], unit: str) -> str:
         return ""
     said = (
         f"A plain least squares (gains, limit, Coulomb, viscous, delay) leaves {1e3 * data['error']:.3g} {unit} of "
-        f"{1e3 * data['error_before']:.3g} on what was kept out"
+        f"{1e3 * data['error_before']:.3g} on what was held out"
     )
     return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
 

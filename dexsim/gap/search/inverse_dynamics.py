@@ -7,7 +7,7 @@ with the body's torque from the MuJoCo model along the measured motion of all jo
 joints and gravity are no hindrance. Linear, hence at once and without a start; it needs a logged torque of 100 Hz or
 more. How much is filtered away follows from the data: a second derivative is noise above what moves. Further effects
 are named one after another, each only where it helps on quarters of the recordings that its fit has not seen; what is
-kept out only judges them.
+held out only judges them.
 """
 
 from __future__ import annotations
@@ -290,7 +290,7 @@ SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck'
 @dataclass
 class Named:
     """One further effect. text: as `Inverse.extra` names it; value, low, high (90 %) of its coefficients; share of the
-    bootstraps in which it was the best to add; residual rms before and after on the recording kept out (N.m, N for a
+    bootstraps in which it was the best to add; residual rms before and after on the recording held out (N.m, N for a
     slide)."""
 
     text: str

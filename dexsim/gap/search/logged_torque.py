@@ -103,7 +103,7 @@ def torque_texts(given: Sequence[tuple]) -> list[str]:
             f"{case.joint}: by the recorded motor torque alone: {said}; {100 * x.residual:.1f} % of the torque is left"
         )
         text += "".join(f"; {n.replace('_', ' ')}: {why}" for n, why in x.refused.items())
-        where = " in the recording kept out" if judged else ""
+        where = " in the recording held out" if judged else ""
         for k, n in enumerate(x.named):
             told = EFFECTS[n.effect].size_by_torque(_by_torque(case, x, n)) if n.effect else ""
             size = f" ({told})" if told else ""
@@ -176,7 +176,7 @@ def hand_on(
     loop does not say otherwise: what it was refitted to then is the fit's own wandering.
 
     d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run
-    over what was kept out is followed better with its own figures, by more than `BELIEF.tolerance`, or where a finding
+    over what was held out is followed better with its own figures, by more than `BELIEF.tolerance`, or where a finding
     of at least a half is about them; not where `stages` say that the drive itself is not as believed, since what its
     loop does then speaks of the drive.
     """
@@ -238,7 +238,7 @@ def _alike(
     test: Sequence[int],
     span_test: Spans | None,
 ) -> bool:
-    """Whether what was kept out is followed as well with the torque's figures as with those that the closed loop was
+    """Whether what was held out is followed as well with the torque's figures as with those that the closed loop was
     refitted to."""
     whole = replace(case, plant=search.whole)
     windows = whole.plant.windows(None, test, span=span_test)

@@ -632,7 +632,7 @@ class JointSearch(JointSelection):
 
     def _simpler(self, trial: Trial) -> Trial:
         """The trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without: slopes
-        stall at such kinks, and what was kept out may go beyond what told them."""
+        stall at such kinks, and what was held out may go beyond what told them."""
         params = trial.fit.params
         away = [
             p.key

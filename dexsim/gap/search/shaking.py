@@ -245,7 +245,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
 
 
 def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict | None) -> float:
-    """Share of what is missed of how a joint rings by itself in `runs`, which were kept out, that what was found takes
+    """Share of what is missed of how a joint rings by itself in `runs`, which were held out, that what was found takes
     away; 0 where it does not ring there."""
     if not any(m.effect.rings for m in outcome.best.members):
         return 0.0
@@ -253,7 +253,7 @@ def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict
     if not fitted.loud.any():
         return 0.0
     shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
-    # what is kept out is a part of the recordings: one stretch of it bears out what several of the others show
+    # what is held out is a part of the recordings: one stretch of it bears out what several of the others show
     if not shaking.loud.any() or sum((x.loud | x.rung).sum() for x in (fitted, shaking)) < SEARCH.shaking:
         return 0.0
     before, after = (float(shaking.of(t).sum()) for t in (outcome.none, outcome.best))

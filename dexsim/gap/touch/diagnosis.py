@@ -1,4 +1,4 @@
-"""Touch and contact: what the taxels show that simulation leaves out, pad by pad, judged on recordings kept out; beside
+"""Touch and contact: what the taxels show that simulation leaves out, pad by pad, judged on recordings held out; beside
 the joints' findings and in the files.
 
 Without the geometry of what is touched, the taxels alone still show the dead, the stuck and the exchanged ones.
@@ -18,9 +18,9 @@ from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
-from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.conclude import sentence
-from dexsim.gap.judge.kept_out import rms_interval
+from dexsim.gap.judge.held_out import rms_interval
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer
@@ -40,7 +40,7 @@ class Pad:
     number: int
     runs: list[PadRun]
     notes: list[str] = field(default_factory=list)
-    kept: set[str] = field(default_factory=set)  # recordings kept out of its fit
+    kept: set[str] = field(default_factory=set)  # recordings held out of its fit
     search: PadSearch | None = None  # None: touched too shortly
     outcome: PadOutcome | None = None
     answer: PadAnswer | None = None
@@ -54,7 +54,7 @@ SEARCHING = 0.5  # of a limit of time: no pad's search begins later
 
 
 class Touch(Steps):
-    """The touch of all recordings. held: names of those kept out of the fit; allowed: effects that are considered, None
+    """The touch of all recordings. held: names of those held out of the fit; allowed: effects that are considered, None
     for all; limit: of time."""
 
     def __init__(
@@ -87,7 +87,7 @@ class Touch(Steps):
         self.pads = [Pad(k, [r for r in self.data.runs if r.pad == k]) for k in self.data.pads()]
 
     def model(self) -> None:
-        """The plant of each pad beside its readings, and what of them is kept out."""
+        """The plant of each pad beside its readings, and what of them is held out."""
         for pad in self.pads:
             runs = pad.runs
             seconds = sum(float(np.sum(r.z.sum(1) > 0.1) * np.median(np.diff(r.t))) for r in runs)
@@ -130,7 +130,7 @@ class Touch(Steps):
                 self.result.error = error
 
     def judge(self) -> None:
-        """Findings, errors and facts of each pad on what was kept out of the fit, and of all of them."""
+        """Findings, errors and facts of each pad on what was held out of the fit, and of all of them."""
         out, judged = self.result, []
         for pad in self.pads:
             if pad.search is not None and pad.outcome is not None:
@@ -181,7 +181,7 @@ def diagnose(
     allowed: set[str] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> TouchResult:
-    """Touch of all recordings, whatever the joints do. held: names of those kept out of the fit."""
+    """Touch of all recordings, whatever the joints do. held: names of those held out of the fit."""
     touch = Touch(recordings, m, held, seed, allowed, progress)
     touch.run()
     return touch.result
@@ -200,7 +200,7 @@ def _verdict(felt: TouchResult) -> str | None:
             f["hint"] = True
     named = [{"effect": f["effect"], "held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
     assert felt.floor is not None and felt.before is not None and felt.after is not None  # with a force predicted
-    word = kept_out.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    word = held_out.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
     return "partly_explained" if word == "explained" and felt.structured else word
 
 
@@ -263,7 +263,7 @@ def _metric(data: dict, felt: TouchResult) -> None:
         "before_high": bh,
         "after_low": al,
         "after_high": ah,
-        "how": "presses kept out of the fit",
+        "how": "presses held out of the fit",
     }
     gap = b**2 - felt.floor**2
     data["unexplained"]["fraction_of_gap"] = (

@@ -1,4 +1,4 @@
-"""One pad's answer judged on what was kept out of the fit: errors before and after, where touch and its simulation
+"""One pad's answer judged on what was held out of the fit: errors before and after, where touch and its simulation
 part, findings with their doubts, facts for training."""
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from dexsim.tactile.sensors import Sensors
 
 
 class PadAnswer:
-    """A searched pad on what was kept out.
+    """A searched pad on what was held out.
 
     before, after: squared errors [N^2] of the signals in which something was found (readings, the cell's force, shear)
     without any effect and with what was found; times: of each [s], unique over the recordings; bounds: 90 % intervals
     of the fitted parameters; numbers: rms [N] for the page; facts: what training is told beside the findings. felt:
-    whether what was kept out feels anything; nothing is judged otherwise."""
+    whether what was held out feels anything; nothing is judged otherwise."""
 
     def __init__(self, search: PadSearch, outcome: PadOutcome, kept: set[str]):
         self.search, self.outcome, self.kept = search, outcome, kept
@@ -41,7 +41,7 @@ class PadAnswer:
         blocks = np.concatenate([held_out(search, self.best, k)[2] for k in self.stages])
         self.felt = bool(len(e0))
         if not self.felt:
-            self.notes.append(f"the {self.name}'s pad feels nothing in what was kept out: nothing is judged there")
+            self.notes.append(f"the {self.name}'s pad feels nothing in what was held out: nothing is judged there")
             return
         silent = _silent_squares(search) if 0 in self.stages else (np.zeros(0), np.zeros(0))
         self.before, self.after = np.concatenate([e0, silent[0]]), np.concatenate([e1, silent[1]])
@@ -67,18 +67,18 @@ class PadAnswer:
         return found
 
     def _finding(self, e: str) -> dict[str, Any] | None:
-        """One effect; None where it did not help on what was kept out."""
+        """One effect; None where it did not help on what was held out."""
         search, best, effect = self.search, self.best, TOUCH_EFFECTS[e]
         stage = _stage(search, e)
         less = search.without(best, e) if len(best.ids) > 1 else self.none
         b, a = held_out(search, less, stage)[0], held_out(search, best, stage)[0]
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= JUDGE.level][:2]
-        judged = np.isfinite(a)  # what nothing kept out shows is doubted
+        judged = np.isfinite(a)  # what nothing held out shows is doubted
         earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if judged else JUDGE.doubted
         if earned <= TOUCH.earned:
             self.notes.append(
-                f"{e} on the {self.name}'s pad earned its place in training but not on what was kept out; not claimed"
+                f"{e} on the {self.name}'s pad earned its place in training but not on what was held out; not claimed"
             )
             return None
         taxels, parameters = self._parameters(e)
@@ -202,7 +202,7 @@ def rms(squares: np.ndarray) -> float:
 
 
 def held_out(pad: PadFit, trial: TouchTrial, stage: int = 0) -> tuple[float, np.ndarray, np.ndarray]:
-    """(rms [N], squared errors, blocks) on residuals kept out, of one stage, over taxels that feel something."""
+    """(rms [N], squared errors, blocks) on residuals held out, of one stage, over taxels that feel something."""
     at = ~pad.train & (pad.stage_of() == stage)
     sigma = np.concatenate([s.sigma[s.mask] for s in pad.samples])
     e = (trial.res * sigma)[at] ** 2
@@ -232,7 +232,7 @@ def _floor(search: PadFit, stages: list[int]) -> float:
 
 
 def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
-    """Squared errors of the dead and stuck taxels on what was kept out: as believed, and as constants."""
+    """Squared errors of the dead and stuck taxels on what was held out: as believed, and as constants."""
     a, b = [], []
     for s in search.samples:
         if s.stage != "taxels" or s.train.all():
@@ -303,7 +303,7 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
 
 
 def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: bool) -> PadCurve:
-    """The last recording of a pad for the page: all of it, or its last quarter, which was kept out of the fit."""
+    """The last recording of a pad for the page: all of it, or its last quarter, which was held out of the fit."""
     run = pad.runs[-1]
     before, after = readings(run, none.values), readings(run, best.values, best.gains, best.order)
     for k, value in pad.silent.items():

@@ -55,7 +55,7 @@ class TouchTrial:
 
 
 class PadFit:
-    """One pad's readings and the plant fitted to them. held: names of recordings kept out; with none, the last quarter
+    """One pad's readings and the plant fitted to them. held: names of recordings held out; with none, the last quarter
     of each recording's time; name: the pad's."""
 
     def __init__(

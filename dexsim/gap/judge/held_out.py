@@ -1,4 +1,4 @@
-"""What is kept out of the fit, the errors on it, and the verdict by them."""
+"""What is held out of the fit, the errors on it, and the verdict by them."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import BLOCK, Run, same_commands
 from dexsim.gap.rules import JUDGE, SEARCH
 
-# -- what is kept out -------------------------------------------------------------------------------------------------
-# What is kept out of the fit: a condition whose regimes are fitted elsewhere, and ends of recordings with regimes that
+# -- what is held out -------------------------------------------------------------------------------------------------
+# What is held out of the fit: a condition whose regimes are fitted elsewhere, and ends of recordings with regimes that
 # it does not visit.
 #
-# A limit that is reached in one recording only can neither be learned if that recording is kept out nor be judged if it
-# is not. So the condition is kept out whose regimes the other conditions visit too; and of recordings that alone visit
-# a regime which it does not, the end is kept out beside it.
+# A limit that is reached in one recording only can neither be learned if that recording is held out nor be judged if it
+# is not. So the condition is held out whose regimes the other conditions visit too; and of recordings that alone visit
+# a regime which it does not, the end is held out beside it.
 
 
 @dataclass
 class Split:
     """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
-    not_judged: regimes that only what is kept out visits."""
+    not_judged: regimes that only what is held out visits."""
 
     train: list[int]
     test: list[int]
@@ -78,7 +78,7 @@ def visits(runs: Sequence[Run], cases: Sequence[Case]) -> tuple[list[str], np.nd
 
 
 def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Case]) -> Split:
-    """What is fitted and what is kept out. held: runs that were asked to be kept out; group: condition of each run."""
+    """What is fitted and what is held out. held: runs that were asked to be held out; group: condition of each run."""
     names, time = visits(runs, cases)
     if held:
         train = [i for i in range(len(runs)) if i not in held]
@@ -135,7 +135,7 @@ def _ends(
     found: dict[str, np.ndarray],
     plant: JointPlant,
 ) -> dict[int, float]:
-    """Where the end of a fitted recording begins that is kept out too [s], by run: those that visit regimes which
+    """Where the end of a fitted recording begins that is held out too [s], by run: those that visit regimes which
     `test` does not, before that moment and after."""
     out: dict[int, float] = {}
     missing = [k for k in range(len(time)) if time[k, test].sum() < JUDGE.visited <= time[k, train].sum()]
@@ -166,14 +166,14 @@ def _ends(
 
 
 def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: Sequence[int]) -> list[str]:
-    """Regimes that what is kept out visits and no fitted recording does."""
+    """Regimes that what is held out visits and no fitted recording does."""
     here, there = time[:, list(test)].sum(1), time[:, list(train)].sum(1)
     alone = (here > JUDGE.visited) & (there < JUDGE.visited)
     return [name for name, so in zip(names, alone, strict=True) if so]
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------
-# Errors on what was kept out of the fit, the floor, when an effect acts, the verdict.
+# Errors on what was held out of the fit, the floor, when an effect acts, the verdict.
 
 DRAWS = 400  # of a bootstrap
 
@@ -267,7 +267,7 @@ def rms_interval(
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
-# The one word of a diagnosis, and which names count for it: by the error on what was kept out, never by a name alone.
+# The one word of a diagnosis, and which names count for it: by the error on what was held out, never by a name alone.
 #
 # One place decides: the sentence, the page and `diagnosis.json` all follow what stands in the findings after `settle`.
 
@@ -304,7 +304,7 @@ def verdict(
     structured: bool,
     quiet: bool = False,
 ) -> str:
-    """The one word. findings: after `settle`; floor, before, after: of the error on what was kept out; before_low: of
+    """The one word. findings: after `settle`; floor, before, after: of the error on what was held out; before_low: of
     its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether every joint is
     followed to its own floor. Where the rest is followed to the floor a wrong signal is the answer: something was
     amiss, and it has a name."""
@@ -328,7 +328,7 @@ def gain_interval(
     without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = BLOCK
 ) -> tuple[float, float]:
     """90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both at
-    times [n] s on what was kept out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the
+    times [n] s on what was held out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the
     whole error: draws without the few moments in which a limit acts show nothing, not a loss. (0, 0) without
     samples."""
     if not len(without):
@@ -347,8 +347,8 @@ def _blocks(times: np.ndarray, block: float) -> np.ndarray:
 
 
 def telling(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, noise: float) -> np.ndarray:
-    """[n] which samples of what was kept out can speak of an effect. without, with_it: squared errors [n] without and
-    with it at times [n] s; noise: of one sample. Where a limit is reached in what was kept out alone, or one stick more
+    """[n] which samples of what was held out can speak of an effect. without, with_it: squared errors [n] without and
+    with it at times [n] s; noise: of one sample. Where a limit is reached in what was held out alone, or one stick more
     sends a free run another way, neither follows, and half a second of that outweighs the rest: half-second blocks that
     are missed by more than `JUDGE.far` x the noise, alike with the effect and without (half of `JUDGE.part`), are left
     out, as long as they are few (`JUDGE.most_left_out`)."""
