@@ -1,4 +1,5 @@
-"""What is held out of the fit, the errors on it, and the verdict by them."""
+"""What is held out of the fit (a hold-out by conditions, not a k-fold cross-validation), the errors on it, and the
+verdict by them."""
 
 from __future__ import annotations
 

@@ -483,7 +483,7 @@ LATE = 2e-3  # s: by what a command is late to see what it does, at most a fifth
 WINDOWS = 24  # at most, evenly over the recordings
 ALIKE = (0.05, 0.2)  # s: over which times that are off may be alike
 SPAN = 1.25  # s of commands that may act within a window of a second
-FALL = 0.5 * 1.645**2  # of the log likelihood at the ends of a 90 % interval
+FALL = 0.5 * 1.645**2  # of the profile likelihood's log at the ends of a 90 % interval
 
 
 @dataclass

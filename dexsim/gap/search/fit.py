@@ -1,4 +1,5 @@
-"""Bounded least squares on a joint's windows: batched finite differences, several damped steps tried at once."""
+"""Bounded least squares on a joint's windows (multiple shooting, each window from its measured state): batched finite
+differences, several damped steps tried at once."""
 
 from __future__ import annotations
 
