@@ -115,7 +115,7 @@ class RotateEnv(HandEnv):
         self.farthest = torch.tensor(self.unit * (ends.get("training") or ends["distance"]), device=dev)
         trained = self.grasps.shape < len(t["objects"]["train"])
         self.poses_of = torch.nonzero(trained)[:, 0], torch.nonzero(~trained)[:, 0]
-        self.judge_held_out(False)
+        self.judge_kept_out(False)
         axis = torch.tensor([float(x) for x in t["goal"]["axis"]], device=dev)
         self.axis = axis / axis.norm()
         self.up = torch.tensor([0.0, 0.0, 1.0], device=dev)  # an IMU knows where down is, but not its heading
@@ -162,9 +162,9 @@ class RotateEnv(HandEnv):
         """What held poses call the objects, in the order of the scene's table; those trained on first."""
         return tuple(called(name) for name in self.shape_names)
 
-    def judge_held_out(self, held_out: bool) -> None:
+    def judge_kept_out(self, kept_out: bool) -> None:
         """Episodes begin with objects kept out of the training from now on, or with those of it."""
-        self.allowed = self.poses_of[held_out]  # one and the same tensor each time: a recorded step holds on to it
+        self.allowed = self.poses_of[kept_out]  # one and the same tensor each time: a recorded step holds on to it
 
     def _check(self) -> None:
         t = self.task

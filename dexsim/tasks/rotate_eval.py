@@ -60,13 +60,13 @@ def evaluate(
     training_length, env.max_episode_length = env.max_episode_length, int(round(cap / env.dt)) + 2
     try:
         r, frames = _trials(env, policy, cap, episodes, True, progress)
-        kept = _held_out(env, policy, cap, max(episodes // 2, 1), progress) if env.task["objects"]["held_out"] else None
+        kept = _kept_out(env, policy, cap, max(episodes // 2, 1), progress) if env.task["objects"]["held_out"] else None
     finally:
         env.max_episode_length = training_length
     resamples = env.task["evaluation"]["resamples"]
     metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, resamples, seed)
     if kept is not None:
-        metrics["held_out"] = summary(kept["successes"], kept["time"], kept["end"] == "capped", cap, resamples, seed)
+        metrics["kept_out"] = summary(kept["successes"], kept["time"], kept["end"] == "capped", cap, resamples, seed)
     metrics |= _by_object(env, [r] if kept is None else [r, kept])
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
@@ -94,14 +94,14 @@ def _trials(
     return {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}, frames
 
 
-def _held_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progress: Progress | None) -> dict:
+def _kept_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progress: Progress | None) -> dict:
     """Trials that begin with the objects kept out of the training."""
     was, env.graphs = env.graphs, False  # a recorded step begins with those of the training
-    env.judge_held_out(True)
+    env.judge_kept_out(True)
     try:
         return _trials(env, policy, cap, episodes, False, progress)[0]
     finally:
-        env.judge_held_out(False)
+        env.judge_kept_out(False)
         env.graphs = was
 
 
@@ -241,7 +241,7 @@ def _tables(env: RotateEnv, m: dict, r: dict) -> list:
         ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
     ]  # fmt: skip
     ends = [(name, count, f"{100 * count / m['episodes']:.1f}") for name, count in m["ends"].items()]
-    kept = m.get("held_out")
+    kept = m.get("kept_out")
     if kept is not None:
         intervals.append(
             ("average, objects kept out", f"{kept['consecutive_successes']['average']:.2f}",
