@@ -373,6 +373,8 @@ def test_git_state_of_a_checkout_and_in_words(tmp_path):
     assert state == {"commit": commit, "dirty": True}
     data = {"git": state, "iteration": 3, "steps": 4096}
     assert checkpoint.provenance(data) == f"iteration 3, 4,096 steps, trained at commit {commit[:12]}+changes"
+    data["git"] = {"commit": commit, "dirty": None, "note": "found by its settings"}
+    assert checkpoint.provenance(data).endswith(f"commit {commit[:12]}, written in afterwards")
     data["git"] = checkpoint.git_state(tmp_path / "elsewhere")
     assert checkpoint.provenance(data).endswith("commit unknown")
 

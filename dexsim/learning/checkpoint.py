@@ -4,10 +4,10 @@ A checkpoint is a ``torch.save`` zip of tensors, numbers and text, read with ``w
 code. It is written beside its place, synced and renamed, so that the previous one survives a full disk or a crash.
 
 Keys (all of them always there in a ``train`` file; a ``policy`` file leaves out those marked t):
-  format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty}); layout
-  ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps); actor (state
-  dict, its running normalization included); t critic, t optimizer, t env (the environment's counters, curriculum and
-  random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states.
+  format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty[, note]});
+  layout ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps); actor
+  (state dict, its running normalization included); t critic, t optimizer, t env (the environment's counters, curriculum
+  and random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states.
 """
 
 from __future__ import annotations
@@ -235,9 +235,11 @@ def git_state(folder: Path | None = None) -> dict[str, Any]:
 
 def provenance(data: dict[str, Any]) -> str:
     """A checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where tracked files
-    differed from it."""
+    differed from it; "written in afterwards" where that is not known."""
     git = data["git"]
-    commit = git["commit"][:12] + ("+changes" if git["dirty"] else "") if git["commit"] != "unknown" else "unknown"
+    commit = git["commit"]
+    if commit != "unknown":
+        commit = commit[:12] + {True: "+changes", False: "", None: ", written in afterwards"}[git["dirty"]]
     return f"iteration {data['iteration']}, {data['steps']:,} steps, trained at commit {commit}"
 
 

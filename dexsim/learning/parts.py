@@ -29,7 +29,8 @@ class Git(msgspec.Struct):
     """See :func:`dexsim.learning.checkpoint.git_state`."""
 
     commit: str
-    dirty: bool
+    dirty: bool | None  # None: not known, of a commit that was written in afterwards
+    note: str = ""
 
 
 class Optimizer(msgspec.Struct):
