@@ -674,7 +674,8 @@ def test_real_time_on_the_simulated_hand(made, tmp_path):
         [
             sys.executable,
             "-m",
-            "dexsim.deploy",
+            "dexsim",
+            "deploy",
             f"bundle={made[0]}",
             "seconds=2",
             "home_speed=2",
@@ -707,7 +708,8 @@ def test_interrupting_the_command(made, tmp_path, how):
         [
             sys.executable,
             "-m",
-            "dexsim.deploy",
+            "dexsim",
+            "deploy",
             f"bundle={made[0]}",
             "seconds=60",
             "home_speed=2",

@@ -484,7 +484,8 @@ def test_a_terminal_that_goes_away_leaves_a_relaxed_hand_and_a_whole_recording(b
         [
             sys.executable,
             "-m",
-            "dexsim.deploy",
+            "dexsim",
+            "deploy",
             f"bundle={b.path}",
             "seconds=60",
             "home_speed=2",

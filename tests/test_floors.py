@@ -1,8 +1,8 @@
 """Imports run down the floors, and no files import each other in a circle. Read off the source with `ast`, nothing is
 imported.
 
-What stands under `if __name__ == "__main__":`, and a `__main__.py`, is a door: it runs only as a program and may lead
-to any floor. Imports inside functions count like those at the top; what stands under `if TYPE_CHECKING:` does not.
+What stands under `if __name__ == "__main__":`, and `dexsim/__main__.py`, is a door: it runs only as a program and may
+lead to any floor. Imports inside functions count like those at the top; what stands under `if TYPE_CHECKING:` does not.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def door(node: ast.AST) -> bool:
 
 
 def modules(root: Path, package: str = "dexsim") -> dict[str, Path]:
-    """Module name -> file of a package in the folder root."""
+    """Module name -> file of a package in the folder root, without the package's own `__main__.py`."""
     found = {}
     for path in sorted((root / package).rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
-        if parts[-1] != "__main__":
+        if parts != (package, "__main__"):
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
@@ -230,9 +230,22 @@ def test_the_check_sees_what_it_must(tmp_path):
     graph = {name: imported(path, known) - {name} for name, path in known.items()}
     assert graph["dexsim.b"] == {"dexsim.c"} and graph["dexsim.d"] == {"dexsim.a"}
     assert [set(c) for c in circles(graph)] == [{"dexsim.a", "dexsim.b", "dexsim.c"}]
+    (house / "__main__.py").write_text("import dexsim.a\n")
+    (house / "part").mkdir()
+    (house / "part" / "__main__.py").write_text("import dexsim.a\n")
+    assert {m for m in modules(tmp_path) if m.endswith("__main__")} == {"dexsim.part.__main__"}
     (house / "f.py").write_text("import dexsim.gone\n")
     with pytest.raises(AssertionError, match="dexsim.gone does not exist"):
         imported(house / "f.py", known)
+
+
+def test_no_private_module_of_another_decoder_is_imported():
+    """It may be moved or changed by any release, though its version is held."""
+    private = re.compile(r"\b(from|import)\s+mcap_ros2\._")
+    files = [p for f in ("dexsim", "benchmarks", "tests", "tools", "docs", "notebooks") for p in (ROOT / f).rglob("*.*")]
+    files = [p for p in (*files, *ROOT.glob("*.py")) if p.suffix in (".py", ".ipynb", ".md")]
+    assert private.search("from mcap_ros2._dynamic import x") and len(files) > 300
+    assert [str(p.relative_to(ROOT)) for p in files if private.search(p.read_text(encoding="utf-8"))] == []
 
 
 def test_topic_names_stand_in_the_schema_alone():
