@@ -435,6 +435,13 @@ def test_every_setting_has_a_line_in_the_help(name):
     assert sorted(names) == sorted(row[0] for row in lines(path))
 
 
+def test_the_help_of_play_lists_what_goes_with_a_replay():
+    from dexsim.cli import help, recorded
+
+    text = help.text("play", CONFIGS)
+    assert [k for k in (*recorded.KEYS, "remap.OURS", "meta.KEY") if f"{k}=" not in text] == []
+
+
 @pytest.mark.parametrize("line, said", [
     ("+agent.actor.hidden_dims.task=[16,16]", "agent.actor.hidden_dims is a list"),
     ("hand=" + "a" * 300, "must be one of xhand, or a folder with a hand.yaml"),

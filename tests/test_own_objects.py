@@ -109,7 +109,7 @@ def test_without_coacd_a_hollow_mesh_is_refused_and_a_convex_one_is_not(tmp_path
     monkeypatch.setattr(decompose, "available", lambda: False)
     u_mesh().export(tmp_path / "u.stl")
     trimesh.creation.box((0.05, 0.04, 0.03)).export(tmp_path / "block.stl")
-    with pytest.raises(UserError, match=r"u\.stl.*pip install 'dexsim\[objects\]'.*object_hulls=1"):
+    with pytest.raises(UserError, match=r"u\.stl.*pip install coacd.*object_hulls=1"):
         own.own_shape(str(tmp_path / "u.stl"))
     assert len(own.own_shape(str(tmp_path / "block.stl")).hulls) == 1
 

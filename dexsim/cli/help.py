@@ -30,9 +30,20 @@ examples:
   dexsim play checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
   dexsim play checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
   dexsim play policy=random task=grasp tactile=raw record=a.mcap realistic=true
-  dexsim play checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install "dexsim[view]")
+  dexsim play checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install viser)
   dexsim play replay=a.mcap                                        recorded against simulated: plots, video
   dexsim play replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
+"""
+REPLAY = """with replay=FILE.mcap, beside out= and video=:
+  model=                      the recorded machine, MJCF or URDF; hand=, hand_mirror=true: one that training knows
+  servo=                      its drives: servo.yaml of a diagnosis (servo_file= is the same), or one of servo= below
+  object=                     what was held, where its pose was recorded: box, sphere, capsule, ... (a wrong one lists all)
+  object_size=                its extents, m: three of a box, diameter and length of a capsule, the longest of others
+  object_mass=                kg
+  object_friction=            sliding, of hand and object
+  timestep=                   a physics step, s
+  remap.OURS=THEIRS           a topic or a joint of the file; meta.KEY=VALUE what the file does not say
+
 """
 END = """
   dexsim {script} --cfg      every setting, those in groups too (task.rewards.force, ...), with its value, then stop
@@ -45,7 +56,7 @@ def text(script: str, config_dir: Path) -> str:
     lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
     for file in files:
         lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in settings(config_dir / file)]
-    lines += ["", "groups (one file of dexsim/configs/<group>/ each):"]
+    lines += ["", *([REPLAY.rstrip(), ""] if script == "play" else []), "groups (one file of dexsim/configs/<group>/ each):"]
     lines += [f"  {name + '=':<14}{' | '.join(options)}" for name, options in groups(config_dir).items()]
     return program.words("\n".join(lines) + "\n" + END.format(script=script))
 

@@ -127,9 +127,7 @@ def session(data: bytes, policy: Path) -> Any:
         import onnx
         import onnxruntime
     except ImportError:
-        raise UserError(
-            "onnxruntime is not installed: pip install 'dexsim[deploy]' (or pip install onnxruntime)"
-        ) from None
+        raise UserError("onnxruntime is not installed: pip install onnxruntime") from None
     try:
         model = onnx.ModelProto.FromString(data)
         outside = next(

@@ -420,7 +420,7 @@ def _viser() -> Any:
     try:
         import viser
     except ImportError:
-        raise UserError('view=true needs viser, which is not installed: pip install -e ".[view]"') from None
+        raise UserError("view=true needs viser, which is not installed: pip install viser") from None
     return viser
 
 

@@ -31,7 +31,7 @@ def decompose(vertices: np.ndarray, faces: np.ndarray, most: int, source: object
     if not available():
         raise UserError(
             f"mesh {source}: is hollow, and CoACD, which splits it into convex parts, is not installed: pip install"
-            " 'dexsim[objects]', or take its convex hull with object_hulls=1"
+            " coacd, or take its convex hull with object_hulls=1"
         )
     import coacd
 
