@@ -292,6 +292,7 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
         ("hold_rate", r, ~pushed & firm),
         ("hold_rate_pushed", r, pushed & able),
         ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k),
+        ("hold_rate_kept_out_shapes_unpushed", k, ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
     ):
         out[f"{name}_interval"] = _rate_interval(part["held"], among)
     return out
