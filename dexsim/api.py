@@ -203,7 +203,7 @@ def make_env(
     """Many simulated hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it gymnasium's).
 
     Args:
-        task: "grasp" or "rotate".
+        task: "grasp", "rotate" or "rotate_fingertips".
         worlds: hands simulated at once; None: what fits the machine.
         device: "cpu", "cuda", "cuda:1"; None: cuda where there is one.
         seed: of everything random.

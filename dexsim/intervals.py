@@ -1,5 +1,8 @@
-"""Intervals of what was counted or averaged: Wilson's of a share, the bootstrap's percentiles of anything else. Both
-are SciPy's, but for stretches of neighbouring units, which SciPy does not draw."""
+"""Intervals of what was counted or averaged: Wilson's of a share, the bootstrap's percentiles of anything else.
+
+SciPy's are `share`, `draws`, and what is made of them: `bootstrap` and `weights`. Drawn here, by NumPy's generator, are
+index arrays: `stretches`, since SciPy draws no blocks of neighbours; `singles`, which are stretches of one, since
+several samples are looked up by the same index; and `nested_means`, since SciPy knows no bootstrap in two stages."""
 
 from __future__ import annotations
 

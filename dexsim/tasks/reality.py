@@ -6,8 +6,8 @@ cone, solver and contact softness; one hand whose drives have effects that no ra
 currents in whole counts, touch in counts and late; control periods that vary and targets that are late or lost. It
 stands in for hardware: it is not hardware, and what it leaves out (soft pads, bending, cables) stays unjudged.
 
-The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121
-out=dexsim/configs/reality/bench.yaml`. The ranges below are ours.
+The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=N out=FILE.yaml`; the file says its seed.
+The ranges below are ours.
 """
 
 from __future__ import annotations
