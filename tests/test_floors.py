@@ -244,7 +244,7 @@ def test_no_private_module_of_another_decoder_is_imported():
     private = re.compile(r"\b(from|import)\s+mcap_ros2\._")
     files = [p for f in ("dexsim", "benchmarks", "tests", "tools", "docs", "notebooks") for p in (ROOT / f).rglob("*.*")]
     files = [p for p in (*files, *ROOT.glob("*.py")) if p.suffix in (".py", ".ipynb", ".md")]
-    assert private.search("from mcap_ros2._dynamic import x") and len(files) > 300
+    assert private.search("from mcap_ros2" + "._dynamic import x") and len(files) > 300
     assert [str(p.relative_to(ROOT)) for p in files if private.search(p.read_text(encoding="utf-8"))] == []
 
 
