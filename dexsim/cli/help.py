@@ -37,13 +37,12 @@ examples:
 REPLAY = """with replay=FILE.mcap, beside out= and video=:
   model=                      the recorded machine, MJCF or URDF; hand=, hand_mirror=true: one that training knows
   servo=                      its drives: servo.yaml of a diagnosis (servo_file= is the same), or one of servo= below
-  object=                     what was held, where its pose was recorded: box, sphere, capsule, ... (a wrong one lists all)
+  object=                     what was held, where its pose was recorded: box, sphere, ... (a wrong one lists them)
   object_size=                its extents, m: three of a box, diameter and length of a capsule, the longest of others
   object_mass=                kg
   object_friction=            sliding, of hand and object
   timestep=                   a physics step, s
   remap.OURS=THEIRS           a topic or a joint of the file; meta.KEY=VALUE what the file does not say
-
 """
 END = """
   dexsim {script} --cfg      every setting, those in groups too (task.rewards.force, ...), with its value, then stop
@@ -56,7 +55,7 @@ def text(script: str, config_dir: Path) -> str:
     lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
     for file in files:
         lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in settings(config_dir / file)]
-    lines += ["", *([REPLAY.rstrip(), ""] if script == "play" else []), "groups (one file of dexsim/configs/<group>/ each):"]
+    lines += ["", *([REPLAY] if script == "play" else []), "groups (one file of dexsim/configs/<group>/ each):"]
     lines += [f"  {name + '=':<14}{' | '.join(options)}" for name, options in groups(config_dir).items()]
     return program.words("\n".join(lines) + "\n" + END.format(script=script))
 
