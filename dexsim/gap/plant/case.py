@@ -93,6 +93,17 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
     return max(rms, quantum / np.sqrt(12), 1e-9), quantum
 
 
+def noise_of(run: Run, j: int) -> tuple[float, float]:
+    """`noise` of joint j's position in a run. Every joint's case asks for that of all others, each time anew that cases
+    are built: it is kept with the run, for as long as the run has these positions."""
+    if run.noises is None or run.noises[0] is not run.q:
+        run.noises = run.q, {}
+    kept = run.noises[1]
+    if j not in kept:
+        kept[j] = noise(run.t, run.q[:, j])
+    return kept[j]
+
+
 def _misfit(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """[S - 2 BESIDE] by what each sample x [S] at t [S] s misses a local cubic through its neighbours without it, of
     the noise's own size."""
@@ -151,7 +162,7 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     others = [k for k, way in enumerate(ways) if k != j and way > 0.5 * ways[j]]
     if len(others) < BELIEF.others:
         return None
-    usual = float(np.median([_of_recordings(runs, [noise(r.t, r.q[:, k])[0] for r in runs]) for k in others]))
+    usual = float(np.median([_of_recordings(runs, [noise_of(r, k)[0] for r in runs]) for k in others]))
     if own <= BELIEF.noisier * usual:
         return None
     apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
@@ -375,7 +386,7 @@ def _case(
         )
     )
     limit = rows[0][j][SERVO_INDEX["torque_limit"]]
-    estimates = [noise(run.t, run.q[:, j]) for run in runs]
+    estimates = [noise_of(run, j) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
     quiet = quiet_noise([(runs[i].t, runs[i].q[:, j]) for i in told], quantum)

@@ -51,6 +51,8 @@ class Run:
     as_: np.ndarray = None  # type: ignore[assignment]
     # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
+    # filled by `gap.plant.case.noise_of`: the positions that it is of, and by joint's number
+    noises: tuple[np.ndarray, dict[int, tuple[float, float]]] | None = None
 
     @property
     def duration(self) -> float:
