@@ -166,7 +166,7 @@ def test_a_push_is_a_hint_where_the_rest_does_not_fit():
 def test_a_loop_tells_of_the_joint_where_its_law_is_right_in_the_main():
     given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
     for fit, tells in ((0.75, True), (0.65, False)):
-        unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
+        unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit, slope_high=1.1)], [])
         assert (unknown == set()) is tells, fit
 
 

@@ -11,6 +11,7 @@ from test_gap import model, plant_run
 from test_gap_torque_route import arm, run
 
 from dexsim.gap.judge import conclude, confidence
+from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
 from dexsim.gap.search import logged_torque, shaking
@@ -74,6 +75,26 @@ def test_a_name_that_makes_a_joint_ring_as_it_does_is_as_sure_as_that():
         conclude._judged_by_ringing(SimpleNamespace(evidence=[e, other]), {"elbow": rings})
         assert e.confidence == pytest.approx(sure, abs=0.01) and len(e.reasons) == 1, (rings, share)
         assert other.confidence == 0.0 and other.reasons == ["not borne out"]
+
+
+def answer_of(soft: JointSearch, found) -> JointAnswer:
+    return JointAnswer(soft.case, soft, found, Kept([None] * 3, [0, 1], [2], None, None))
+
+
+def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft):
+    """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
+    does is a hint, and is not handed on."""
+    answer = answer_of(soft, shaking.answered(soft, soft.without_search()))
+    assert rms(answer.after) > rms(answer.before)
+    assert conclude._loses([answer], {"joint"}) == {}
+    answer.after = 3.6 * answer.before
+    worse = conclude._loses([answer], {"joint"})
+    assert "by more with it" in worse["joint"] and conclude._loses([answer], set()) == {}
+    e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, 0, [], 0.0)
+    d = SimpleNamespace(evidence=[e], notes=[])
+    conclude._judged_by_ringing(d, {"joint": 0.95})
+    conclude._not_better(d, worse)
+    assert e.confidence < 0.5 and "is not handed on" in d.notes[0]
 
 
 def test_a_joint_that_does_not_ring_is_left_as_it_was_found():

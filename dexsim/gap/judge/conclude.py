@@ -106,9 +106,9 @@ def into_diagnosis(
         )
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
     worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
-    worse = {joint: reason for joint, reason in worse.items() if joint not in rings}
-    _not_better(d, worse)
+    worse = {joint: reason for joint, reason in worse.items() if joint not in rings} | _loses(answers, rings)
     _judged_by_ringing(d, rings)
+    _not_better(d, worse)
     findings.sort(key=lambda f: -_weight(f, rings))
     _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
     _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
@@ -153,6 +153,22 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
             if e.joint == joint and not EFFECTS[e.effect].effort_only:
                 e.reasons.append(reason)
                 e.confidence = min(e.confidence, JUDGE.hinted)
+
+
+def _loses(answers: Sequence[JointAnswer], rings: Collection[str]) -> dict[str, str]:
+    """Of the joints that ring by themselves (`rings`) those on which the error of what was held out surely rises by
+    what was found, with the reason: that no free run keeps step explains an error that does not fall, and this one is
+    no lack of step alone."""
+    out = {}
+    for a in answers:
+        if a.case.joint in rings and a.best.members and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
+            k, unit = 1e3, "mm" if a.case.scales.slide else "mrad"
+            out[a.case.joint] = (
+                f"what was held out is missed by {k * rms(a.before):.3g} {unit} without what was found and, whichever "
+                f"stretches had been recorded, by more with it ({k * rms(a.after):.3g} {unit}), though it rings as the "
+                "joint does"
+            )
+    return out
 
 
 def _rings(a: JointAnswer) -> float:

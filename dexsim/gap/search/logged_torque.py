@@ -216,17 +216,23 @@ def hand_on(
 
 def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
     """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly
-    in part: their closed loop speaks of an unknown controller, and no effect of the joint is looked for in it. Said in
-    `notes`."""
+    in part, or surely pushes the other way: their closed loop speaks of an unknown controller, and no effect of the
+    joint is looked for in it. Said in `notes`.
+
+    A line through the law and the torque fits well where one is the other's mirror image, too; but no gain of the
+    believed law is negative, and the torque's own sign is borne out by its friction, which resists."""
     told = {case.joint for case, _, _ in given if case.told}
-    out = {x.joint for x in stages if x.joint in told and x.fit < 1 - TORQUE.much}
+    out = set()
     for x in stages:
-        if x.joint in out:
-            notes.append(
-                f"{x.joint}: the believed law of its drive gives {100 * max(x.fit, 0.0):.0f} % of the torque that was "
-                "logged: its controller is another, "
-                "and only the torque is judged"
-            )
+        against = x.slope_high < 0
+        if x.joint not in told or not (against or x.fit < 1 - TORQUE.much):
+            continue
+        out.add(x.joint)
+        gives = "the opposite" if against else f"{100 * max(x.fit, 0.0):.0f} %"
+        notes.append(
+            f"{x.joint}: the believed law of its drive gives {gives} of the torque that was logged: its controller is "
+            "another, and only the torque is judged"
+        )
     return out
 
 
