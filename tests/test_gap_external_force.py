@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_gap_torque_route import ARM, arm, run
 
+from dexsim.gap.inquiry import Judged
 from dexsim.gap.judge import conclude
 from dexsim.gap.search import logged_torque
 
@@ -76,17 +77,24 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     }
     data = {
         "findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")],
-        "verdict": "explained",
         "noise_floor": {"position_rad": 0.01},
-        "held_out": held | {"error": "position_rmse_rad"},
+        "held_out": {},
+        "baseline": {},
         "unexplained": {"depends_on": []},
     }
-    d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[])
-    d.ringing = frozenset()
+    d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[], touch=None)
+    d.ringing, d.judged = frozenset(), Judged(held | {"before_low": 0.02, "error": "position_rmse_rad"})
     conclude.claim_push(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
-    assert d.sentence.startswith("Joint elbow is pushed by something outside")
-    assert d.data["verdict"] == "explained" and len(d.notes) == 1
+    assert len(d.notes) == 1
+    conclude.decide(d)
+    assert d.data["verdict"] == "partly_explained"  # the friction is not sure
+    assert d.sentence.startswith("Joint shoulder") and "elbow" not in d.sentence  # what is known of that is a hint
+    assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
+    push.clear = True
+    data["findings"] = [push.finding()]
+    conclude.decide(d)
+    assert d.sentence.startswith("Joint elbow is pushed by something outside") and d.data["verdict"] == "unknown"
 
 
 @pytest.mark.slow

@@ -369,13 +369,14 @@ def test_what_counts_as_a_part_of_the_answer():
 
 def test_names_below_firm_are_hints():
     found = [named(confidence=0.51), named(confidence=0.49)]
-    held_out.settle(found, set())
+    held_out.settle(found)
     assert [f.get("hint", False) for f in found] == [False, True]
 
 
 def test_what_is_not_borne_out_keeps_little():
     found = [named()]
-    held_out.settle(found, {"j"})
+    held_out.unneeded(found, {"j"})
+    held_out.settle(found)
     assert 0.4 < found[0]["confidence"] < 0.5 and found[0]["hint"]
 
 

@@ -280,6 +280,12 @@ def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str])
     return done
 
 
+def left_by_what_is_handed_on(data: dict[str, Any]) -> float | None:
+    """Error [rad or m] that is left where it is the plain model of every judged joint that is handed on; None where it
+    is not. data: of `overall`."""
+    return data["error"] if data and set(data["handed_on"]) == set(data["joints"]) else None
+
+
 def text(data: dict[str, Any], unit: str) -> str:
     """One line for a person."""
     if not data:

@@ -288,6 +288,8 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
                     "held_out": {
                         "before": n.before,
                         "after": n.after,
+                        "removed_low": round(n.removed[0], 4),
+                        "removed_high": round(n.removed[1], 4),
                         "error": f"effort_rmse_{'N' if case.scales.slide else 'Nm'}",
                     },
                 }
