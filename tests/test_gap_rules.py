@@ -895,7 +895,7 @@ def test_the_short_list_asks_a_promise():
 
 def test_a_small_change_of_temperature_tells_nothing():
     for warm, tells in ((2.2, True), (1.8, False)):
-        s = SimpleNamespace(warm=warm, voltage=False, nominal={"coulomb_friction": 0.1, "viscous_friction": 0.0})
+        s = SimpleNamespace(warm=warm, voltage=False, nominal={"coulomb_friction": 0.1}, unknown=())
         assert (EFFECTS["thermal"].variants(s) != []) is tells, warm
 
 

@@ -313,11 +313,14 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
 
 
 def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
-    """Whether a signal is wrong only where its joint is not judged: that casts no doubt on what the other recordings
-    tell of it."""
+    """Whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or with all
+    of it: that casts no doubt on what the other recordings tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
+    judged = {run.name for run in kept.runs}
     return bool(channel["when"]) and all(
-        (w["recording"], j) in left_out for w in channel["when"] for j in channel["where"]["joints"]
+        w["recording"] not in judged or (w["recording"], j) in left_out
+        for w in channel["when"]
+        for j in channel["where"]["joints"]
     )
 
 
@@ -540,7 +543,8 @@ def _left_of_gap(d: Diagnosis, error: dict[str, Any]) -> float | None:
 
 
 def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:
-    """Effect id -> why it was not considered on any joint or pad (or on which), in the catalogue's order.
+    """Effect id (and kind of it, where others of it are considered) -> why it was not considered on any joint or pad
+    (or on which), in the catalogue's order.
 
     cases: `plant.case.Case`."""
     out: dict[str, str] = {}
@@ -552,16 +556,11 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
         if not moved:
             out[e] = "no joint is judged" if not cases else "no joint moves"
             continue
-        given = {c.joint: x.unseen(c.scales) for c in moved}
-        lacking = {j: r for j, r in given.items() if r}
-        if not lacking:
-            continue
-        first = next(iter(lacking.values()))
-        if len(lacking) == len(given):
-            same = all(r == first for r in lacking.values())
-            out[e] = first if same else "; ".join(f"{j}: {r}" for j, r in lacking.items())
-        else:
-            out[e] = "; ".join(f"on {j}: {r}" for j, r in lacking.items())
+        if said := _by_joint({c.joint: x.unseen(c.scales) for c in moved}):
+            out[e] = said
+        kinds = {c.joint: x.without(c.scales) for c in moved}
+        for kind in dict.fromkeys(k for given in kinds.values() for k in given):
+            out[f"{e} {kind}"] = _by_joint({j: given.get(kind, "") for j, given in kinds.items()})
     touch = (
         "no /tactile is recorded"
         if not felt.tactile
@@ -579,6 +578,15 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
         elif touch and not any(f["effect"] == e for f in felt.findings):
             out[e] = touch
     return out
+
+
+def _by_joint(given: dict[str, str]) -> str:
+    """Reasons by joint, said once where they are one; joints without one are left out."""
+    lacking = {j: r for j, r in given.items() if r}
+    if len(lacking) == len(given) and len(set(lacking.values())) == 1:
+        return next(iter(lacking.values()))
+    on = "" if len(lacking) == len(given) else "on "
+    return "; ".join(f"{on}{j}: {r}" for j, r in lacking.items())
 
 
 def not_fitted(cases: Sequence) -> list[str]:
