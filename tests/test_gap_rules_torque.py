@@ -235,9 +235,9 @@ def test_a_weight_is_believed_where_the_torque_cannot_tell():
 
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
     """Whether friction that differs by direction is named, of this column, beside a constant torque."""
-    own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {})
+    own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {"viscous_friction": 10.0})
     name = inverse_dynamics.BY_DIRECTION
-    found, _ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
+    found, *_ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
     return [n.text for n in found] == [name]
 
 
