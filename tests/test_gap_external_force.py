@@ -39,6 +39,25 @@ def test_pushes_are_told_with_when_and_how_hard():
     assert "in 3 stretches of time, forwards" in finding["regime"]
 
 
+@pytest.mark.parametrize("size", [3.0, 6.0])
+@pytest.mark.parametrize("cogging", [0.0, 0.08])
+def test_the_size_of_a_push_lies_inside_its_interval(size, cogging):
+    """Of a steady push: the largest sample is not its size. At its edges the torque's filter swings over by an eighth,
+    and the body is not exactly what the fit can say."""
+    model, true = arm(), []
+    steady = lambda t: size * np.any([(t > a) & (t < b) for a, b in SPANS], 0)  # noqa: E731
+    for k in (0, 1):
+        r = run(model, 2 * k, pushed=steady if k == 0 else None, friction=(0.1, 0.05))
+        r.torque[:, 1] += cogging * size * np.sin(25.0 * r.q[:, 1])  # cogging
+        true.append(r)
+    (push,) = (p for p in logged_torque.find_pushes(model, true, [0, 1]) if p.joint == "elbow")
+    told = push.finding()["parameters"]["torque"]
+    assert told["low"] < size < told["high"] and told["value"] == pytest.approx(size, rel=0.06)
+    assert told["high"] - told["low"] < 0.5 * size
+    sample = logged_torque.Push("elbow", 0.906, (0.7, 1.0), 0.5, True, False).finding()["parameters"]["torque"]
+    assert (sample["value"], sample["low"], sample["high"]) == (0.906, 0.7, 1.0)
+
+
 def test_nothing_is_told_where_nothing_pushes():
     model = arm()
     assert logged_torque.find_pushes(model, [run(model, 0), run(model, 1, friction=(1.5, 0.6))], [0, 1]) == []

@@ -130,7 +130,7 @@ def test_what_pushes_most_of_the_time_is_no_stretch():
 
 def test_a_joint_is_judged_without_pushes_where_enough_is_left():
     run = SimpleNamespace(name="a", duration=10.0)
-    push = logged_torque.Push("j", 1.0, 0.1, 0.5, True, False, {"a": [(0.0, 1.0)]})
+    push = logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, True, False, {"a": [(0.0, 1.0)]})
     for seconds, cut in ((5.0, True), (3.0, False)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(inputs, "merged_spans", lambda *_: {})
@@ -153,7 +153,7 @@ def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
 
 
 def push(clear: bool) -> float:
-    return logged_torque.Push("j", 1.0, 0.1, 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
+    return logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
 
 
 def test_a_push_is_named_surely_where_the_rest_fits():

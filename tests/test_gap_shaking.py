@@ -133,7 +133,7 @@ def test_nobody_pushes_a_joint_that_rings():
 
 
 def test_what_is_followed_to_the_noise_is_not_pushed():
-    push = logged_torque.Push("elbow", 1.0, 0.1, 0.5, False, False)
+    push = logged_torque.Push("elbow", 1.0, (0.9, 1.1), 0.5, False, False)
     finding = {
         "effect": "torque_ripple",
         "where": {"joints": ["elbow"]},
