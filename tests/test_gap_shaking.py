@@ -86,10 +86,12 @@ def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(
     does is a hint, and is not handed on."""
     answer = answer_of(soft, shaking.answered(soft, soft.without_search()))
     assert rms(answer.after) > rms(answer.before)
-    assert conclude._loses([answer], {"joint"}) == {}
+    plainly = {"joint": "a plain model follows better"}  # it does not ring, and keeps step with nothing either
+    assert conclude._withheld(plainly, [answer], {"joint"}) == {}
+    assert conclude._withheld(plainly, [answer], set()) == plainly
     answer.after = 3.6 * answer.before
-    worse = conclude._loses([answer], {"joint"})
-    assert "by more with it" in worse["joint"] and conclude._loses([answer], set()) == {}
+    worse = conclude._withheld(plainly, [answer], {"joint"})
+    assert "by more with it" in worse["joint"] and conclude._withheld({}, [answer], set()) == {}
     e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, 0, [], 0.0)
     d = SimpleNamespace(evidence=[e], notes=[])
     conclude._judged_by_ringing(d, {"joint": 0.95})

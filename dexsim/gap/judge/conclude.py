@@ -105,7 +105,7 @@ def into_diagnosis(
         )
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
     worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
-    worse = {joint: reason for joint, reason in worse.items() if joint not in rings} | _loses(answers, rings)
+    worse = _withheld(worse, answers, rings)
     _judged_by_ringing(d, rings)
     _not_better(d, worse)
     findings.sort(key=lambda f: -_weight(f, rings))
@@ -145,11 +145,11 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
                 e.confidence = min(e.confidence, JUDGE.hinted)
 
 
-def _loses(answers: Sequence[JointAnswer], rings: Collection[str]) -> dict[str, str]:
-    """Of the joints that ring by themselves (`rings`) those on which the error of what was held out surely rises by
-    what was found, with the reason: that no free run keeps step explains an error that does not fall, and this one is
-    no lack of step alone."""
-    out = {}
+def _withheld(worse: dict[str, str], answers: Sequence[JointAnswer], rings: Collection[str]) -> dict[str, str]:
+    """Joints of which what was found is not handed on, with the reason: those of `worse` (`baseline.refused`), but of
+    the joints that ring by themselves (`rings`) only those on which the error of what was held out surely rises by it.
+    That no free run keeps step explains an error that does not fall, not one that does nothing but rise."""
+    out = {joint: reason for joint, reason in worse.items() if joint not in rings}
     for a in answers:
         if a.case.joint in rings and a.best.members and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
             k, unit = 1e3, "mm" if a.case.scales.slide else "mrad"

@@ -499,12 +499,13 @@ def _size(
     tenths of those medians and what their mean moves by with the fit's own figures. off [draws, K]: by which the
     figures of the fit differ when its blocks are drawn anew; noise: of one sample."""
     best: tuple[float, int, np.ndarray, np.ndarray] | None = None
+    anywhere = any(on.any() for on in pushed)
     for k, (t, r, on) in enumerate(zip(times, residual, pushed, strict=True)):
         if not len(r):
             continue
         count = max(int(AROUND / max(float(np.median(np.diff(t))), 1e-6)), 1) if len(t) > 1 else 1
         smooth = median_filter(r, count, mode="nearest")
-        edge = np.flatnonzero(np.diff(np.r_[0, (on if on.any() else np.ones(len(r), bool)).astype(int), 0]))
+        edge = np.flatnonzero(np.diff(np.r_[0, (on if anywhere else np.ones(len(r), bool)).astype(int), 0]))
         for a, b in zip(edge[::2], edge[1::2], strict=True):
             peak = float(smooth[a:b][np.argmax(np.abs(smooth[a:b]))])
             if best is None or abs(peak) > abs(best[0]):
