@@ -170,3 +170,24 @@ def test_convert_writes_what_is_read(tmp_path):
     )
     with pytest.raises(UserError, match="exists"):
         convert(path, tmp_path / "a.mcap", {}, {})
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_columns_without_a_name_are_the_model_s_one_joint(tmp_path, suffix):
+    t, path = np.arange(0.0, 2.0, 0.01), tmp_path / f"log{suffix}"
+    if suffix == ".npz":
+        np.savez(path, time=t, command=np.sin(t), position=np.sin(t - 0.1))
+    else:
+        rows = [f"{a:.3f},{np.sin(a):.6f},{np.sin(a - 0.1):.6f}" for a in t]
+        path.write_text("\n".join(["time,command,position", *rows]))
+    r = read(path, joints=["elbow"])
+    assert r.joints == ("elbow",) and np.allclose(r.states.position.value[:, 0], np.sin(t - 0.1), atol=1e-5)
+    assert any("they are taken for the model's one, elbow" in f.text for f in r.findings)
+    assert read(path, {"elbow": "joint"}, joints=["elbow"]).joints == ("elbow",)
+    assert read(path, joints=["elbow", "joint"]).joints == ("joint",)
+    with pytest.raises(UserError, match="none of its joints"):  # which of two?
+        read(path, joints=["elbow", "wrist"])
+    named = tmp_path / "named.csv"
+    named.write_text("time,command.knee,position.knee\n" + "".join(f"{a:.3f},0,{a:.3f}\n" for a in t))
+    with pytest.raises(UserError, match="none of its joints"):  # a name that is another's
+        read(named, joints=["elbow"])

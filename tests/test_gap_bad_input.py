@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from dexsim.errors import UserError
 from dexsim.gap import command, demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.judge import conclude
+from dexsim.gap.judge.joint_answer import Kept
 from dexsim.gap.read import channels
 from dexsim.recording import read, write
 
@@ -300,3 +303,15 @@ def test_links_that_touch_each_other_are_cut_out():
     assert inputs.merged_spans({"a": [(1.0, 2.0)]}, {"a": [(1.5, 3.0), (4.0, 5.0)]}) == {"a": [(1.0, 3.0), (4.0, 5.0)]}
     open_hand = Run("b", xhand.JOINTS, t, 0 * q, t, 0 * q, None, np.zeros(3))
     assert not inputs.self_touch([open_hand], model)
+
+
+def test_what_is_wrong_in_a_recording_that_is_left_out_doubts_nothing_elsewhere():
+    """A joint that is stuck in one of several recordings, which is left out: whole where it has no other joint."""
+    stuck = lambda *names: {"when": [{"recording": n} for n in names], "where": {"joints": ["joint"]}}  # noqa: E731
+    kept = lambda **runs: Kept(  # noqa: E731
+        [SimpleNamespace(name=n, left_out=frozenset(x)) for n, x in runs.items()], [0], [1], None, None
+    )
+    assert conclude._elsewhere(stuck("b"), kept(a=(), c=()))
+    assert conclude._elsewhere(stuck("b", "c"), kept(a=(), c=("joint",)))
+    assert not conclude._elsewhere(stuck("b", "c"), kept(a=(), c=()))
+    assert not conclude._elsewhere(stuck("a"), kept(a=(), c=()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -10,7 +11,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import build
-from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.read import Run
 from dexsim.gap.search import baseline
 from dexsim.gap.search.baseline import forbids, room_for_friction
@@ -120,6 +121,43 @@ def test_what_follows_worse_than_the_plain_model_is_not_handed_on(fitted):
     assert baseline.hand_on([plain], servo, ["joint"]) == ["joint"]
     assert servo.value("joint", "delay").value == pytest.approx(plain.value["delay"], abs=1e-8)
     assert servo.value("joint", "kp").value == pytest.approx(plain.value["kp"], abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("columns", "held"),
+    [
+        ({"stribeck_peak": 1.4 * HANGS}, True),
+        ({"stribeck_peak": 0.1}, False),
+        ({"gear_load_friction_backdriven": 1.3}, True),  # holds whatever its load
+        ({"gear_load_friction_backdriven": 0.8}, False),
+        ({"gear_load_friction_backdriven": 0.8, "coulomb_friction": 0.4 * HANGS}, True),
+        ({"coulomb_friction": 0.4 * HANGS}, False),
+        ({"gear_load_friction": 1.3}, False),  # of a load that the gear drives, and here it is driven
+        ({"load_friction_external": 1.3}, True),
+        ({"load_friction_backdriven": 1.3}, False),  # per torque of the motor, which is off
+    ],
+)
+def test_breakaway_and_friction_by_load_may_forbid_a_fall_too(columns, held):
+    """Of an arm that falls without power; a share of the load of more than one holds it by itself."""
+    t, q = (x[:180] for x in falls(0.01))  # the first fall
+    case = case_of(run("fall.mcap", t, q, np.full(180, 1.2), enabled=np.zeros(180)))
+    fixed = {"gear_load_unit": HANGS} if any(n.startswith("gear") for n in columns) else {}
+    params = [Param(n, (n,), "set", 0.0, 9.0, 0.0) for n in {**columns, **fixed}]
+    x = np.array([*columns.values(), *fixed.values()])
+    trial = SimpleNamespace(fit=SimpleNamespace(params=params, x=x))
+    refused = baseline.refused([], {"joint": {"after": 1.0, "sigma": 1e-3}}, [(case, trial, np.ones(3))], [0], 1e-3)
+    assert ("would hold the joint" in refused.get("joint", "")) is held
+
+
+def test_the_plain_model_is_handed_on_with_the_braking_that_it_was_judged_with(fitted):
+    """Of which the servo's file says nothing: its default is another."""
+    case, _, plain = fitted
+    servo = ServoTable.from_dict(BELIEVED)
+    assert servo.value("joint", "braking_slope").value == 1.0 != case.scales.nominal["braking_slope"]
+    baseline.hand_on([plain], servo, ["joint"])
+    assert servo.value("joint", "braking_slope").value == case.scales.nominal["braking_slope"] == 0.0
+    stated = replace(case, stated=frozenset({"braking_slope"}))
+    assert baseline.judged(stated, ([], np.zeros(0)), [1]).beside == {}
 
 
 def test_the_plain_model_fits_no_friction_that_a_fall_forbids():

@@ -17,8 +17,10 @@ from test_gap import SERVO, model, plant_run
 
 import dexsim.gap
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.effects import FittedEffect, Variant
+from dexsim.gap.effects import FittedEffect, Variant, drive
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TOUCH_EFFECTS
+from dexsim.gap.inquiry import TouchResult
+from dexsim.gap.judge import conclude
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import NAMES, SERIES
 from dexsim.gap.plant.free_run import free_run
@@ -246,3 +248,24 @@ def test_a_ripple_is_looked_for_up_to_what_the_drive_can_work_against():
         amplitude = next(p for p in variant.params if p.key == "amplitude")
         assert 0.4 < amplitude.high < 0.6
         assert all(0 < start[0] < 0.013 for start in variant.starts)
+
+
+@pytest.mark.parametrize("believed", [*({n: 0.1} for n in drive.WARMED), {"unknown": ("coulomb_friction",)}])
+def test_friction_that_drifts_with_heat_is_looked_for_where_there_may_be_friction(believed):
+    """Any column of friction that is there, or of which nothing is believed."""
+    thermal, unknown = EFFECTS["thermal"], believed.get("unknown", ())
+    s = SimpleNamespace(warm=20.0, voltage=False, nominal=believed, unknown=unknown, base_friction=0.0)
+    assert "friction" in [v.label for v in thermal.variants(s)] and thermal.without(s) == {}
+
+
+def test_friction_that_cannot_drift_with_heat_is_said_not_to_be_looked_for():
+    runs = [plant_run(f"r{k}", k, 3.0, {}, temperature=1.0 + 40.0 * k) for k in (0, 1)]
+    for r in runs:
+        r.smooth()
+    case = build(model(), runs)[0]
+    nominal = case.scales.nominal | dict.fromkeys(drive.WARMED, 0.0)
+    for model_has, said in ((0.0, "no friction is believed of the drive"), (0.2, "frictionloss has no temperature")):
+        case.scales = replace(case.scales, nominal=nominal, base_friction=model_has)
+        absent = conclude.not_considered([case], TouchResult(), None)
+        assert said in absent["thermal of friction"] and "thermal" not in absent
+        assert [v.label for v in EFFECTS["thermal"].variants(case.scales)] == ["torque_constant"]

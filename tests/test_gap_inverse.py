@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
+from dexsim.gap.effects import ByTorque
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import identify
 from dexsim.gap.search.logged_torque import believe
 
@@ -53,6 +56,22 @@ def test_further_effects_are_named_one_after_another():
     assert by["lag"].value / found.full["inertia"] == pytest.approx(3e-3, rel=0.15)
     assert by["lag"].low < by["lag"].value < by["lag"].high
     assert found.named[-1].after < 0.5 * found.named[0].before
+
+
+def test_no_direction_has_a_negative_friction():
+    """200 N.s/m forwards and 200 + backward backwards, of which there is none below 0: the mean is 200 + backward / 2,
+    and what differs by direction no larger than that."""
+    wide = identify(*carriage(180.0), test=carriage(180.0, 1))
+    (named,) = wide.named
+    assert abs(named.value) <= wide.full["viscous_friction"] and not wide.refused
+    beyond = identify(*carriage(-280.0), test=carriage(-280.0, 1))  # pushes along backwards: no friction does
+    assert "viscous_friction" not in {n.effect for n in beyond.named}
+    assert "neither direction's can be negative" in beyond.refused[inverse_dynamics.BY_DIRECTION]
+    effect, joint = EFFECTS["viscous_friction"], {"viscous_friction": 60.0}
+    assert effect.possible_by_torque(-59.0, joint, 5.0) and not effect.possible_by_torque(61.0, joint, 5.0)
+    assert not effect.possible_by_torque(1.0, {}, 5.0)  # beside none on the whole
+    told = effect.parameters_by_torque(ByTorque(-58.0, -66.0, -50.0, 0.0, joint, "N", "m"))["asymmetry"]
+    assert told["low"] == -2.0 <= told["value"] < told["high"]
 
 
 def test_nothing_further_is_named_where_nothing_is_missing():

@@ -369,13 +369,14 @@ def test_what_counts_as_a_part_of_the_answer():
 
 def test_names_below_firm_are_hints():
     found = [named(confidence=0.51), named(confidence=0.49)]
-    held_out.settle(found, set())
+    held_out.settle(found)
     assert [f.get("hint", False) for f in found] == [False, True]
 
 
 def test_what_is_not_borne_out_keeps_little():
     found = [named()]
-    held_out.settle(found, {"j"})
+    held_out.unneeded(found, {"j"})
+    held_out.settle(found)
     assert 0.4 < found[0]["confidence"] < 0.5 and found[0]["hint"]
 
 
@@ -894,7 +895,7 @@ def test_the_short_list_asks_a_promise():
 
 def test_a_small_change_of_temperature_tells_nothing():
     for warm, tells in ((2.2, True), (1.8, False)):
-        s = SimpleNamespace(warm=warm, voltage=False, nominal={"coulomb_friction": 0.1, "viscous_friction": 0.0})
+        s = SimpleNamespace(warm=warm, voltage=False, nominal={"coulomb_friction": 0.1}, unknown=())
         assert (EFFECTS["thermal"].variants(s) != []) is tells, warm
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
+from dexsim.gap.inquiry import Judged, empty
 from dexsim.gap.judge import conclude
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.stage_tests import Stage
@@ -129,7 +130,7 @@ def test_what_pushes_most_of_the_time_is_no_stretch():
 
 def test_a_joint_is_judged_without_pushes_where_enough_is_left():
     run = SimpleNamespace(name="a", duration=10.0)
-    push = logged_torque.Push("j", 1.0, 0.1, 0.5, True, False, {"a": [(0.0, 1.0)]})
+    push = logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, True, False, {"a": [(0.0, 1.0)]})
     for seconds, cut in ((5.0, True), (3.0, False)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(inputs, "merged_spans", lambda *_: {})
@@ -152,7 +153,7 @@ def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
 
 
 def push(clear: bool) -> float:
-    return logged_torque.Push("j", 1.0, 0.1, 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
+    return logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
 
 
 def test_a_push_is_named_surely_where_the_rest_fits():
@@ -166,7 +167,7 @@ def test_a_push_is_a_hint_where_the_rest_does_not_fit():
 def test_a_loop_tells_of_the_joint_where_its_law_is_right_in_the_main():
     given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
     for fit, tells in ((0.75, True), (0.65, False)):
-        unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
+        unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit, slope_high=1.1)], [])
         assert (unknown == set()) is tells, fit
 
 
@@ -234,9 +235,9 @@ def test_a_weight_is_believed_where_the_torque_cannot_tell():
 
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
     """Whether friction that differs by direction is named, of this column, beside a constant torque."""
-    own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {})
+    own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {"viscous_friction": 10.0})
     name = inverse_dynamics.BY_DIRECTION
-    found, _ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
+    found, *_ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
     return [n.text for n in found] == [name]
 
 
@@ -293,7 +294,7 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
 def told(after: float) -> float:
     """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held out."""
     n = SimpleNamespace(effect=inverse_dynamics.LOAD, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
-                        after=after, rival=None, text="friction that grows with the load")  # fmt: skip
+                        after=after, rival=None, text="grows with the load", removed=(0.1, 0.2))  # fmt: skip
     case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
@@ -312,14 +313,15 @@ def test_what_the_torque_names_must_help_in_what_was_held_out():
 
 def test_what_the_torque_names_is_a_part_of_the_answer():
     for left, word in ((0.65, "partly_explained"), (0.75, "unknown")):
-        data = {"findings": [], "noise_floor": {"position_rad": 0.0}, "unexplained": {}}
         named_ = [SimpleNamespace(effect="load_friction", before=1.0, after=left)]
-        finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": {"error": "effort_rmse_Nm"}}
+        held = {"before": 1.0, "after": left, "removed_low": 0.1, "error": "effort_rmse_Nm"}
+        finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": held, "confidence": 0.9}
+        d = SimpleNamespace(data=empty(), touch=None, judged=Judged({}))
+        conclude.add_behind(d, [finding], [(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(conclude, "sentence", lambda *_: "")
-            by_torque = [(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
-            conclude.add_behind(SimpleNamespace(data=data), [finding], by_torque)
-        assert data["verdict"] == word, left
+            conclude.decide(d)
+        assert d.data["verdict"] == word, left
 
 
 def fitted_from_torque(samples=1000, seconds=10.0) -> bool:

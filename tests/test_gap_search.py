@@ -123,7 +123,7 @@ def test_what_only_the_recording_held_out_shows_is_said():
     [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")],
 )
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
-    finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
+    finding = {"held_out": {"before": 0.01, "after": 0.001}, "confidence": confidence, "indistinguishable": group}
     assert held_out.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 

@@ -11,6 +11,7 @@ from test_gap import model, plant_run
 from test_gap_torque_route import arm, run
 
 from dexsim.gap.judge import conclude, confidence
+from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
 from dexsim.gap.search import logged_torque, shaking
@@ -76,6 +77,28 @@ def test_a_name_that_makes_a_joint_ring_as_it_does_is_as_sure_as_that():
         assert other.confidence == 0.0 and other.reasons == ["not borne out"]
 
 
+def answer_of(soft: JointSearch, found) -> JointAnswer:
+    return JointAnswer(soft.case, soft, found, Kept([None] * 3, [0, 1], [2], None, None))
+
+
+def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft):
+    """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
+    does is a hint, and is not handed on."""
+    answer = answer_of(soft, shaking.answered(soft, soft.without_search()))
+    assert rms(answer.after) > rms(answer.before)
+    plainly = {"joint": "a plain model follows better"}  # it does not ring, and keeps step with nothing either
+    assert conclude._withheld(plainly, [answer], {"joint"}) == {}
+    assert conclude._withheld(plainly, [answer], set()) == plainly
+    answer.after = 3.6 * answer.before
+    worse = conclude._withheld(plainly, [answer], {"joint"})
+    assert "by more with it" in worse["joint"] and conclude._withheld({}, [answer], set()) == {}
+    e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, 0, [], 0.0)
+    d = SimpleNamespace(evidence=[e], notes=[])
+    conclude._judged_by_ringing(d, {"joint": 0.95})
+    conclude._not_better(d, worse)
+    assert e.confidence < 0.5 and "is not handed on" in d.notes[0]
+
+
 def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
     runs = [plant_run(f"run{k}", 1, 3.0, {"coulomb_friction": 0.06}, seed=k, servo=SERVO) for k in (0, 1)]
     for r in runs:
@@ -112,7 +135,7 @@ def test_nobody_pushes_a_joint_that_rings():
 
 
 def test_what_is_followed_to_the_noise_is_not_pushed():
-    push = logged_torque.Push("elbow", 1.0, 0.1, 0.5, False, False)
+    push = logged_torque.Push("elbow", 1.0, (0.9, 1.1), 0.5, False, False)
     finding = {
         "effect": "torque_ripple",
         "where": {"joints": ["elbow"]},

@@ -170,8 +170,13 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     assert servo.value("elbow", "coulomb_friction").unknown
     notes: list[str] = []
     # of the elbow the torque told nothing
-    stages = [SimpleNamespace(joint="shoulder", fit=0.1), SimpleNamespace(joint="elbow", fit=0.1)]
+    stage = lambda joint, fit, high=1.1: SimpleNamespace(joint=joint, fit=fit, slope_high=high)  # noqa: E731
+    stages = [stage("shoulder", 0.1), stage("elbow", 0.1)]
     given[1][0].told = False
     assert logged_torque.unknown_controllers(given, stages, notes) == {"shoulder"}
     assert "controller is another" in notes[0]
-    assert logged_torque.unknown_controllers(given, [SimpleNamespace(joint="shoulder", fit=0.9)], notes) == set()
+    assert logged_torque.unknown_controllers(given, [stage("shoulder", 0.9)], notes) == set()
+    # a law that surely pushes the other way is not the drive's, however well its mirror image fits; one that may be is
+    assert logged_torque.unknown_controllers(given, [stage("shoulder", 0.9, -0.05)], notes) == {"shoulder"}
+    assert "gives the opposite of the torque" in notes[1]
+    assert logged_torque.unknown_controllers(given, [stage("shoulder", 0.9, 0.05)], notes) == set()

@@ -10,12 +10,11 @@ import pytest
 from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
-from dexsim.gap.inquiry import TouchResult
+from dexsim.gap.inquiry import Judged, TouchResult, empty
 from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.hypotheses import Outcome
-from dexsim.gap.touch import diagnosis as touch_report
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
@@ -29,19 +28,115 @@ def finding(confidence: float, joint: str = "a") -> dict:
 
 def test_names_on_joints_that_need_no_effect_are_hints():
     found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
-    held_out.settle(found, quiet={"a"})
+    held_out.unneeded(found, quiet={"a"})
+    held_out.settle(found)
     assert [f.get("hint", False) for f in found] == [True, False, True]
     assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
     assert held_out.firm(found) == [found[1]]
 
 
-def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a_quiet_joint():
+def told(effect: str, confidence: float, joint: str = "a", **held) -> dict:
+    """A finding as the page has it."""
+    return {
+        "effect": effect,
+        "where": {"joints": [joint], "taxels": [], "topics": []},
+        "held_out": {"before": 2.0, "after": 1.0, "removed_low": 0.5} | held,
+        "confidence": confidence,
+        "regime": "now and then",
+        "indistinguishable": [],
+        "parameters": {},
+    }
+
+
+def decided(*found: dict, before=4.0, after=1.0, floor=1.0, touch=None, **judged) -> SimpleNamespace:
+    """A diagnosis of these findings, decided; errors in rad."""
+    position = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after}
+    d = SimpleNamespace(
+        data=empty() | {"findings": list(found), "noise_floor": {"position_rad": floor}},
+        judged=Judged(position, **judged), touch=touch, sentence="", mechanism=None, joints={},
+    )  # fmt: skip
+    conclude.decide(d)
+    return d
+
+
+PUSH = {"effect": "external_force", "held_out": None}
+BAD = {"effect": "bad_channel", "held_out": None}
+EFFORT = {"error": "effort_rmse_Nm", "before": 2.0, "before_low": 2.0, "after": 1.0}
+
+
+@pytest.mark.parametrize("other", [{}, PUSH, BAD, {"effect": "current_sensor"}])
+def test_whatever_is_named_below_a_half_is_a_hint_and_not_in_the_sentence(other):
+    """Of a joint, of what pushes it, of a signal, of an effort: after what is sure, unknown to the verdict."""
+    d = decided(told("lag", 0.45) | other, told("backlash", 0.9, "b"), effort=EFFORT)
+    assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
+    assert d.data["verdict"] == "explained" and "Joint b" in d.sentence and "Joint a" not in d.sentence
+    alone = decided(told("lag", 0.45) | other, effort=EFFORT)
+    assert alone.data["verdict"] == "unknown" and alone.sentence.startswith("Something is missing that no effect")
+    assert decided(told("lag", 0.45) | other, before=1.1, effort=EFFORT).data["verdict"] == "none"
+
+
+def test_what_the_torque_whispers_decides_nothing():
+    """Of the torque route, which is added after the joints: its error is the verdict's only where it names surely."""
+    behind = {"error": "effort_rmse_Nm", "before": 0.5, "before_low": None, "after": 0.2}
+    d = SimpleNamespace(data={"findings": []}, judged=Judged({}))
+    named = [SimpleNamespace(effect="stribeck_friction", before=0.5, after=0.2)]
+    by_torque = [(SimpleNamespace(joint="a"), SimpleNamespace(named=named), ["r"])]
+    conclude.add_behind(d, [told("stribeck_friction", 0.45, error="effort_rmse_Nm")], by_torque)
+    assert d.judged.torque is None and len(d.data["findings"]) == 1
+    sure = told("stribeck_friction", 0.9, error="effort_rmse_Nm")
+    assert decided(sure, torque=behind).data["verdict"] == "partly_explained"
+    whispered = decided(told("stribeck_friction", 0.45, error="effort_rmse_Nm"))
+    assert whispered.data["verdict"] == "unknown" and whispered.data["held_out"]["error"] == "position_rmse_rad"
+    # beside a name that the motion bears out the torque's counts for nothing in the motion's verdict
+    both = decided(sure, told("backlash", 0.45), after=1.0, torque=behind)
+    assert both.data["held_out"]["error"] == "effort_rmse_Nm" and both.data["findings"][1]["hint"]
+
+
+@pytest.mark.parametrize(("low", "word"), [(0.01, "explained"), (-0.01, "unknown")])
+def test_no_verdict_by_a_name_that_does_not_surely_lower_the_error(low, word):
+    assert decided(told("backlash", 0.9, removed_low=low)).data["verdict"] == word
+    assert decided(told("current_sensor", 0.9, removed_low=low), effort=EFFORT).data["verdict"] == word
+    quiet = decided(told("backlash", 0.9, removed_low=-0.01), before=1.2)
+    assert quiet.data["verdict"] == "none" and quiet.data["findings"][0]["hint"]
+
+
+def test_what_was_not_judged_is_kept_whatever_the_verdict_goes_by():
+    d = decided(told("current_sensor", 0.9), effort=EFFORT)
+    assert d.data["held_out"]["error"] == "effort_rmse_Nm" and d.data["verdict"] == "explained"
+    d.data["held_out"]["not_judged"] = ["saturation of a"]
+    conclude.decide(d)
+    assert d.data["held_out"]["not_judged"] == ["saturation of a"]
+
+
+def test_touch_beside_joints_is_one_verdict():
+    touched = {"effect": "tactile_gain", "where": {"joints": [], "taxels": ["0:1"], "topics": []}}
+    for confidence, alone, beside in ((0.9, "explained", "explained"), (0.3, "unknown", "partly_explained")):
+        gain = told("tactile_gain", confidence) | touched | {"parameters": {}}
+        felt = TouchResult([gain], before=(0.3, 0.2, 0.4), after=(0.03, 0.03, 0.03), floor=0.03)
+        d = decided(gain, before=1.1, touch=felt)
+        assert d.data["verdict"] == alone and d.data["held_out"]["error"] == "tactile_rmse_N"
+        d = decided(gain, told("backlash", 0.9), touch=felt)
+        assert d.data["verdict"] == beside and d.data["held_out"]["error"] == "position_rmse_rad"
+        assert ("hint" in gain) is (confidence < 0.5)
+
+
+def test_the_sentence_says_what_the_plain_model_leaves_where_that_is_handed_on():
+    d = decided()
+    assert "4,000 mrad are left where" in d.sentence
+    joints = {"a": {}, "b": {}}
+    by_plain = "2,500 mrad are left by the plain model, which is handed on, where"
+    for handed, said in ((["a", "b"], by_plain), (["a"], "4,000 mrad are left where")):
+        d.data["baseline"] = {"error": 2.5, "joints": joints, "handed_on": handed}
+        conclude.decide(d)
+        assert said in d.sentence
+
+
+def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half():
     """The motion of such a joint needs no effect, and that says nothing of its sensor; a whisper stays one."""
-    found = [finding(c) | {"effect": "current_sensor"} for c in (0.9, 0.45)] + [finding(0.9)]
-    conclude.mark_hints(found, quiet={"a"})
-    assert [f.get("hint", False) for f in found] == [False, True, True]
-    assert [f["confidence"] for f in found[:2]] == [0.9, 0.45]
-    assert held_out.verdict(found[1:2], 1.0, 1.15, 1.1, 1.14, True) == "none"
+    found = [finding(c) | {"effect": "current_sensor"} for c in (0.9, 0.45)]
+    held_out.settle(found)
+    assert [f.get("hint", False) for f in found] == [False, True]
+    assert held_out.verdict(found[1:], 1.0, 1.15, 1.1, 1.14, True) == "none"
 
 
 @pytest.mark.parametrize(
@@ -58,7 +153,7 @@ def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half_and_none_on_a
 )
 def test_no_verdict_by_a_whisper(before, after, confidence, word):
     found = [finding(confidence)]
-    held_out.settle(found, set())
+    held_out.settle(found)
     assert held_out.verdict(found, 1.0, before, 0.9 * before, after, True) == word
 
 
@@ -228,7 +323,8 @@ def test_touch_with_nothing_but_hints_within_its_noise_is_none():
     felt = TouchResult(
         [{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03
     )
-    assert touch_report._verdict(felt) == "none" and felt.findings[0]["hint"]
+    held_out.settle(felt.findings)
+    assert conclude._of_touch(felt) == "none" and felt.findings[0]["hint"]
 
 
 @pytest.mark.parametrize(

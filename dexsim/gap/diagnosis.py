@@ -63,6 +63,7 @@ def diagnose(
     d = Diagnosis(empty(), "", w.notes, mechanism=w.m, lengths=w.lengths)
     drives.report(d)
     touch.report(d)
+    conclude.decide(d)
     w.clock.lap("judging on held-out data")
     if d.data["verdict"] in ("unknown", "partly_explained"):
         drives.stand_in(d)
@@ -93,11 +94,13 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
     d.data["findings"] = w.channel
     if felt.before is None and not felt.findings:
         d.data["reason"] = reason
+        conclude.decide(d)
         return d
     w.notes.append(f"no joint is judged: {reason}")
     left_out = conclude.not_considered((), felt, w.settings.allowed)
     w.notes += cannot_be_seen(w.settings.allowed, left_out)
     touch.report(d)
+    conclude.decide(d)
     d.data["unexplained"]["not_considered"] = left_out
     d.lengths = w.lengths
     _next(d, w, ())

@@ -110,6 +110,20 @@ class Curve:
 
 
 @dataclass
+class Judged:
+    """What the verdict on joints goes by, as entries of `held_out`: errors of their motion, of the reading of their
+    effort alone, and of their torque from the motion (what the recorded torque names); None where there is none.
+    structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its
+    own floor without any."""
+
+    position: dict[str, Any]
+    effort: dict[str, Any] | None = None
+    torque: dict[str, Any] | None = None
+    structured: bool = True
+    quiet: bool = False
+
+
+@dataclass
 class Diagnosis:
     """Everything the page shows; `data` is what diagnosis.json holds."""
 
@@ -137,6 +151,7 @@ class Diagnosis:
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
     # joints that ring by themselves, as what was found of them does in what was held out
     ringing: frozenset[str] = frozenset()
+    judged: Judged | None = None  # None where no joint is
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:

@@ -83,7 +83,7 @@ class Table:
     """A file's columns by quantity and joint, in SI units: time [T] s by topic, value[quantity][joint] [T].
 
     meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
-    left out."""
+    left out; unnamed: whether no column names the one joint."""
 
     joints: list[str]
     time: dict[str, np.ndarray]
@@ -91,6 +91,7 @@ class Table:
     meta: dict[str, str]
     start_ns: int
     findings: list[Finding] = field(default_factory=list)
+    unnamed: bool = False
 
     def samples(self, quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """(t [T] s, value [T, J]) of one quantity, rows without any number left out."""
@@ -139,7 +140,8 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
             joints.append(joint)
     joints = list(dict.fromkeys(joints))
     unnamed = {q for q, c in found.items() if "" in c and q not in ("time", "supply_voltage")}
-    if unnamed and not joints:
+    nameless = bool(unnamed) and not joints
+    if nameless:
         joints = ["joint"]
     for q in unnamed:
         if len(joints) > 1:
@@ -166,7 +168,8 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
             "remap.effort.JOINT=COLUMN"
         )
     time, start = _clock(path, found, roles, meta, list(raw))
-    return Table(joints, time, {q: c for q, c in found.items() if q != "time"}, stated, start, findings)
+    value = {q: c for q, c in found.items() if q != "time"}
+    return Table(joints, time, value, stated, start, findings, nameless)
 
 
 def _roles(path: Path, columns: list[str], named: Mapping[str, str]) -> dict[str, tuple[str, str, str, str]]:

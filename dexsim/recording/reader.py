@@ -621,6 +621,13 @@ class _TableReading(_Reading):
     ) -> list[str]:
         return list(self.table.joints)
 
+    def _match(self, theirs: list[str], joints: Sequence[str] | None) -> dict[str, str]:
+        if self.table.unnamed and joints is not None and len(joints) == 1 and not self.joint_remap:
+            text = f"the columns name no joint: they are taken for the model's one, {joints[0]}"
+            self.findings.append(Finding("joint_names", "", NAN, 1, text, "info"))
+            return {theirs[0]: joints[0]}
+        return super()._match(theirs, joints)
+
 
 def _line(t: np.ndarray, own: np.ndarray, x: np.ndarray) -> np.ndarray:
     ok = np.isfinite(x) & np.isfinite(own)

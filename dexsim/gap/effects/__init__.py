@@ -224,6 +224,10 @@ class Effect:
         """Why a joint's motion cannot show it; empty where it can."""
         return "" if self.variants(s) else "these recordings cannot show it"
 
+    def without(self, s: Scales) -> dict[str, str]:
+        """Kinds of it that are left out on a joint that can show others, each with the reason."""
+        return {}
+
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         """[n] how strongly it acts at each measured sample: its own torque, or the signal that it changes."""
         return np.ones_like(case.regimes["speed"])

@@ -185,6 +185,21 @@ class SupplySag(Effect):
         return {k: fit.entry(k, f"1/({fit.force})") for k in keys}
 
 
+WARMED = (  # servo columns that `thermal_friction` scales
+    "coulomb_friction",
+    "viscous_friction",
+    "thinning_friction",
+    "stribeck_peak",
+    "load_friction",
+    "load_friction_backdriven",
+    "load_friction_external",
+    "load_stribeck",
+    "load_stribeck_external",
+    "load_quadratic",
+    "load_quadratic_external",
+)
+
+
 class Thermal(Effect):
     """Torque constant, friction or resistance that drift with the temperature."""
 
@@ -206,7 +221,7 @@ class Thermal(Effect):
         ):
             if of == "resistance" and not s.voltage:
                 continue
-            if of == "friction" and not (s.nominal["coulomb_friction"] > 0 or s.nominal["viscous_friction"] > 0):
+            if of == "friction" and self.without(s):
                 continue
             top = min(0.03 if of != "friction" else 0.1, 0.7 / s.warm)
             # copper gains 0.39 % of resistance per degree: ten times that is a proxy of something else
@@ -223,6 +238,16 @@ class Thermal(Effect):
             )
             out.append(Variant((p,), starts, of, note={"of": of}))
         return out
+
+    def without(self, s: Scales) -> dict[str, str]:
+        if s.warm < SEARCH.warmth or any(s.nominal.get(n, 0.0) > 0 or n in s.unknown for n in WARMED):
+            return {}
+        if s.base_friction > 0:
+            return {
+                "of friction": "the drive is believed to have none, and the model's frictionloss has no temperature: "
+                "state it as coulomb_friction of the servo"
+            }
+        return {"of friction": "no friction is believed of the drive; where its size is not known it is unknown, not 0"}
 
     def unseen(self, s: Scales) -> str:
         if s.warm <= 0:

@@ -106,7 +106,13 @@ class ViscousFriction(Effect):
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of what differs by direction
         own = found.joint["viscous_friction"]
         unit = f"{found.force}.s/{found.length}"
-        return {"coefficient": entry(own, own * 0.95, own * 1.05, unit), "asymmetry": found.entry("1", 2, own)}
+        asymmetry = found.entry("1", 2, own)
+        # neither direction's is below 0
+        asymmetry |= {k: float(np.clip(asymmetry[k], -2.0, 2.0)) for k in ("value", "low", "high")}
+        return {"coefficient": entry(own, own * 0.95, own * 1.05, unit), "asymmetry": asymmetry}
+
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        return abs(value) <= joint.get("viscous_friction", 0.0)
 
 
 class StribeckFriction(Effect):

@@ -14,7 +14,7 @@ from dexsim.console.tables import number
 from dexsim.gap import locate
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
-from dexsim.gap.inquiry import Diagnosis, Settings, TouchResult
+from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
@@ -64,7 +64,6 @@ def into_diagnosis(
     """
     data, notes, m = d.data, d.notes, d.mechanism
     assert m is not None  # that of the answers
-    data["verdict"] = "none"
     findings: list[dict[str, Any]] = []
     for a in answers:
         joint = a.case.joint
@@ -106,9 +105,9 @@ def into_diagnosis(
         )
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
     worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
-    worse = {joint: reason for joint, reason in worse.items() if joint not in rings}
-    _not_better(d, worse)
+    worse = _withheld(worse, answers, rings)
     _judged_by_ringing(d, rings)
+    _not_better(d, worse)
     findings.sort(key=lambda f: -_weight(f, rings))
     _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
     _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
@@ -118,19 +117,10 @@ def into_diagnosis(
         data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
-    mark_hints(findings, quiet)
-    findings.sort(key=lambda f: f.get("hint", False))
+    # that says nothing of what is wrong with the reading of the effort alone
+    held_out.unneeded([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
-    _verdict(d, answers, kept, findings, refuted, noise.floor, how, s.seed, len(quiet) == len(answers))
-    d.sentence = sentence(data, d, noise.floor)
-
-
-def mark_hints(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
-    """Which findings are hints (`held_out.settle`). quiet: joints followed to their floor without any effect, which
-    says nothing of what is wrong with the reading of the effort alone."""
-    by_effort = [f for f in findings if EFFECTS[f["effect"]].effort_only]
-    held_out.settle([f for f in findings if f not in by_effort], quiet)
-    held_out.settle(by_effort, set())
+    d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers))
 
 
 def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
@@ -153,6 +143,22 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
             if e.joint == joint and not EFFECTS[e.effect].effort_only:
                 e.reasons.append(reason)
                 e.confidence = min(e.confidence, JUDGE.hinted)
+
+
+def _withheld(worse: dict[str, str], answers: Sequence[JointAnswer], rings: Collection[str]) -> dict[str, str]:
+    """Joints of which what was found is not handed on, with the reason: those of `worse` (`baseline.refused`), but of
+    the joints that ring by themselves (`rings`) only those on which the error of what was held out surely rises by it.
+    That no free run keeps step explains an error that does not fall, not one that does nothing but rise."""
+    out = {joint: reason for joint, reason in worse.items() if joint not in rings}
+    for a in answers:
+        if a.case.joint in rings and a.best.members and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
+            k, unit = 1e3, "mm" if a.case.scales.slide else "mrad"
+            out[a.case.joint] = (
+                f"what was held out is missed by {k * rms(a.before):.3g} {unit} without what was found and, whichever "
+                f"stretches had been recorded, by more with it ({k * rms(a.after):.3g} {unit}), though it rings as the "
+                "joint does"
+            )
+    return out
 
 
 def _rings(a: JointAnswer) -> float:
@@ -225,57 +231,39 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
     d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
 
 
-def _verdict(
-    d: Diagnosis,
-    answers: Sequence[JointAnswer],
-    kept: Kept,
-    findings: list[dict[str, Any]],
-    refuted: set[str],
-    floor: float,
-    how: str,
-    seed: int,
-    quiet: bool,
-) -> None:
-    """Errors over all joints on what was held out, and the word for it."""
-    data, times = d.data, [a.t for a in answers]
-    b, bl, bh = held_out.rms_interval([a.before for a in answers], times, seed)
-    a, al, ah = held_out.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
-    slide = all(x.case.constants.slide for x in answers)
-    data["held_out"] = {
-        "recordings": [kept.runs[i].name for i in kept.test],
-        "error": "position_rmse_m" if slide else "position_rmse_rad",
-        "before": b,
-        "after": a,
-        "before_low": bl,
-        "before_high": bh,
-        "after_low": al,
-        "after_high": ah,
-        "how": how,
-    }
+def _judged(
+    answers: Sequence[JointAnswer], kept: Kept, refuted: set[str], how: str, seed: int, quiet: bool
+) -> Judged:
+    """Errors over all joints on what was held out."""
+    times = [a.t for a in answers]
+    before = held_out.rms_interval([a.before for a in answers], times, seed)
+    after = held_out.rms_interval(
+        [x.before if x.case.joint in refuted else x.after for x in answers], times, seed
+    )
+    slide, names = all(x.case.constants.slide for x in answers), [kept.runs[i].name for i in kept.test]
+    position = _error("position_rmse_m" if slide else "position_rmse_rad", before, after, names, how)
+    parts = [
+        [x for x in xs if x is not None]
+        for xs in ([x.effort_before for x in answers], [x.effort_after for x in answers])
+    ]
+    effort = None
+    if parts[0] and parts[1]:
+        eb, ea = (float(np.sqrt(np.concatenate(xs).mean())) for xs in parts)
+        effort = _error("effort_rmse_Nm", (eb, eb, eb), (ea, ea, ea), names, how)
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    data["verdict"] = held_out.verdict(data["findings"], floor, b, bl, a, structured, quiet)
-    findings = [f for f in findings if f["confidence"] >= JUDGE.firm]
-    if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
-        data["verdict"] = "explained"
-        squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
-        eb, ea = (float(np.sqrt(np.concatenate([x for x in xs if x is not None]).mean())) for xs in squares)
-        data["held_out"] |= {
-            "error": "effort_rmse_Nm",
-            "before": eb,
-            "after": ea,
-            "before_low": eb,
-            "before_high": eb,
-            "after_low": ea,
-            "after_high": ea,
-        }
-    gap = b**2 - floor**2
-    data["unexplained"]["fraction_of_gap"] = (
-        round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * floor else 0.0
-    )
-    if data["verdict"] in ("none", "explained"):
-        data["unexplained"]["depends_on"] = []
+    return Judged(position, effort, None, structured, quiet)
+
+
+def _error(
+    name: str, before: Sequence[float | None], after: Sequence[float | None], recordings: Sequence[str], how: str
+) -> dict[str, Any]:
+    """An entry of `held_out`. before, after: value, low and high."""
+    keys = ("before", "before_low", "before_high", "after", "after_low", "after_high")
+    values = dict(zip(keys, [*before, *after], strict=True))
+    order = ("before", "after", "before_low", "before_high", "after_low", "after_high")
+    return {"recordings": list(recordings), "error": name} | {k: values[k] for k in order} | {"how": how}
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
@@ -325,11 +313,14 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
 
 
 def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
-    """Whether a signal is wrong only where its joint is not judged: that casts no doubt on what the other recordings
-    tell of it."""
+    """Whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or with all
+    of it: that casts no doubt on what the other recordings tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
+    judged = {run.name for run in kept.runs}
     return bool(channel["when"]) and all(
-        (w["recording"], j) in left_out for w in channel["when"] for j in channel["where"]["joints"]
+        w["recording"] not in judged or (w["recording"], j) in left_out
+        for w in channel["when"]
+        for j in channel["where"]["joints"]
     )
 
 
@@ -377,34 +368,27 @@ def _weight(f: dict, rings: dict[str, float]) -> float:
 def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
     """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
     that is left on the recording held out, where the loop's own error shows nothing."""
-    if not findings:
+    taken = {(f["effect"], *f["where"]["joints"]) for f in d.data["findings"]}
+    findings = [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
+    d.data["findings"] += findings
+    sure = [f for f in findings if f["confidence"] >= JUDGE.firm]
+    judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in sure)]
+    if not judged:
         return
-    data = d.data
-    shown = [f for f in data["findings"] if entry(f) is not None]
-    taken = {(f["effect"], *f["where"]["joints"]) for f in shown}
-    data["findings"] += [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
-    if not shown:
-        judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in findings)]
-        # not what the catalogue has no name for
-        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]
-        b, a = (
-            float(np.sqrt(sum(y**2 for y in ys)))
-            for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last])
-        )
-        data["held_out"] = {
-            "recordings": judged[0][1],
-            "error": findings[0]["held_out"]["error"],
-            "before": b,
-            "after": a,
-            "before_low": None,
-            "before_high": None,
-            "after_low": None,
-            "after_high": None,
-            "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere",
-        }
-        data["verdict"] = "partly_explained" if a < (1 - JUDGE.removed) * b else "unknown"
-        data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
-    d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
+    # not what the catalogue has no name for
+    last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]
+    b, a = (
+        float(np.sqrt(sum(y**2 for y in ys)))
+        for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last])
+    )
+    assert d.judged is not None  # the joints come first
+    d.judged.torque = _error(
+        sure[0]["held_out"]["error"],
+        (b, None, None),
+        (a, None, None),
+        judged[0][1],
+        "the motor torque recorded there, from the motion, with what was fitted elsewhere",
+    )
 
 
 def _followed(d: Diagnosis, joint: str) -> bool:
@@ -442,9 +426,116 @@ def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
         if f not in kept
     ]
     d.data["findings"] = [p.finding() for p in pushes] + kept
-    if not any(f["held_out"] for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
-        d.data["verdict"] = "unknown"
-    d.sentence = sentence(d.data, d, d.data["noise_floor"]["position_rad"])
+
+
+# -- the verdict ------------------------------------------------------------------------------------------------------
+
+
+def decide(d: Diagnosis) -> None:
+    """Which findings are hints, the verdict with the error that it goes by, how much of the gap is left and the
+    sentence: the last step, after everything was found of signals, joints, pushes and touch. Nothing else decides any
+    of these."""
+    data, felt = d.data, d.touch
+    held_out.settle(data["findings"])
+    of_touch = [] if felt is None else felt.findings
+    mine = [f for f in data["findings"] if not any(f is x for x in of_touch)]
+    joints, error = ("unusable", None) if d.judged is None else _of_joints(mine, d.judged, _floor(d))
+    depends = [] if joints in ("none", "explained") else list(data["unexplained"]["depends_on"])
+    word, touch = joints, None if felt is None else _of_touch(felt)
+    if felt is not None and touch is not None:
+        word = _of_both(joints, touch)
+        depends += felt.depends_on if word not in ("none", "explained") else []
+        named = [f for f in mine if f["effect"] != "bad_channel" and not f.get("hint")]
+        felt_alone = not named and (joints == "none" or any(not f.get("hint") for f in of_touch)) and touch != "none"
+        if joints == "unusable" or (felt_alone and felt.before is not None):
+            error = _error_of_touch(felt)
+    data["verdict"] = word
+    data["findings"].sort(key=lambda f: f.get("hint", False))
+    data["unexplained"]["depends_on"] = depends
+    if error is not None:
+        beside = {k: v for k, v in data["held_out"].items() if k == "not_judged"}
+        data["held_out"] = error | beside
+        data["unexplained"]["fraction_of_gap"] = _left_of_gap(d, error)
+    if word != "unusable":
+        d.sentence = sentence(data, d, _floor(d))
+
+
+def _floor(d: Diagnosis) -> float:
+    """Of the joints' position error [rad or m]; 0 where none is judged."""
+    return d.data["noise_floor"]["position_rad"] or 0.0
+
+
+def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> tuple[str, dict[str, Any]]:
+    """The word for the joints, and the error that it goes by: that of the torque where nothing but that names anything,
+    that of the effort where nothing but its reading is wrong, of the motion otherwise."""
+    behind = [f for f in held_out.firm(findings) if by.torque is not None and _by_torque(f)]
+    named = [f for f in held_out.firm(findings) if not _by_torque(f)]
+    if behind and not named and by.torque is not None:
+        b, a = by.torque["before"], by.torque["after"]
+        part = any(map(held_out.lowers, behind)) and a < (1 - JUDGE.removed) * b
+        return ("partly_explained" if part else "unknown"), by.torque
+    if named and by.effort is not None and all(EFFECTS[f["effect"]].effort_only for f in named):
+        if any(map(held_out.lowers, named)):
+            return "explained", by.effort
+    p, of_motion = by.position, [f for f in findings if not _by_torque(f)]
+    word = held_out.verdict(of_motion, floor, p["before"], p["before_low"], p["after"], by.structured, by.quiet)
+    if word == "none":
+        _whispered(named)
+    return word, p
+
+
+def _by_torque(f: dict[str, Any]) -> bool:
+    """Whether a finding was judged by its torque alone (`add_behind`)."""
+    return bool(f["held_out"]) and f["held_out"].get("error", "").startswith("effort")
+
+
+def _whispered(findings: Sequence[dict[str, Any]]) -> None:
+    """Makes hints of names where nothing is missing."""
+    for f in findings:
+        f["confidence"], f["hint"] = min(f["confidence"], JUDGE.hinted), True
+
+
+def _of_touch(felt: TouchResult) -> str | None:
+    """The word for touch alone; None where it was not judged."""
+    named = [f for f in felt.findings if not f.get("hint")]
+    if felt.before is None:
+        return "explained" if named else None
+    assert felt.floor is not None and felt.after is not None  # with a force predicted
+    seen = {"before": 1.0, "after": 0.0}  # what is constant was seen, not fitted
+    given = [{"effect": f["effect"], "held_out": f.get("held_out") or seen, "hint": False} for f in named]
+    word = held_out.verdict(given, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    if word == "none":
+        _whispered(named)
+    return "partly_explained" if word == "explained" and felt.structured else word
+
+
+def _of_both(joints: str, touch: str) -> str:
+    """The word for joints and touch."""
+    if joints in ("unusable", "none"):
+        return touch
+    return joints if touch in ("none", joints) else "partly_explained"
+
+
+def _error_of_touch(felt: TouchResult) -> dict[str, Any]:
+    if felt.before is None or felt.after is None:
+        return _error("tactile_rmse_N", (None,) * 3, (None,) * 3, [], "")
+    return _error("tactile_rmse_N", felt.before, felt.after, felt.recordings, "presses held out of the fit")
+
+
+def _left_of_gap(d: Diagnosis, error: dict[str, Any]) -> float | None:
+    """Share of the gap between the error before and the floor that is left."""
+    assert d.judged is not None or d.touch is not None  # one of them was judged
+    if d.judged is not None and error is d.judged.torque:
+        return round((error["after"] / error["before"]) ** 2, 4)
+    if error["error"].startswith("tactile"):
+        floor = d.touch.floor if d.touch is not None else None
+    else:  # of the effort's reading no gap is known: the motion's
+        floor, error = _floor(d), d.judged.position if d.judged is not None else error
+    b, a = error["before"], error["after"]
+    if b is None or floor is None:
+        return None
+    gap = b**2 - floor**2
+    return round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * floor else 0.0
 
 
 # -- what is not considered -------------------------------------------------------------------------------------------
@@ -452,7 +543,8 @@ def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
 
 
 def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:
-    """Effect id -> why it was not considered on any joint or pad (or on which), in the catalogue's order.
+    """Effect id (and kind of it, where others of it are considered) -> why it was not considered on any joint or pad
+    (or on which), in the catalogue's order.
 
     cases: `plant.case.Case`."""
     out: dict[str, str] = {}
@@ -464,16 +556,11 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
         if not moved:
             out[e] = "no joint is judged" if not cases else "no joint moves"
             continue
-        given = {c.joint: x.unseen(c.scales) for c in moved}
-        lacking = {j: r for j, r in given.items() if r}
-        if not lacking:
-            continue
-        first = next(iter(lacking.values()))
-        if len(lacking) == len(given):
-            same = all(r == first for r in lacking.values())
-            out[e] = first if same else "; ".join(f"{j}: {r}" for j, r in lacking.items())
-        else:
-            out[e] = "; ".join(f"on {j}: {r}" for j, r in lacking.items())
+        if said := _by_joint({c.joint: x.unseen(c.scales) for c in moved}):
+            out[e] = said
+        kinds = {c.joint: x.without(c.scales) for c in moved}
+        for kind in dict.fromkeys(k for given in kinds.values() for k in given):
+            out[f"{e} {kind}"] = _by_joint({j: given.get(kind, "") for j, given in kinds.items()})
     touch = (
         "no /tactile is recorded"
         if not felt.tactile
@@ -491,6 +578,15 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
         elif touch and not any(f["effect"] == e for f in felt.findings):
             out[e] = touch
     return out
+
+
+def _by_joint(given: dict[str, str]) -> str:
+    """Reasons by joint, said once where they are one; joints without one are left out."""
+    lacking = {j: r for j, r in given.items() if r}
+    if len(lacking) == len(given) and len(set(lacking.values())) == 1:
+        return next(iter(lacking.values()))
+    on = "" if len(lacking) == len(given) else "on "
+    return "; ".join(f"{on}{j}: {r}" for j, r in lacking.items())
 
 
 def not_fitted(cases: Sequence) -> list[str]:
@@ -520,8 +616,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
     named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
-    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
-    prefix = _first_of_all(data["findings"], bad, d)
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel" and not f.get("hint")]
+    prefix = _first_of_all([f for f in data["findings"] if not f.get("hint")], bad, d)
     if data["verdict"] == "none":
         return (
             prefix
@@ -540,10 +636,15 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
             if data["unexplained"]["depends_on"]
             else ""
         )
+        plain = baseline.left_by_what_is_handed_on(data["baseline"]) if metric.startswith("position") else None
+        left = (
+            f"{number(before)} {unit} are left"
+            if plain is None
+            else f"{number(1e3 * plain)} {unit} are left by the plain model, which is handed on,"
+        )
         return (
             prefix
-            + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where "
-              f"{limit}{depends}."
+            + f"Something is missing that no effect of the catalogue explains: {left} where {limit}{depends}."
         )
     of = ""
     alone = {j for f in named for j in f["where"]["joints"]}

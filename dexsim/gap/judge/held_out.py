@@ -270,25 +270,38 @@ def rms_interval(
 # -- the verdict ------------------------------------------------------------------------------------------------------
 # The one word of a diagnosis, and which names count for it: by the error on what was held out, never by a name alone.
 #
-# One place decides: the sentence, the page and `diagnosis.json` all follow what stands in the findings after `settle`.
+# One place decides, last (`conclude.decide`): the sentence, the page and `diagnosis.json` follow what stands in the
+# findings after `settle`.
 
 STRETCH = 4  # neighbouring blocks that the bootstraps of a gain draw together
 
 
-def settle(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
-    """Marks the findings of joints that are hints: names below `JUDGE.firm`, and those on joints that are followed to
-    their floor without any effect (`quiet`), whose confidence goes below it."""
+def unneeded(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
+    """Lowers what is known of names on joints that are followed to their floor without any effect (`quiet`) to what a
+    hint has."""
     for f in findings:
         joints = f["where"]["joints"]
         if joints and set(joints) <= quiet and f["held_out"]:
             f["confidence"] = min(f["confidence"], JUDGE.hinted)
-        if f["held_out"] and f["confidence"] < JUDGE.firm:
+
+
+def settle(findings: Sequence[dict[str, Any]]) -> None:
+    """Marks the findings that are hints: whatever is named below `JUDGE.firm`, of a joint, a signal, a push or of
+    touch."""
+    for f in findings:
+        if f["confidence"] < JUDGE.firm:
             f["hint"] = True
 
 
 def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The findings of physics that are more than hints."""
     return [f for f in findings if f["held_out"] and not f.get("hint")]
+
+
+def lowers(f: dict[str, Any]) -> bool:
+    """Whether a finding lowers the error on what was held out, by more than the interval of what it removes."""
+    h = f["held_out"]
+    return bool(h["removed_low"] > 0 if "removed_low" in h else h["after"] < h["before"])
 
 
 def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -308,9 +321,9 @@ def verdict(
     """The one word. findings: after `settle`; floor, before, after: of the error on what was held out; before_low: of
     its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether every joint is
     followed to its own floor. Where the rest is followed to the floor a wrong signal is the answer: something was
-    amiss, and it has a name."""
+    amiss, and it has a name. Names of which none surely lowers the error explain nothing."""
     named = firm(findings)
-    if not named:
+    if not any(map(lowers, named)):
         if (
             quiet
             or before <= JUDGE.within * floor

@@ -188,11 +188,13 @@ class JointAnswer:
         lost = (self.measured - q) ** 2
         effort_only = mm.effect.effort_only
         of_effort = self.effort_after if effort_only else None
+        gain = told = held_out.gain_interval(lost, self.after, self.t)
         if of_effort is not None:
-            was, left = rms((self.torque - effort)[self.sensed] ** 2), rms(of_effort)
+            misread = (self.torque - effort)[self.sensed] ** 2
+            was, left = rms(misread), rms(of_effort)
+            told = held_out.gain_interval(misread, of_effort, self.t[self.sensed])
         else:
             was, left = rms(lost), rms(self.after)
-        gain = held_out.gain_interval(lost, self.after, self.t)
         evidence = self._judged(mm, trial, raw, was, left, gain[0])
         on = held_out.telling(lost, self.after, self.t, self.case.sigma)
         if not effort_only and not on.all():  # what the other moments say of it, as a hint
@@ -218,13 +220,11 @@ class JointAnswer:
             "regime": mm.effect.shows,
             "when": intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
-            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(of_effort)}
-            if of_effort is not None
-            else {
-                "before": rms(lost),
-                "after": rms(self.after),
-                "removed_low": round(gain[0], 4),
-                "removed_high": round(gain[1], 4),
+            "held_out": {
+                "before": was,
+                "after": left,
+                "removed_low": round(told[0], 4),
+                "removed_high": round(told[1], 4),
             },
         }
         late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.within**2 else None

@@ -428,6 +428,7 @@ def _case(
         voltage=voltage,
         effort=effort_noise > 0,
         saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
+        unknown=_open_figures(runs[0].servo, joint)[1],
         base_friction=constants.friction,
         base_damping=constants.damping,
         armature=constants.armature,

@@ -165,6 +165,7 @@ class Scales:
     voltage: bool
     effort: bool
     saturates: float  # share of samples at the believed limit
+    unknown: tuple[str, ...] = ()  # servo columns of which nothing is believed
     base_friction: float = 0.0
     base_damping: float = 0.0
     armature: float = 0.0

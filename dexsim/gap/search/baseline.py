@@ -11,7 +11,7 @@ recorded, and is otherwise at most its limit; gravity and the other joints' pull
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX as SERVO
+from dexsim.actuator.reference import dry_friction
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
@@ -35,6 +36,7 @@ ITERATIONS = 8  # of the fit from each guess
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
 DRAWS = 400  # of the bootstrap
+UNSTATED = ("braking_slope",)  # what is believed of an unknown drive is not the servo table's default (`plant.case`)
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
 
 
@@ -42,7 +44,8 @@ UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "
 class Baseline:
     """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over
     what was held out [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples,
-    of half a second a block [n]; at_bound: columns that stopped there."""
+    of half a second a block [n]; at_bound: columns that stopped there; beside: columns of which the servo's file says
+    nothing, as they were when it was judged, where the file's default is another."""
 
     joint: str
     value: dict[str, float]
@@ -53,6 +56,7 @@ class Baseline:
     block: np.ndarray = field(repr=False)
     slide: bool = False
     at_bound: tuple[str, ...] = ()
+    beside: dict[str, float] = field(default_factory=dict)
 
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
@@ -179,7 +183,10 @@ def judged(
     )
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
     block = (here.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * here.plant.run_of[kept.sample_row]
-    return Baseline(case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped)
+    beside = {n: case.scales.nominal[n] for n in UNSTATED if n not in case.stated}
+    return Baseline(
+        case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped, beside
+    )
 
 
 def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np.ndarray:
@@ -237,10 +244,10 @@ def refused(
     for case, trial, squares in fits:
         joint = case.joint
         row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
-        friction = float(row[INDEX["coulomb_friction"]])
+        dry = {n: float(row[INDEX[n]]) for n in DRY}
         # than was believed: that is not this answer's
-        more = friction > (1 + BELIEF.tolerance) * case.scales.nominal["coulomb_friction"] + 1e-12
-        reason = forbids(case, train, friction, float(row[INDEX["friction_asymmetry"]])) if more else ""
+        more = any(dry[n] > (1 + BELIEF.tolerance) * case.scales.nominal.get(n, 0.0) + 1e-12 for n in HOLDING)
+        reason = forbids(case, train, dry["coulomb_friction"], dry["friction_asymmetry"], dry) if more else ""
         plain, after = by.get(joint), joints[joint]["after"]
         if reason:
             out[joint] = reason
@@ -273,11 +280,17 @@ def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str])
     done = []
     for b in given:
         if b.joint in joints and b.error < b.error_before:
-            for name, x in b.value.items():
+            for name, x in (b.beside | b.value).items():
                 if name in SERVO:
                     servo.set(b.joint, name, round(x, 9))
             done.append(b.joint)
     return done
+
+
+def left_by_what_is_handed_on(data: dict[str, Any]) -> float | None:
+    """Error [rad or m] that is left where it is the plain model of every judged joint that is handed on; None where it
+    is not. data: of `overall`."""
+    return data["error"] if data and set(data["handed_on"]) == set(data["joints"]) else None
 
 
 def text(data: dict[str, Any], unit: str) -> str:
@@ -291,9 +304,26 @@ def text(data: dict[str, Any], unit: str) -> str:
     return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
 
 
-def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
+HOLDING = (  # columns of dry friction that may hold a joint at rest
+    "coulomb_friction",
+    "stribeck_peak",
+    "load_friction",
+    "load_friction_backdriven",
+    "load_friction_external",
+    "load_stribeck",
+    "load_stribeck_external",
+    "load_quadratic",
+    "load_quadratic_external",
+    "gear_load_friction",
+    "gear_load_friction_backdriven",
+)
+DRY = (*HOLDING, "friction_asymmetry", "stribeck_speed", "stribeck_exponent", "gear_load_power", "gear_load_unit")
+
+
+def room_for_friction(case: Case, runs: Sequence[int], dry: Mapping[str, float] | None = None) -> dict[int, float]:
     """By direction (1, -1): the largest dry friction [N.m] with which every motion of these runs that began at rest
-    could begin; infinite where none did."""
+    could begin; infinite where none did. dry: columns `DRY`, whose breakaway and share of the load it has to leave room
+    for (it is below 0 where those alone are too much)."""
     out = {1: np.inf, -1: np.inf}
     gives = BELIEF.gives_slide if case.scales.slide else BELIEF.gives  # so far it moves without sliding
     plant, speed = case.plant, case.regimes["_speed"]
@@ -305,26 +335,45 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
         drive, pull = _drive(case, r), _series(case, r, "gravity_cos") + _series(case, r, "rest")
         for way in (1, -1):
             on = way * v > JUDGE.slides * case.scales.speed
+            net = drive[way] - way * pull
+            free = TORQUE.room * net - (_beyond_coulomb(dry, way, q, drive[way], pull) if dry else 0.0)
             edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
             for a, b in zip(edge[::2], edge[1::2], strict=True):
                 if a == 0 or abs(q[b - 1] - q[a]) < max(gives, 20 * case.sigma):
                     continue
                 a = max(a - 2, 0)  # the torque that set it off is from just before
-                out[way] = min(out[way], max(TORQUE.room * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))
+                drives = net[a:b] > 0
+                out[way] = min(out[way], float(np.max(free[a:b][drives])) if drives.any() else 0.0)
     return out
 
 
-def forbids(case: Case, runs: Sequence[int], friction: float, asymmetry: float = 0.0) -> str:
-    """Why a dry friction [N.m] (its asymmetry as in servo.yaml) cannot be: a motion was recorded that it forbids. Empty
-    where none is."""
-    for way, room in room_for_friction(case, runs).items():
+def _beyond_coulomb(
+    dry: Mapping[str, float], way: int, q: np.ndarray, drive: np.ndarray, pull: np.ndarray
+) -> np.ndarray:
+    """[S] dry friction [N.m] of a joint at rest that is about to move to one side, beyond its Coulomb friction: what
+    it takes to break away, and what grows with the torques on its gear. drive: most torque that way; where that is not
+    known the motor's share is left out."""
+    motor = np.where(np.isfinite(drive), way * drive, 0.0)
+    level = dry_friction(dict(dry) | {"coulomb_friction": 0.0}, q, np.full_like(q, way * 1e-9), motor, -pull)
+    unit = max(dry["gear_load_unit"], 1e-12)
+    share = np.where(way * pull < 0.0, dry["gear_load_friction_backdriven"], dry["gear_load_friction"])
+    level = level + share * unit * (np.abs(pull) / unit) ** dry["gear_load_power"]
+    return level * (1 + 0.5 * way * dry["friction_asymmetry"])
+
+
+def forbids(
+    case: Case, runs: Sequence[int], friction: float, asymmetry: float = 0.0, dry: Mapping[str, float] | None = None
+) -> str:
+    """Why a dry friction [N.m] (its asymmetry as in servo.yaml; dry: what is beside it, see `room_for_friction`) cannot
+    be: a motion was recorded that it forbids. Empty where none is."""
+    most = room_for_friction(case, runs)
+    for way, room in room_for_friction(case, runs, dry).items():
         level = friction * (1 + 0.5 * way * asymmetry) + case.constants.friction
         if level > room:
-            unit = "N" if case.scales.slide else "N.m"
+            unit, where = "N" if case.scales.slide else "N.m", "forwards" if way > 0 else "backwards"
             return (
-                f"a dry friction of {level:.3g} {unit} would hold the joint, but it was recorded setting itself in "
-                "motion "
-                f"{'forwards' if way > 0 else 'backwards'} with at most {room:.3g} {unit} to drive it"
+                f"a dry friction of {level + most[way] - room:.3g} {unit} would hold the joint, but it was recorded "
+                f"setting itself in motion {where} with at most {most[way]:.3g} {unit} to drive it"
             )
     return ""
 

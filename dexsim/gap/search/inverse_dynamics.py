@@ -276,6 +276,7 @@ def unphysical(d: Columns) -> dict[str, str]:
 
 
 DRAWS = 300  # of a bootstrap
+STRETCH = 4  # neighbouring blocks that the bootstrap of what an effect removes draws together
 QUARTERS = 4  # of a recording, each left out in turn
 EFFECT = {e.by_torque: e for e in CATALOGUE if e.by_torque}
 BY_DIRECTION, LAG, STRIBECK = ViscousFriction.by_torque, Lag.by_torque, StribeckFriction.by_torque
@@ -291,7 +292,7 @@ SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck'
 class Named:
     """One further effect. text: as `Inverse.extra` names it; value, low, high (90 %) of its coefficients; share of the
     bootstraps in which it was the best to add; residual rms before and after on the recording held out (N.m, N for a
-    slide)."""
+    slide), and the share of its square that it removes there (90 %, stretches of two seconds)."""
 
     text: str
     value: float
@@ -301,6 +302,7 @@ class Named:
     rival: str
     before: float
     after: float
+    removed: tuple[float, float] = (0.0, 0.0)
 
     @property
     def effect(self) -> str:
@@ -374,11 +376,12 @@ def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int 
     for name in further:
         more = least(np.column_stack([X, mine[name]]), u)
         extra.append((name, float(1 - np.std(other.u - np.column_stack([other.X, theirs[name]]) @ more) / before)))
-    named, full = _name(own, other, mine, theirs, rng)
+    named, full, impossible = _name(own, other, mine, theirs, rng)
     left = float(np.std(u - X @ theta) / max(np.std(own.torque), 1e-12))
     pack = lambda x: {n: 0.0 for n in refused} | own.pack(x)  # noqa: E731
+    extra.sort(key=lambda e: -e[1])
     return Inverse(
-        pack(theta), pack(low), pack(high), left, sorted(extra, key=lambda e: -e[1]), named, pack(full), refused, cutoff
+        pack(theta), pack(low), pack(high), left, extra, named, pack(full), refused | impossible, cutoff
     )
 
 
@@ -395,10 +398,11 @@ def _name(
     mine: dict[str, np.ndarray],
     theirs: dict[str, np.ndarray],
     rng: np.random.Generator,
-) -> tuple[list[Named], np.ndarray]:
-    """Further effects in the order in which they help on quarters left out, and the coefficients with the
-    catalogue's."""
+) -> tuple[list[Named], np.ndarray, dict[str, str]]:
+    """Further effects in the order in which they help on quarters left out, the coefficients with the catalogue's, and
+    effects that would have helped but cannot be what they are called, each with the reason."""
     chosen: list[str] = []
+    impossible: dict[str, str] = {}
     out: list[tuple[str, float, str]] = []
     X, Y, base = own.X, other.X, own.X.shape[1]
     quarter = np.minimum(np.arange(len(own.u)) * QUARTERS // len(own.u), QUARTERS - 1)
@@ -421,6 +425,11 @@ def _name(
             c = least(A, own.u)
             if _sensible(name, c[-1], own.pack(c)):
                 tried[name] = left_out(A)
+            elif name == BY_DIRECTION and left_out(A).sum() < (1 - SEARCH.least) * now.sum():
+                impossible[name] = (
+                    f"the least squares give {own.pack(c).get('viscous_friction', 0.0):.3g} with {c[-1]:.3g} more "
+                    "forwards and less backwards, and neither direction's can be negative"
+                )
         if not tried:
             break
         best = min(tried, key=lambda n: tried[n].sum())
@@ -436,16 +445,35 @@ def _name(
         now, X, Y = tried[best], np.column_stack([X, mine[best]]), np.column_stack([Y, theirs[best]])
     # what the catalogue has no name for must not lend its trace to what has one
     known = [n for n in chosen if _effect(n)]
+    if BY_DIRECTION in known:
+        both = least(np.column_stack([own.X, *(mine[n] for n in known)]), own.u)
+        if not _sensible(BY_DIRECTION, both[base + known.index(BY_DIRECTION)], own.pack(both)):
+            rest = {n: c for n, c in mine.items() if n != BY_DIRECTION}
+            named, theta, more = _name(own, other, rest, theirs, rng)
+            others = " and ".join(_kind(n).replace("_", " ") for n in known if n != BY_DIRECTION)
+            why = f"beside {others} one direction's would be negative"
+            return named, theta, impossible | more | {BY_DIRECTION: why}
     theta, low, high = _intervals(np.column_stack([own.X, *(mine[n] for n in known)]), own.u, own.blocks, rng)
     size = {n: (theta[base + i], low[base + i], high[base + i]) for i, n in enumerate(known)}
     all_, below, above = _intervals(X, own.u, own.blocks, rng)
     named = []
     for i, (name, share, rival) in enumerate(out):
         with_, without = (least(X[:, :k], own.u) for k in (base + 1 + i, base + i))
-        a, b = np.std(other.u - Y[:, : base + i] @ without), np.std(other.u - Y[:, : base + 1 + i] @ with_)
+        before, after = other.u - Y[:, : base + i] @ without, other.u - Y[:, : base + 1 + i] @ with_
+        a, b = np.std(before), np.std(after)
         value, least_, most = size.get(name, (all_[base + i], below[base + i], above[base + i]))
-        named.append(Named(name, float(value), float(least_), float(most), share, rival, float(a), float(b)))
-    return named, theta
+        gain = _removed(before - before.mean(), after - after.mean(), other.blocks)
+        named.append(Named(name, float(value), float(least_), float(most), share, rival, float(a), float(b), gain))
+    return named, theta, {n: why for n, why in impossible.items() if n not in chosen}
+
+
+def _removed(before: np.ndarray, after: np.ndarray, blocks: np.ndarray) -> tuple[float, float]:
+    """90 % interval of the share of the squared residual `before` [m] that is gone in `after`, by a bootstrap over
+    stretches of neighbouring blocks."""
+    was = np.bincount(blocks, before**2)
+    less = was - np.bincount(blocks, after**2)
+    share = less[intervals.stretches(len(was), STRETCH, 0, DRAWS)].sum(1) / max(float(was.sum()), 1e-300)
+    return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))
 
 
 def _effect(name: str) -> str:

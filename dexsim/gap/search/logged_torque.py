@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+from scipy.ndimage import median_filter
 
+from dexsim import intervals
 from dexsim.gap.effects import ByTorque
 from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.catalogue import EFFECTS
@@ -216,17 +218,23 @@ def hand_on(
 
 def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
     """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly
-    in part: their closed loop speaks of an unknown controller, and no effect of the joint is looked for in it. Said in
-    `notes`."""
+    in part, or surely pushes the other way: their closed loop speaks of an unknown controller, and no effect of the
+    joint is looked for in it. Said in `notes`.
+
+    A line through the law and the torque fits well where one is the other's mirror image, too; but no gain of the
+    believed law is negative, and the torque's own sign is borne out by its friction, which resists."""
     told = {case.joint for case, _, _ in given if case.told}
-    out = {x.joint for x in stages if x.joint in told and x.fit < 1 - TORQUE.much}
+    out = set()
     for x in stages:
-        if x.joint in out:
-            notes.append(
-                f"{x.joint}: the believed law of its drive gives {100 * max(x.fit, 0.0):.0f} % of the torque that was "
-                "logged: its controller is another, "
-                "and only the torque is judged"
-            )
+        against = x.slope_high < 0
+        if x.joint not in told or not (against or x.fit < 1 - TORQUE.much):
+            continue
+        out.add(x.joint)
+        gives = "the opposite" if against else f"{100 * max(x.fit, 0.0):.0f} %"
+        notes.append(
+            f"{x.joint}: the believed law of its drive gives {gives} of the torque that was logged: its controller is "
+            "another, and only the torque is judged"
+        )
     return out
 
 
@@ -282,6 +290,8 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
                     "held_out": {
                         "before": n.before,
                         "after": n.after,
+                        "removed_low": round(n.removed[0], 4),
+                        "removed_high": round(n.removed[1], 4),
                         "error": f"effort_rmse_{'N' if case.scales.slide else 'Nm'}",
                     },
                 }
@@ -299,18 +309,20 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
 # missed. Where nothing agrees, the torque is no witness of this body at all.
 
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
-AROUND = 0.2  # s over which it is measured how much a joint shakes
+AROUND = 0.2  # s over which it is measured how much a joint shakes, and how hard it is pushed
+CREST = 0.8  # of the largest push: what is as strong is its crest
+DRAWS = 200  # of a bootstrap
 
 
 @dataclass
 class Push:
-    """Of one joint: torque [N.m, N for a slide], the largest from outside (positive along positive motion); its quiet
-    residual as noise; spans by recording [s]; left: share of the torque's variance that a plain fit leaves; clear:
+    """Of one joint: torque [N.m, N for a slide], the largest from outside (positive along positive motion); interval
+    (90 %) of its size; spans by recording [s]; left: share of the torque's variance that a plain fit leaves; clear:
     whether the rest fits."""
 
     joint: str
     torque: float
-    noise: float
+    interval: tuple[float, float]
     left: float
     clear: bool
     slide: bool
@@ -319,7 +331,7 @@ class Push:
 
     def finding(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
-        half, unit = 3.0 * self.noise, "N" if self.slide else "N.m"
+        unit = "N" if self.slide else "N.m"
         count = sum(map(len, self.spans.values()))
         said = (
             f"in {count} stretch{'es' * (count != 1)} of time, {'forwards' if self.torque > 0 else 'backwards'} at "
@@ -344,8 +356,8 @@ class Push:
             "parameters": {
                 "torque": {
                     "value": abs(self.torque),
-                    "low": max(abs(self.torque) - half, 0.0),
-                    "high": abs(self.torque) + half,
+                    "low": self.interval[0],
+                    "high": self.interval[1],
                     "unit": unit,
                 }
             },
@@ -431,9 +443,9 @@ def _swing(x: np.ndarray, step: float) -> np.ndarray:
 
 def _of_joint(
     pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], float, float, float, bool] | None:
-    """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest
-    fits); None where little is left.
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], float, tuple[float, float], float, bool] | None:
+    """([(times, pushed) of each piece], largest push, the interval of its size, share left by a plain fit, whether the
+    rest fits); None where little is left.
 
     Fitted while the joint moves: at rest its dry friction carries any torque up to its level, and only what is beyond
     that speaks."""
@@ -464,10 +476,48 @@ def _of_joint(
     share = float(np.mean(np.concatenate(pushed)))
     if fits and share == 0 or not fits and not _slow(u - A @ x, block):
         return None  # nothing stands out, or noise does
-    top = max((float(r[np.argmax(np.abs(r))]) for r in residual if len(r)), key=abs)
     times = [np.concatenate([q.motion.t[q.keep] - q.motion.t[0] for q in p.pieces]) for p in pieces]
+    _, quiet_block = np.unique(block[on], return_inverse=True)
+    grams, sides = sums(A[on], u[on], quiet_block, int(quiet_block.max()) + 1)
+    weight = intervals.weights(len(grams), rng, DRAWS)
+    drawn = solved(np.einsum("db,bkl->dkl", weight, grams), weight @ sides)
+    top, interval = _size(times, residual, pushed, X, drawn - x, noise)
     # what the motor gives less, something else gives
-    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < TORQUE.most
+    return list(zip(times, pushed, strict=True)), -top, interval, left, fits and share < TORQUE.most
+
+
+def _size(
+    times: Sequence[np.ndarray],
+    residual: Sequence[np.ndarray],
+    pushed: Sequence[np.ndarray],
+    X: Sequence[np.ndarray],
+    off: np.ndarray,
+    noise: float,
+) -> tuple[float, tuple[float, float]]:
+    """(the largest push, interval of its size): of the crest of the strongest stretch, where medians over `AROUND` are
+    within `CREST` of the largest. One sample is no size: the largest of many is the noise's. The interval holds nine
+    tenths of those medians and what their mean moves by with the fit's own figures. off [draws, K]: by which the
+    figures of the fit differ when its blocks are drawn anew; noise: of one sample."""
+    best: tuple[float, int, np.ndarray, np.ndarray] | None = None
+    anywhere = any(on.any() for on in pushed)
+    for k, (t, r, on) in enumerate(zip(times, residual, pushed, strict=True)):
+        if not len(r):
+            continue
+        count = max(int(AROUND / max(float(np.median(np.diff(t))), 1e-6)), 1) if len(t) > 1 else 1
+        smooth = median_filter(r, count, mode="nearest")
+        edge = np.flatnonzero(np.diff(np.r_[0, (on if anywhere else np.ones(len(r), bool)).astype(int), 0]))
+        for a, b in zip(edge[::2], edge[1::2], strict=True):
+            peak = float(smooth[a:b][np.argmax(np.abs(smooth[a:b]))])
+            if best is None or abs(peak) > abs(best[0]):
+                best = peak, k, smooth[a:b], np.arange(a, b)
+    assert best is not None  # one piece has samples
+    peak, k, smooth, rows = best
+    crest = smooth * np.sign(peak) >= CREST * abs(peak)
+    size = float(np.mean(smooth[crest] * np.sign(peak)))
+    moves = 1.645 * float(np.std((X[k][rows[crest]] @ off.T).mean(0)))
+    low, high = np.quantile(smooth[crest] * np.sign(peak), [0.05, 0.95])
+    low, high = (size - np.hypot(size - low, moves) - noise, size + np.hypot(high - size, moves) + noise)
+    return float(np.sign(peak) * size), (max(float(low), 0.0), float(high))
 
 
 def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from dexsim.gap.effects import Fit, PadFacts, word
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.inquiry import PadCurve
+from dexsim.gap.judge.held_out import gain_interval
 from dexsim.gap.read import spans
 from dexsim.gap.rules import JUDGE, SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, contact, readings
@@ -71,7 +72,7 @@ class PadAnswer:
         search, best, effect = self.search, self.best, TOUCH_EFFECTS[e]
         stage = _stage(search, e)
         less = search.without(best, e) if len(best.ids) > 1 else self.none
-        b, a = held_out(search, less, stage)[0], held_out(search, best, stage)[0]
+        (b, without, blocks), (a, with_it, _) = (held_out(search, x, stage) for x in (less, best))
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= JUDGE.level][:2]
         judged = np.isfinite(a)  # what nothing held out shows is doubted
@@ -82,6 +83,7 @@ class PadAnswer:
             )
             return None
         taxels, parameters = self._parameters(e)
+        gain = gain_interval(without, with_it, 0.5 * blocks)
         return {
             "effect": e,
             "confidence": round(float(min(share * earned, JUDGE.surest)), 3),
@@ -92,7 +94,7 @@ class PadAnswer:
             "regime": effect.shows,
             "when": when(e, search, best),
             "parameters": parameters,
-            "held_out": {"before": b, "after": a},
+            "held_out": {"before": b, "after": a, "removed_low": round(gain[0], 4), "removed_high": round(gain[1], 4)},
         }
 
     def facts(self) -> PadFacts:
