@@ -198,7 +198,8 @@ class Held:
             "acceleration": np.full(count, 1.0),
             "position": np.tile(np.sin(np.linspace(0, 40, n)), len(saturated)),
         }
-        self.plant = type("P", (), {"rows": staticmethod(lambda i: slice(i * n, (i + 1) * n))})()
+        times = {"t": np.tile(np.arange(n) / 100, len(saturated)), "run_of": np.repeat(np.arange(len(saturated)), n)}
+        self.plant = type("P", (), times | {"rows": staticmethod(lambda i: slice(i * n, (i + 1) * n))})()
         self.runs = [
             type("R", (), {"t": np.arange(n) / 100, "duration": T, "name": f"r{i}"})() for i in range(len(saturated))
         ]
@@ -226,8 +227,36 @@ def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
     case = Held([(0, 0), (0, 0), (1.0, 9.0)])
     parts = held_out.split(case.runs, [2], [0, 1, 2], [case])
     assert parts.test == [2] and "saturation of a" in parts.not_judged
+    inside = parts.apart["a"]
+    # with the half second before and after it, in which a free run is on its way back
+    assert np.flatnonzero(inside)[[0, -1]].tolist() == [2000 + 50, 2000 + 949] and inside.sum() == 900
     both = Held([(0, 0), (2.0, 4.0), (1.0, 9.0)])
-    assert not held_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
+    shown = held_out.split(both.runs, [2], [0, 1, 2], [both])
+    assert not shown.not_judged and not shown.apart
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "found", "word"),
+    [
+        (1.1, 1.1, [], "none"),
+        (4.0, 1.1, [("backlash", 0.9)], "explained"),
+        (4.0, 2.0, [("backlash", 0.9)], "partly_explained"),
+        (4.0, 4.0, [], "unknown"),
+    ],
+)
+def test_what_no_fitted_recording_shows_makes_no_verdict_unknown(before, after, found, word):
+    """The error away from it decides then, and the sentence says what is not judged."""
+    names = [told(effect, confidence) for effect, confidence in found]
+    near = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after, "how": "near"}
+    given = empty()["held_out"] | {"not_judged": ["saturation of a"]}
+    d = SimpleNamespace(
+        data=empty() | {"findings": names, "noise_floor": {"position_rad": 1.0}, "held_out": given},
+        judged=Judged({**near, "before": 90.0, "before_low": 80.0, "after": 88.0, "how": "all"}, shown=(near, False)),
+        touch=None, sentence="", mechanism=None, joints={},
+    )  # fmt: skip
+    conclude.decide(d)
+    assert d.data["verdict"] == word and "Not judged: saturation of a" in d.sentence
+    assert d.data["held_out"]["before"] == (90.0 if word == "unknown" else before)
 
 
 def test_ends_of_all_recordings_where_there_are_few():

@@ -150,7 +150,7 @@ class Drives(Steps):
     def kept(self) -> Kept:
         """What every joint is judged by."""
         p = self.parts
-        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test)
+        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test, p.apart)
 
     # -- read
     # ------------------------------------------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ def into_diagnosis(
     # that says nothing of what is wrong with the reading of the effort alone
     held_out.unneeded([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
-    d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers))
+    d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers), noise)
 
 
 def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
@@ -232,16 +232,30 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
 
 
 def _judged(
-    answers: Sequence[JointAnswer], kept: Kept, refuted: set[str], how: str, seed: int, quiet: bool
+    answers: Sequence[JointAnswer],
+    kept: Kept,
+    refuted: set[str],
+    how: str,
+    seed: int,
+    quiet: bool,
+    noise: Noise,
 ) -> Judged:
     """Errors over all joints on what was held out."""
-    times = [a.t for a in answers]
-    before = held_out.rms_interval([a.before for a in answers], times, seed)
-    after = held_out.rms_interval(
-        [x.before if x.case.joint in refuted else x.after for x in answers], times, seed
-    )
     slide, names = all(x.case.constants.slide for x in answers), [kept.runs[i].name for i in kept.test]
-    position = _error("position_rmse_m" if slide else "position_rmse_rad", before, after, names, how)
+
+    def position(on: Sequence[np.ndarray], how: str) -> dict[str, Any]:
+        times = [x.t[k] for x, k in zip(answers, on, strict=True)]
+        before = [x.before[k] for x, k in zip(answers, on, strict=True)]
+        after = [(x.before if x.case.joint in refuted else x.after)[k] for x, k in zip(answers, on, strict=True)]
+        both = (held_out.rms_interval(squares, times, seed) for squares in (before, after))
+        return _error("position_rmse_m" if slide else "position_rmse_rad", *both, names, how)
+
+    all_of_it, on = [np.ones(len(x.t), bool) for x in answers], [x.shown for x in answers]
+    shown = None
+    if len(answers) and 0.5 < np.mean(np.concatenate(on)) < 1.0:  # most of it, but not all
+        floors = [JUDGE.within * noise.joints[x.case.joint] for x in answers]
+        still = all(rms(x.before[k]) <= f for x, k, f in zip(answers, on, floors, strict=True))
+        shown = position(on, f"{how}; without the regimes that are not judged"), still
     parts = [
         [x for x in xs if x is not None]
         for xs in ([x.effort_before for x in answers], [x.effort_after for x in answers])
@@ -253,7 +267,7 @@ def _judged(
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    return Judged(position, effort, None, structured, quiet)
+    return Judged(position(all_of_it, how), effort, None, structured, quiet, shown)
 
 
 def _error(
@@ -457,7 +471,17 @@ def decide(d: Diagnosis) -> None:
         data["held_out"] = error | beside
         data["unexplained"]["fraction_of_gap"] = _left_of_gap(d, error)
     if word != "unusable":
-        d.sentence = sentence(data, d, _floor(d))
+        d.sentence = sentence(data, d, _floor(d)) + _unjudged(data, d.judged)
+
+
+def _unjudged(data: dict[str, Any], by: Judged | None) -> str:
+    """Which regimes only what was held out visits, where they are left out of the verdict or may be why it is
+    unknown."""
+    regimes = data["held_out"].get("not_judged")
+    left_out = by is not None and by.shown is not None and data["held_out"]["how"] == by.shown[0]["how"]
+    if not regimes or not (left_out or data["verdict"] == "unknown"):
+        return ""
+    return f" Not judged: {', '.join(regimes)}; what was held out visits it and no recording that is fitted does."
 
 
 def _floor(d: Diagnosis) -> float:
@@ -479,6 +503,11 @@ def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> 
             return "explained", by.effort
     p, of_motion = by.position, [f for f in findings if not _by_torque(f)]
     word = held_out.verdict(of_motion, floor, p["before"], p["before_low"], p["after"], by.structured, by.quiet)
+    if word == "unknown" and by.shown is not None:  # what no fitted recording shows cannot be known: it is not judged
+        q, quiet = by.shown
+        told = held_out.verdict(of_motion, floor, q["before"], q["before_low"], q["after"], by.structured, quiet)
+        if told != "unknown":
+            word, p = told, q
     if word == "none":
         _whispered(named)
     return word, p

@@ -3,7 +3,7 @@ verdict by them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +29,7 @@ from dexsim.gap.rules import JUDGE, SEARCH
 @dataclass
 class Split:
     """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
-    not_judged: regimes that only what is held out visits."""
+    not_judged: regimes that only what is held out visits; apart: by joint the measured rows [n] bool in and near them."""
 
     train: list[int]
     test: list[int]
@@ -37,6 +37,7 @@ class Split:
     span_test: dict[int, tuple[float, float]] | None
     how: str
     not_judged: list[str] = field(default_factory=list)
+    apart: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def regimes(cases: Sequence[Case]) -> dict[str, np.ndarray]:
@@ -85,6 +86,7 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
         train = [i for i in range(len(runs)) if i not in held]
         out = Split(train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held))
         out.not_judged = _alone(names, time, held, train)
+        out.apart = _near(cases, out.not_judged)
         return out
     chosen = _condition(runs, group, time)
     if chosen is None:
@@ -96,7 +98,8 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
     train = [i for i in range(len(runs)) if i not in test]
     how = "one condition, " + ", ".join(runs[i].name for i in test)
     ends = _ends(runs, train, test, time, regimes(cases), cases[0].plant)
-    out = Split(train, test, None, None, how, _alone(names, time, test, train))
+    alone = _alone(names, time, test, train)
+    out = Split(train, test, None, None, how, alone, _near(cases, alone))
     if ends:
         whole = {i: (0.0, runs[i].duration + 1.0) for i in (*train, *test)}
         out.span_train = whole | {i: (0.0, at) for i, at in ends.items()}
@@ -171,6 +174,23 @@ def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: S
     here, there = time[:, list(test)].sum(1), time[:, list(train)].sum(1)
     alone = (here > JUDGE.visited) & (there < JUDGE.visited)
     return [name for name, so in zip(names, alone, strict=True) if so]
+
+
+def _near(cases: Sequence[Case], names: Collection[str]) -> dict[str, np.ndarray]:
+    """By joint its measured rows [n] bool that are in one of the regimes `names` or within a block of one: a free run
+    that a limit has thrown off takes a while to come back. Joints without any are left out."""
+    out: dict[str, np.ndarray] = {}
+    for c in cases:
+        inside = [on for name, on in regimes([c]).items() if name in names]
+        if not inside:
+            continue
+        # runs lie behind each other, further apart than a block
+        at = c.plant.t + 1e4 * c.plant.run_of
+        visits_at = at[np.any(inside, 0)]
+        next_one = np.searchsorted(visits_at, at)
+        away = [np.abs(at - visits_at[np.clip(next_one + k, 0, len(visits_at) - 1)]) for k in (-1, 0)]
+        out[c.joint] = np.minimum(*away) <= BLOCK
+    return out
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------

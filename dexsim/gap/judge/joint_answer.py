@@ -4,7 +4,7 @@ its residual lives, how much a delay varies."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,13 +32,14 @@ MUTE = "moments of what was held out are followed neither with it nor without; t
 @dataclass
 class Kept:
     """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept
-    out."""
+    out; apart: `held_out.Split.apart`."""
 
     runs: list[Run]
     train: list[int]
     test: list[int]
     span_train: dict[int, tuple[float, float]] | None
     span_test: dict[int, tuple[float, float]] | None
+    apart: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class JointAnswer:
@@ -111,6 +112,12 @@ class JointAnswer:
         """Errors before and after (rms) where what was held out can speak of what was found (`held_out.telling`)."""
         on = held_out.telling(self.before, self.after, self.t, self.case.sigma)
         return rms(self.before[on]), rms(self.after[on])
+
+    @property
+    def shown(self) -> np.ndarray:
+        """(rows,) bool: samples away from what no fitted recording visits."""
+        apart = self.kept.apart.get(self.case.joint)
+        return np.ones(len(self.rows), bool) if apart is None else ~apart[self.rows]
 
     def mae(self) -> dict[str, tuple[float, float]]:
         """Mean |error| before and after by recording; one that was cut is several runs."""
