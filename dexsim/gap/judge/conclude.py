@@ -247,8 +247,8 @@ def _judged(
         times = [x.t[k] for x, k in zip(answers, on, strict=True)]
         before = [x.before[k] for x, k in zip(answers, on, strict=True)]
         after = [(x.before if x.case.joint in refuted else x.after)[k] for x, k in zip(answers, on, strict=True)]
-        both = (held_out.rms_interval(squares, times, seed) for squares in (before, after))
-        return _error("position_rmse_m" if slide else "position_rmse_rad", *both, names, how)
+        was, left = (held_out.rms_interval(squares, times, seed) for squares in (before, after))
+        return _error("position_rmse_m" if slide else "position_rmse_rad", was, left, names, how)
 
     all_of_it, on = [np.ones(len(x.t), bool) for x in answers], [x.shown for x in answers]
     shown = None

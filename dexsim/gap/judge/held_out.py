@@ -29,7 +29,8 @@ from dexsim.gap.rules import JUDGE, SEARCH
 @dataclass
 class Split:
     """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
-    not_judged: regimes that only what is held out visits; apart: by joint the measured rows [n] bool in and near them."""
+    not_judged: regimes that only what is held out visits; apart: by joint the measured rows [n] bool in and near
+    them."""
 
     train: list[int]
     test: list[int]
