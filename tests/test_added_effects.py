@@ -438,7 +438,8 @@ class Drives:  # of 400 worlds
 
 left, judge = [], Steps.judge
 def judged(self):
-    case, search, outcome = self.outcomes[0]
+    x = self.searched[0]
+    case, search, outcome = x.case, x.search, x.outcome
     for trial in (outcome.none, outcome.best):
         torque, on = residual_torque(case, self.w.runs, search.polish(trial), 0)
         left.append(float(np.sqrt(np.mean(torque[on] ** 2))))

@@ -39,9 +39,9 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
 """Parts of dexsim from the ground up. A part imports itself and lower floors only."""
 NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
 """What a part does not import though it stands lower."""
-STEPS = ("read", "locate", "plant", "search", "judge", "report")
-"""The steps of a diagnosis, each a part of `dexsim.gap` (and of `dexsim.gap.touch` what it has of them): what is
-measured goes down them, so that none imports from a later one."""
+STEPS = ("read", "plant", "search", "locate", "judge", "report")
+"""The steps of a diagnosis in the order in which `gap.inquiry.Steps` takes them, each a part of `dexsim.gap` (and of
+`dexsim.gap.touch` what it has of them): what is measured goes down them, so that none imports from a later one."""
 CIRCLES: dict[frozenset[str], str] = {}
 """Circles of files that are allowed, each with its reason. None is."""
 WARP = re.compile(r"@wp\.(kernel|func|func_native|struct)\b|wp\.kernel\(")

@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.search.inverse_dynamics import identify
-from dexsim.gap.search.logged_torque import believe
+from dexsim.gap.search.logged_torque import IdentifiedJoint, believe
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):
@@ -74,7 +74,7 @@ def test_unknown_friction_is_believed_as_the_torque_tells_it():
 
     x = identify(*carriage())
     open_, known = case("viscous_friction", "coulomb_friction", "kd"), case("kd")
-    assert len(believe([(open_, x, []), (known, x, [])])) == 1
+    assert len(believe([IdentifiedJoint(open_, x, []), IdentifiedJoint(known, x, [])])) == 1
     assert open_.told and open_.unknown == ("kd",) and not known.told and not known.ranges
     for name, true in (("viscous_friction", 200), ("coulomb_friction", 20), ("friction_asymmetry", -0.3)):
         assert open_.plant.nominal[:, INDEX[name]] == pytest.approx([true, true], rel=0.02)

@@ -32,7 +32,7 @@ from dexsim.gap.search import search as selecting
 from dexsim.gap.search import shaking
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, thin
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, SearchedJoint
 from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
 
@@ -609,8 +609,8 @@ def test_a_stand_in_is_offered_where_much_is_left():
     for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
         d = SimpleNamespace(joints={"j": {"after": left}}, data={"findings": []}, standins=[], notes=[])
         parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
-        drives = SimpleNamespace(outcomes=[(SimpleNamespace(joint="j"), SimpleNamespace(polish=lambda t: t),
-                                            SimpleNamespace(best=None, none=None))],
+        search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(best=None, none=None)
+        drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
                                  w=SimpleNamespace(runs=[], limit=TimeLimit(),
                                                    settings=SimpleNamespace(seed=0)))  # fmt: skip

@@ -16,6 +16,7 @@ from dexsim.gap.read.stage_tests import Stage
 from dexsim.gap.rules import BELIEF, JUDGE
 from dexsim.gap.search import baseline, inverse_dynamics, logged_torque
 from dexsim.gap.search.inverse_dynamics import WEIGHT, Columns, least
+from dexsim.gap.search.logged_torque import IdentifiedJoint
 
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 STEP, BLOCKS, A_BLOCK = 0.01, 80, 50
@@ -164,7 +165,7 @@ def test_a_push_is_a_hint_where_the_rest_does_not_fit():
 
 
 def test_a_loop_tells_of_the_joint_where_its_law_is_right_in_the_main():
-    given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
+    given = [IdentifiedJoint(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, [])]
     for fit, tells in ((0.75, True), (0.65, False)):
         unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
         assert (unknown == set()) is tells, fit
@@ -270,7 +271,7 @@ def test_a_torque_that_fits_nothing_is_no_witness():
         scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=1.0)
         case = SimpleNamespace(joint="j", unknown=("coulomb_friction",), scales=scales, ranges={}, factors={},
                                told=False, plant=SimpleNamespace(nominal=np.zeros((1, len(INDEX)))))  # fmt: skip
-        logged_torque.believe([(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
+        logged_torque.believe([IdentifiedJoint(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
         assert case.told is told, left
 
 
@@ -298,7 +299,8 @@ def told(after: float) -> float:
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logged_torque, "intervals_of", lambda *_: [])
-        (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n], full={}), ["a"])], ["j"], [], [])
+        given = [IdentifiedJoint(case, SimpleNamespace(named=[n], full={}), ["a"])]
+        (finding,) = logged_torque.findings(given, ["j"], [], [])
     return finding["confidence"]
 
 
@@ -317,7 +319,7 @@ def test_what_the_torque_names_is_a_part_of_the_answer():
         finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": {"error": "effort_rmse_Nm"}}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(conclude, "sentence", lambda *_: "")
-            by_torque = [(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
+            by_torque = [IdentifiedJoint(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
             conclude.add_behind(SimpleNamespace(data=data), [finding], by_torque)
         assert data["verdict"] == word, left
 
@@ -328,7 +330,8 @@ def fitted_from_torque(samples=1000, seconds=10.0) -> bool:
     run = SimpleNamespace(name="a", t=0.01 * np.arange(samples))
     of = SimpleNamespace(u=np.zeros(samples), seconds=seconds, loaded=False)
     with pytest.MonkeyPatch.context() as patch:
-        for name, answer in (("readable", True), ("moved", ("motion", "body")), ("columns_of", of), ("solve", "fit")):
+        stretch = inverse_dynamics.Stretch("motion", "body")
+        for name, answer in (("readable", True), ("moved", stretch), ("columns_of", of), ("solve", "fit")):
             patch.setattr(logged_torque, name, lambda *_, answer=answer: answer)
         patch.setattr(inverse_dynamics, "highest", lambda t: 10.0)
         return logged_torque.identify_joints([case], [run], [0], [], None) != []
@@ -341,7 +344,7 @@ def test_gravity_that_matters_is_fitted():
         one = np.ones_like(m.u)
         m.u[:] = one
         b = inverse_dynamics.Body(share * one, share * one, 0 * one, one)
-        assert inverse_dynamics.columns_of([(m, b)], 0).loaded is fitted, share
+        assert inverse_dynamics.columns_of([inverse_dynamics.Stretch(m, b)], 0).loaded is fitted, share
 
 
 def test_a_torque_is_fitted_where_enough_was_logged():

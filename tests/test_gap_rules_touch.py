@@ -62,7 +62,7 @@ def test_a_pad_must_be_touched_for_a_while():
         touch.pads = [Pad(1, [SimpleNamespace(recording="a", name="index", t=t, z=np.ones((len(t), 4)))])]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("dexsim.gap.touch.diagnosis.PadSearch", lambda *_: "search")
-            touch.model()
+            touch.plant()
         assert (touch.pads[0].search == "search") is judged_, seconds
 
 

@@ -223,17 +223,18 @@ class Steps(ABC):
         """What of the recordings tells of this part alone, as arrays."""
 
     @abstractmethod
-    def model(self) -> None:
+    def plant(self) -> None:
         """The plant that simulates it along the recordings, what is held out of the fit, and the noise."""
 
     @abstractmethod
     def search(self) -> None:
-        """Which effects it has: scan, fit, select on conditions left out."""
+        """Which effects it has: scan, fit, select on conditions left out, and what of that stands on what was held out
+        of the fit."""
 
     @abstractmethod
     def locate(self) -> None:
         """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the
-        recordings."""
+        recordings. After the search, which refits them: it also says where what was found leaves something."""
 
     @abstractmethod
     def judge(self) -> None:
@@ -245,7 +246,7 @@ class Steps(ABC):
 
     def run(self) -> None:
         """All steps up to the judgement, in order."""
-        for step in (self.read, self.model, self.search, self.locate, self.judge):
+        for step in (self.read, self.plant, self.search, self.locate, self.judge):
             step()
 
 

@@ -374,7 +374,7 @@ def _weight(f: dict, rings: dict[str, float]) -> float:
     return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
 
 
-def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
+def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[logged_torque.IdentifiedJoint]) -> None:
     """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
     that is left on the recording held out, where the loop's own error shows nothing."""
     if not findings:
@@ -384,15 +384,15 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
     taken = {(f["effect"], *f["where"]["joints"]) for f in shown}
     data["findings"] += [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
     if not shown:
-        judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in findings)]
+        judged = [x for x in by_torque if any(x.case.joint in f["where"]["joints"] for f in findings)]
         # not what the catalogue has no name for
-        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]
+        last = [next(n for n in reversed(x.inverse.named) if n.effect) for x in judged]
         b, a = (
             float(np.sqrt(sum(y**2 for y in ys)))
-            for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last])
+            for ys in ([x.inverse.named[0].before for x in judged], [n.after for n in last])
         )
         data["held_out"] = {
-            "recordings": judged[0][1],
+            "recordings": judged[0].judges,
             "error": findings[0]["held_out"]["error"],
             "before": b,
             "after": a,

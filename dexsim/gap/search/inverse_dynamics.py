@@ -140,6 +140,16 @@ def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: M
     return Body(torque, back(pull), back(across), inertia)
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """A recorded motion with what the model's body asks for along it (None: it has none), and the span [s from its
+    start] that is used, None for all."""
+
+    motion: Motion
+    body: Body | None
+    span: tuple[float, float] | None = None
+
+
 @dataclass
 class Piece:
     """One recording at its full rate: q, v, load (the body's torque) [n] and which samples are kept."""
@@ -185,28 +195,31 @@ class Columns:
         return out | ({"inertia": out["inertia"] + self.inertia} if "inertia" in out else {"inertia": self.inertia})
 
 
-def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
-    """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed;
-    loaded: whether gravity's factors are among the columns, by default where it matters in these recordings."""
+def columns_of(given: Sequence[Stretch], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
+    """Of joint j; given: of each recording; efficiency: of the drive, believed; loaded: whether gravity's factors are
+    among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
-    bodies = [(m, b) for m, b, *_ in given if b is not None]
+    bodies = [(x.motion, x.body) for x in given if x.body is not None]
     inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b in bodies]))) if bodies else 0.0
     if loaded is None:
         weights = [np.abs(b.gravity[:, j]).max() / max(np.abs(m.u[:, j]).max(), 1e-12) for m, b in bodies]
         loaded = bool(max(weights, default=0.0) > BELIEF.tolerance)
-    for m, b, *rest in given:
+    for x in given:
+        m, b = x.motion, x.body
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
         load = np.zeros_like(q) if b is None else b.torque[:, j]
         keep = np.zeros(len(q), bool)
         keep[m.edge : len(q) - m.edge : max(int(1.0 / (PER_CUTOFF * m.cutoff * m.step)), 1)] = True
-        if rest and rest[0] is not None:
-            keep &= (m.t - m.t[0] >= rest[0][0]) & (m.t - m.t[0] <= rest[0][1])
+        if x.span is not None:
+            keep &= (m.t - m.t[0] >= x.span[0]) & (m.t - m.t[0] <= x.span[1])
         columns = [m.a[:, j], v, m.smooth(np.sign(v)), np.ones(len(v))]
-        columns += [b.gravity[:, j], b.across[:, j]] if loaded else []
+        if loaded:
+            assert b is not None  # gravity pulls at a body
+            columns += [b.gravity[:, j], b.across[:, j]]
         rise = np.gradient(m.a[:, j] if b is None else load / inertia, m.step)
         block = at + ((m.t - m.t[0]) / BLOCK).astype(int)
         at = int(block.max()) + 1
-        parts.append(tuple(x[keep] for x in (np.stack(columns, 1), torque - load, v, rise, torque, block)))
+        parts.append(tuple(c[keep] for c in (np.stack(columns, 1), torque - load, v, rise, torque, block)))
         pieces.append(Piece(m, q, v, load, keep))
     X, u, v, rise, torque, block = (np.concatenate(x) for x in zip(*parts, strict=True))
     q = np.concatenate([p.q[p.keep] for p in pieces])
@@ -233,10 +246,11 @@ def readable(run: Run, j: int) -> bool:
     return 1 / np.median(np.diff(run.t)) >= 0.97 * RATE
 
 
-def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> tuple[Motion, Body]:
+def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> Stretch:
+    """A run's motion beside the model's body."""
     assert run.torque is not None  # as `readable` has looked
     m = motion(run.t, run.q, np.nan_to_num(run.torque), cutoff)
-    return m, body(model, run.gravity, run.joints, m)
+    return Stretch(m, body(model, run.gravity, run.joints, m))
 
 
 def sums(X: np.ndarray, u: np.ndarray, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -345,7 +359,7 @@ def identify(
             motion(x[0], x[1][:, None], x[2][:, None], cutoff)
             for x in ((t, q, torque), *([] if test is None else [test]))
         ]
-        made = [columns_of([(m, None)], 0) for m in given]
+        made = [columns_of([Stretch(m, None)], 0) for m in given]
         return made[0], made[-1]
 
     return solve(at, highest(t), seed)

@@ -4,7 +4,7 @@ was found on whole recordings, and intervals."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -743,4 +743,13 @@ class JointSearch(JointSelection):
         return np.stack([np.maximum(laws[:, 0] - half, low), np.minimum(laws[:, 1] + half, high)], 1)
 
 
-__all__ = ["JointSearch", "Member", "Outcome", "Trial", "subset"]
+@dataclass(frozen=True)
+class SearchedJoint:
+    """A joint after its search: its case as it was searched, the search, and what it ended with."""
+
+    case: Case
+    search: JointSearch
+    outcome: Outcome
+
+
+__all__ = ["JointSearch", "Member", "Outcome", "SearchedJoint", "Trial", "subset"]

@@ -86,7 +86,7 @@ class Touch(Steps):
             self.result.notes += self.data.notes
         self.pads = [Pad(k, [r for r in self.data.runs if r.pad == k]) for k in self.data.pads()]
 
-    def model(self) -> None:
+    def plant(self) -> None:
         """The plant of each pad beside its readings, and what of them is held out."""
         for pad in self.pads:
             runs = pad.runs
