@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
+from dexsim.gap.effects.friction import LoadFriction, ViscousFriction
+from dexsim.gap.effects.signals import Lag
 from dexsim.gap.judge import conclude
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.stage_tests import Stage
@@ -236,7 +238,7 @@ def test_a_weight_is_believed_where_the_torque_cannot_tell():
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
     """Whether friction that differs by direction is named, of this column, beside a constant torque."""
     own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {})
-    name = inverse_dynamics.BY_DIRECTION
+    name = ViscousFriction.by_torque
     found, _ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
     return [n.text for n in found] == [name]
 
@@ -262,7 +264,7 @@ def test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps():
 def test_a_torque_that_acts_far_later_is_no_lag():
     """A radian of 5 Hz is 32 ms."""
     for late, is_lag in ((0.03, True), (0.035, False)):
-        assert inverse_dynamics._sensible(inverse_dynamics.LAG, 2.0 * late, {"inertia": 2.0}) is is_lag, late
+        assert inverse_dynamics._sensible(Lag.by_torque, 2.0 * late, {"inertia": 2.0}) is is_lag, late
 
 
 def test_a_torque_that_fits_nothing_is_no_witness():
@@ -293,7 +295,7 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
 
 def told(after: float) -> float:
     """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held out."""
-    n = SimpleNamespace(effect=inverse_dynamics.LOAD, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
+    n = SimpleNamespace(effect=LoadFriction.id, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
                         after=after, rival=None, text="friction that grows with the load")  # fmt: skip
     case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip

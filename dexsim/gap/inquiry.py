@@ -18,6 +18,7 @@ from dexsim.errors import UserError
 from dexsim.gap import locate
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import PadFacts
+from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.judge import confidence, full_model, handed_on
 from dexsim.gap.read import Run, channels, inputs
 from dexsim.gap.search.search import Outcome
@@ -301,7 +302,8 @@ def to_runs(w: Inquiry) -> None:
             w.held.append(len(w.runs))
         w.runs.append(run)
     readable = w.readable
-    w.channel = inputs.channel_findings(readable, w.m.joints)
+    sensors = {e.id: e.experiment for e in CATALOGUE if e.effort_only}
+    w.channel = inputs.channel_findings(readable, w.m.joints, sensors)
     w.notes += [
         f"{r.path.name}: {f.text}"
         for r in readable

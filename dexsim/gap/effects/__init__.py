@@ -8,7 +8,7 @@ Of an effect that training has no use for the columns stand in `dexsim.gap.plant
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from dexsim.actuator.table import ServoTable
     from dexsim.gap.plant.case import Case
+    from dexsim.gap.search.inverse_dynamics import Columns
     from dexsim.gap.touch.read import PadRun
     from dexsim.gap.touch.search import PadSearch, TouchTrial
 
@@ -213,6 +214,8 @@ class Effect:
     jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
     by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
+    # whether that column names it; else it only keeps others from taking its trace for their own
+    named_by_torque: ClassVar[bool] = True
     # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
     approximated: ClassVar[tuple[str, ...]] = ()
 
@@ -231,6 +234,16 @@ class Effect:
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         """Parameters by the keys of `diagnosis.json`, with 90 % intervals."""
         raise NotImplementedError
+
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        """What it adds to the torque per unit of its coefficient, as columns [m] of what inverse dynamics filtered; by
+        `by_torque`, behind it in brackets what else its law was given. own: what is fitted."""
+        return {}
+
+    @property
+    def shows_by_torque(self) -> str:
+        """The regime of what logged torque names."""
+        return self.shows
 
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         """The same where logged torque showed it and not the motion: for those of `search.inverse_dynamics`."""

@@ -18,6 +18,7 @@ from dexsim.gap.inquiry import Diagnosis, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
+from dexsim.gap.read import wrong_signal
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, shaking
@@ -520,7 +521,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
     named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
-    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    bad = [f for f in data["findings"] if wrong_signal(f)]
     prefix = _first_of_all(data["findings"], bad, d)
     if data["verdict"] == "none":
         return (

@@ -24,7 +24,7 @@ import numpy as np
 from scipy import signal
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.read import Run
+from dexsim.gap.read import WRONG_SIGNAL, Run
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
@@ -52,9 +52,9 @@ Spans = list[tuple[float, float]]  # s
 def finding(
     kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9
 ) -> dict[str, Any]:
-    """A finding bad_channel as `diagnosis.json` has it."""
+    """A finding that a signal is not what it says, as `diagnosis.json` has it."""
     return {
-        "effect": "bad_channel",
+        "effect": WRONG_SIGNAL,
         "confidence": confidence,
         "alternatives": [],
         "indistinguishable": [],

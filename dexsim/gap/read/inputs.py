@@ -14,15 +14,14 @@ from scipy.interpolate import PchipInterpolator
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap.effects.signals import CurrentSensor
-from dexsim.gap.read import Run
+from dexsim.gap.read import WRONG_SIGNAL, Run
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import COMMANDS_FIX, DUTY, STATES, Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
-BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
+WRONG = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
 SHORTEST = 0.5  # s: what a recording must last to be read
 
 
@@ -316,12 +315,15 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
     return runs
 
 
-def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list[dict[str, Any]]:
-    """Findings of signals that are not what they say, as `diagnosis.json` has them (effect bad_channel)."""
+def channel_findings(
+    recordings: list[Recording], joints: Sequence[str], sensors: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Findings of signals that are not what they say, as `diagnosis.json` has them. sensors: ids of the effects that
+    make the same of an effort's sign, each with the experiment that shows it."""
     out: dict[tuple, dict[str, Any]] = {}
     for r in recordings:
         for f in r.findings:
-            if f.kind not in BAD_CHANNEL or f.severity != "error":
+            if f.kind not in WRONG or f.severity != "error":
                 continue
             # dry friction may hold it: `channels.inspect` tells beside the others
             if f.kind == "stuck" and f.text.startswith("position"):
@@ -331,11 +333,11 @@ def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list
             entry = out.setdefault(
                 key,
                 {
-                    "effect": "bad_channel",
+                    "effect": WRONG_SIGNAL,
                     "confidence": 0.9,
                     "alternatives": [],
-                    "indistinguishable": ["bad_channel", CurrentSensor.id] if sensor else [],
-                    "separating_experiment": CurrentSensor.experiment if sensor else None,
+                    "indistinguishable": [WRONG_SIGNAL, *sensors] if sensor else [],
+                    "separating_experiment": next(iter(sensors.values()), None) if sensor else None,
                     "where": {
                         "joints": [f.joint] if f.joint in joints else [],
                         "taxels": [],

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import mujoco
 import numpy as np
@@ -22,8 +21,6 @@ from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE
-from dexsim.gap.effects.friction import LoadFriction, StribeckFriction, ViscousFriction
-from dexsim.gap.effects.signals import Lag
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
@@ -292,13 +289,10 @@ def unphysical(d: Columns) -> dict[str, str]:
 DRAWS = 300  # of a bootstrap
 QUARTERS = 4  # of a recording, each left out in turn
 EFFECT = {e.by_torque: e for e in CATALOGUE if e.by_torque}
-BY_DIRECTION, LAG, STRIBECK = ViscousFriction.by_torque, Lag.by_torque, StribeckFriction.by_torque
-LOAD = LoadFriction.by_torque
-# laws that the catalogue has no effect for
-SQUARE = "friction with the square of the speed"
-GIVES = "dry friction that gives way before it slides"
-DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # of the whole motion: over which it may give way (P. Dahl 1968)
-SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck's excess may be down to 1/e
+SQUARE = "friction with the square of the speed"  # a law that the catalogue has no effect for
+FIRST = ("viscous_friction", SQUARE, "lag", "load_friction", "stribeck_friction")
+"""The order of the further effects, by id: of two that are the best to add in as many bootstraps, the first is the
+rival. One that is not named here comes after, in the catalogue's order."""
 
 
 @dataclass
@@ -463,8 +457,8 @@ def _name(
 
 
 def _effect(name: str) -> str:
-    kind = _kind(name)
-    return EFFECT[kind].id if kind in EFFECT else ""
+    e = EFFECT.get(_kind(name))
+    return e.id if e is not None and e.named_by_torque else ""
 
 
 def _kind(name: str) -> str:
@@ -472,10 +466,8 @@ def _kind(name: str) -> str:
 
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Whether a coefficient can be what it is called; what gives way is friction that is there."""
+    """Whether a coefficient can be what it is called."""
     kind = _kind(name)
-    if kind == GIVES:
-        return 0 < c < 2 * theta.get("coulomb_friction", 0.0)
     return kind not in EFFECT or EFFECT[kind].possible_by_torque(c, theta, LEAST)
 
 
@@ -491,40 +483,8 @@ def _intervals(
 
 
 def _further(own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
-    """One more effect each, as a column of what was filtered."""
-    top, span = float(np.abs(own.v).max()), own.span
-    out: dict[str, Callable[[Columns], np.ndarray]] = {
-        BY_DIRECTION: lambda d: np.abs(d.v),
-        SQUARE: lambda d: d.v * np.abs(d.v),
-        LAG: lambda d: d.rise,
-    }
-    if own.loaded:
-        out[LOAD] = lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))
-    for part in SPEEDS:
-        out[f"{STRIBECK} (v_s {part * top:.3g})"] = partial(_stribeck, speed=part * top)
-    for part in DISTANCES:
-        out[f"{GIVES} (over {part * span:.2g})"] = partial(_gives, way=part * span)
-    return out
-
-
-def _stribeck(d: Columns, speed: float) -> np.ndarray:
-    """Dry friction that falls with speed [rad/s], exp(-(v / speed)^2)."""
-    return d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / speed) ** 2)))
-
-
-def _gives(d: Columns, way: float) -> np.ndarray:
-    """Dry friction that is taken up over a way [rad], less what is there at once."""
-    return d.column(lambda q, v, load: _taken_up(q, way) - np.sign(v))
-
-
-def _taken_up(q: np.ndarray, distance: float) -> np.ndarray:
-    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
-    exactly."""
-    z, out = 0.0, np.empty(len(q))
-    steps = np.diff(q, prepend=q[0])
-    keep = np.exp(-np.abs(steps) / distance)
-    for i, (step, k) in enumerate(zip(steps, keep, strict=True)):
-        way = 1.0 if step > 0 else -1.0
-        z = way + (z - way) * k
-        out[i] = z
-    return out
+    """One more effect each, as a column of what was filtered, by its law (`_kind`) and what it was given."""
+    by: dict[str, dict[str, Callable[[Columns], np.ndarray]]] = {e.id: e.torque_columns(own) for e in CATALOGUE}
+    by[SQUARE] = {SQUARE: lambda d: d.v * np.abs(d.v)}
+    order = sorted(by, key=lambda e: FIRST.index(e) if e in FIRST else len(FIRST))
+    return {name: column for e in order for name, column in by[e].items()}

@@ -19,7 +19,6 @@ from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
-    BY_DIRECTION,
     NAMES,
     PER_CUTOFF,
     Columns,
@@ -291,7 +290,7 @@ def findings(
                     "indistinguishable": list(effect.alike_by_torque),
                     "separating_experiment": effect.experiment if effect.alike_by_torque else None,
                     "where": {"joints": [case.joint], "taxels": [], "topics": []},
-                    "regime": effect.shows + ("; differs by direction" if n.text == BY_DIRECTION else ""),
+                    "regime": effect.shows_by_torque,
                     "when": intervals_of(active, case, runs, train),
                     "parameters": parameters,
                     "held_out": {

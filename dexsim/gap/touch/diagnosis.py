@@ -21,6 +21,7 @@ from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.conclude import sentence
 from dexsim.gap.judge.held_out import rms_interval
+from dexsim.gap.read import wrong_signal
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer
@@ -235,8 +236,8 @@ def _beside(d: Diagnosis, felt: TouchResult) -> None:
         return
     data = d.data
     joints = data["verdict"]
-    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
-    rest = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    bad = [f for f in data["findings"] if wrong_signal(f)]
+    rest = [f for f in data["findings"] if not wrong_signal(f)]
     data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
     data["nuisance"] |= felt.nuisance
     if felt.floor is not None:
