@@ -20,7 +20,7 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
-from dexsim.gap.effects.catalogue import CATALOGUE
+from dexsim.gap.effects.catalogue import BY_TORQUE
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
@@ -288,11 +288,8 @@ def unphysical(d: Columns) -> dict[str, str]:
 
 DRAWS = 300  # of a bootstrap
 QUARTERS = 4  # of a recording, each left out in turn
-EFFECT = {e.by_torque: e for e in CATALOGUE if e.by_torque}
+EFFECT = {e.by_torque: e for e in BY_TORQUE}
 SQUARE = "friction with the square of the speed"  # a law that the catalogue has no effect for
-FIRST = ("viscous_friction", SQUARE, "lag", "load_friction", "stribeck_friction")
-"""The order of the further effects, by id: of two that are the best to add in as many bootstraps, the first is the
-rival. One that is not named here comes after, in the catalogue's order."""
 
 
 @dataclass
@@ -484,7 +481,6 @@ def _intervals(
 
 def _further(own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
     """One more effect each, as a column of what was filtered, by its law (`_kind`) and what it was given."""
-    by: dict[str, dict[str, Callable[[Columns], np.ndarray]]] = {e.id: e.torque_columns(own) for e in CATALOGUE}
-    by[SQUARE] = {SQUARE: lambda d: d.v * np.abs(d.v)}
-    order = sorted(by, key=lambda e: FIRST.index(e) if e in FIRST else len(FIRST))
-    return {name: column for e in order for name, column in by[e].items()}
+    laws = [e.torque_columns(own) for e in BY_TORQUE]
+    laws.insert(1, {SQUARE: lambda d: d.v * np.abs(d.v)})  # beside the other friction that grows with speed
+    return {name: column for law in laws for name, column in law.items()}
