@@ -16,7 +16,7 @@ import yaml
 from dexsim import outputs, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY, NAMES
 from dexsim.actuator.kernel import EXTENDED, FRESH
-from dexsim.actuator.laws import encoder_error
+from dexsim.actuator.laws import encoder_error, encoder_line
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
@@ -70,7 +70,7 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel
             j = c - 1
             memory, fresh = remembered(w, j, first_memory, state)
             error = encoder(params[w, j], qpos[w, q_index[j]], memory, fresh)
-            value = params[w, j, SCALE] * qpos[w, q_index[j]] + params[w, j, OFFSET]
+            value = encoder_line(qpos[w, q_index[j]], params[w, j, SCALE], params[w, j, OFFSET])
             value += error[0] + error[1]
         elif c > joints and c <= 2 * joints:
             j = c - 1 - joints
