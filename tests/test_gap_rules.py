@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import test_gap_rules_belief
+import test_gap_rules_signal
 import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
@@ -1029,7 +1030,8 @@ def test_a_belief_without_a_trace_is_not_refitted():
     assert [p.key for p in search.nuisances] == ["kp"]
 
 
-TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | vars(test_gap_rules_belief) | globals()
+FILES = (test_gap_rules_touch, test_gap_rules_torque, test_gap_rules_belief, test_gap_rules_signal)
+TESTS = {k: v for file in FILES for k, v in vars(file).items()} | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():
