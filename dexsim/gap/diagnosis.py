@@ -37,7 +37,7 @@ from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next, rival_of
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, logged_torque, shaking
+from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
 from dexsim.gap.touch.diagnosis import Touch
 
@@ -331,7 +331,7 @@ class Drives(Steps):
         if self.w.limit.seconds is not None and case.moved:
             search.plain()  # what all else is held against has its time before anything else
         if case.moved and case.joint not in self.unknown_controllers:
-            found = shaking.answered(search, search.run())
+            found = ringing.answered(search, search.run())
         else:
             found = search.without_search()
         search.settle(found)
@@ -435,24 +435,24 @@ class Drives(Steps):
         several = list(left.values())
         by = compute.each(len(left), lambda i: None if w.limit.left() <= 0 else self._dragger(*several[i]))
         pulled = {k: case for k, case in zip(left, by, strict=True) if case is not None}
-        self._other_ends(answers, self._search_with(answers, pulled))
+        self._search_draggers(answers, self._search_with(answers, pulled))
 
-    def _other_ends(self, answers: Answers, dragged: Sequence[int]) -> None:
+    def _search_draggers(self, answers: Answers, dragged: Sequence[int]) -> None:
         """The joints that drag those of `dragged`, numbers of `answers`, searched once more with what hangs on them: a
         linkage pulls at both its ends, and what is not asked for at the second looks like a friction or a weight of its
         own."""
         number = {search.case.joint: k for k, (search, _) in enumerate(answers)}
-        ends: dict[int, Case] = {}
+        draggers: dict[int, Case] = {}
         for k in dragged:
             search, found = answers[k]
             assert found is not None  # of `_search_with`
             for other in (m.variant.note["from_joint"] for m in found.best.members if m.effect.couples):
                 i = number.get(other)
-                if i is None or i in ends or (mine := answers[i][1]) is None or not mine.best.members:
+                if i is None or i in draggers or (mine := answers[i][1]) is None or not mine.best.members:
                     continue
                 if search.case.joint not in answers[i][0].case.scales.others:
-                    ends[i] = dragged_by(self.cases[i], [self.cases[k]])
-        self._search_with(answers, ends)
+                    draggers[i] = dragged_by(self.cases[i], [self.cases[k]])
+        self._search_with(answers, draggers)
 
     def _search_with(self, answers: Answers, cases: dict[int, Case]) -> list[int]:
         """The joints `cases`, by their number in `answers`, searched once more as these cases have them; `answers` is

@@ -54,6 +54,14 @@ class SearchRules:
         "planted sizes are off by 0.6 to 1.3 % in the median",
         "test_intervals_hold_what_no_residual_shows",
     )
+    imitates: float = _rule(
+        0.08,
+        "relative, of its loss: what a hypothesis must do better that can imitate simpler ones, as an eccentricity "
+        "whose zero is anywhere imitates a zero error",
+        "above two of what nothing is trusted finer than (`apart`); at 0.2 an eccentric encoder of another plant was "
+        "taken for a zero error",
+        "test_what_can_imitate_another_effect_must_do_better",
+    )
     bounded: float = _rule(
         1.5,
         "x its loss: what a hypothesis counts for whose size stopped at the end of what is physical",

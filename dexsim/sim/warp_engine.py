@@ -18,7 +18,7 @@ from dexsim.sim import contact
 from dexsim.sim import solver as newton
 from dexsim.sim.begin import Begin
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
-from dexsim.sim.warmup import compile_together
+from dexsim.sim.warmup import compile_side_by_side
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 _STREAMS: dict[int, wp.Stream] = {}
@@ -115,7 +115,7 @@ class WarpEngine(Engine):
         self._fields_t = {k: wp.to_torch(v) for k, v in self._fields.items()}
         self._graphs: dict = {}
         self._eager_done: set = set()
-        compile_together(self._one_step, device)
+        compile_side_by_side(self._one_step, device)
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:

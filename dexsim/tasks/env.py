@@ -34,7 +34,7 @@ from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.memory import give_back
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
-from dexsim.sim.warmup import compile_together
+from dexsim.sim.warmup import compile_side_by_side
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
@@ -184,7 +184,7 @@ class HandEnv(VecEnv):
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
-        compile_together(self._name_kernels, device)
+        compile_side_by_side(self._name_kernels, device)
         self.reset_all()
 
     def _check_rewards(self) -> None:
@@ -288,7 +288,7 @@ class HandEnv(VecEnv):
 
     def _before(self) -> None:
         self.act(self._action_in)
-        with self._drawn_together("orders"):
+        with self._drawn_ahead("orders"):
             self.before_physics()
         self._nan_dump.before()
 
@@ -320,9 +320,9 @@ class HandEnv(VecEnv):
         return rates, reward
 
     @contextmanager
-    def _drawn_together(self, name: str) -> Iterator[None]:
+    def _drawn_ahead(self, name: str) -> Iterator[None]:
         """On a GPU, all random numbers of a part of the step at once; evaluation draws as ever, whatever the device."""
-        with self.sampler.together(name) if self.graphs and self.draws_together else nullcontext():
+        with self.sampler.drawn_ahead(name) if self.graphs and self.draws_ahead else nullcontext():
             yield
 
     def _reset_done(self) -> None:
@@ -379,7 +379,7 @@ class HandEnv(VecEnv):
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
-        with self._drawn_together("episodes"):
+        with self._drawn_ahead("episodes"):
             self.begin_episodes(mask)
         self.engine.refresh()
         self._clear_touch(mask)
@@ -391,7 +391,7 @@ class HandEnv(VecEnv):
 
     def _observe_all(self) -> None:
         self._blind.zero_()
-        with self._drawn_together("observations"):
+        with self._drawn_ahead("observations"):
             observed = self.observe(advance=True)
         for row, (group, value) in enumerate(observed.items(), 1):
             if group not in self.obs:
@@ -429,7 +429,7 @@ class HandEnv(VecEnv):
         return [*own, object_kernel.write_kernel(real), servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
-        """For `compile_together`, which asks of a launch only which kernel it is of."""
+        """For `compile_side_by_side`, which asks of a launch only which kernel it is of."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)
 
@@ -505,7 +505,7 @@ class HandEnv(VecEnv):
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
         self.graphs, self.keep_final_obs = True, False
-        self.draws_together = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
+        self.draws_ahead = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
         # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step.
         # (The random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
         self.skip_idle_resets = self.engine.kind == "mujoco"

@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim.gap.effects import ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
+from dexsim.gap.rules import SEARCH
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -163,7 +164,7 @@ class PositionScale(Effect):
                     params,
                     ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)),
                     "eccentricity, its zero elsewhere",
-                    dear=0.08,
+                    complexity_price=SEARCH.imitates,
                 )
             )
         return out

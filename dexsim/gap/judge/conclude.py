@@ -21,7 +21,7 @@ from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rm
 from dexsim.gap.read import wrong_signal
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, logged_torque, shaking
+from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
@@ -161,7 +161,7 @@ def _rings(a: JointAnswer) -> float:
     where the error there is lower with it anyway."""
     if _less(a.numbers["after"], a.numbers["before"]):
         return 0.0
-    return shaking.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
+    return ringing.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
 
 
 def _take_back(

@@ -161,7 +161,7 @@ class JointSelection(JointScan):
                     with self._fix(members):
                         fits.append(self.fitter.fit(params, x0=np.array([fitted[p.key] for p in params]), iterations=8))
                 new = self.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
-                mine, theirs = (self._left(t).sum() * self._dear(t) for t in (current, new))
+                mine, theirs = (self._left(t).sum() * self._price_factor(t) for t in (current, new))
                 if (1 - SEARCH.least) * theirs < mine and not self._shrunk(new):
                     self.fitted[frozenset(new.ids)] = new
                     return new
@@ -562,7 +562,8 @@ class JointSelection(JointScan):
                 if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
                     self.cross(trial)
                     others.append(trial)
-            table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
+            priced = [self._left(t) * self._price_factor(t) for t in others]
+            table = np.stack([mine * self._price_factor(current), *priced, lost])
             drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
             shares = intervals.wins(table, drawn, SEARCH.apart)
             rows = [
