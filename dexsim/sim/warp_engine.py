@@ -181,22 +181,15 @@ class WarpEngine(Engine):
     def _outputs(self) -> None:
         d = self.d
         if self.pairs:
+            now = contact.Contacts()
+            for name in ("geom", "worldid", "frame", "dim", "friction", "efc_address"):
+                setattr(now, name, getattr(d.contact, name))
+            now.nacon, now.efc_force, now.njmax = d.nacon, d.efc.force, d.njmax
+            now.pyramidal = int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
             wp.launch(
                 contact.add_contacts,
                 dim=d.naconmax,
-                inputs=[
-                    d.nacon,
-                    d.contact.geom,
-                    d.contact.worldid,
-                    d.contact.frame,
-                    d.contact.dim,
-                    d.contact.friction,
-                    d.contact.efc_address,
-                    d.efc.force,
-                    d.njmax,
-                    int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
-                    self._table,
-                ],
+                inputs=[now, self._table],
                 outputs=[self._normal_sum, self._force_sum],
             )
             wp.launch(

@@ -314,9 +314,13 @@ class HandEnv(VecEnv):
         ended = torch.stack(list(ends.values())) if ends else self.nan[None][:0]
         rates = torch.empty(len(ends) + 2, self.num_envs, device=self.device)
         count = self.nan_count.view(1)
-        given = (self._episode_length, self._length_limit.view(1), self._blind[0], ended, reward, self.nan, self._wrong)
-        args = (*given, count, self.reward, self.done, self.time_out, rates)
-        wp.launch(state_kernels.judge, dim=self.num_envs, inputs=[*map(wp.from_torch, args)], device=self.device)
+        given = filled(
+            state_kernels.Ends, episode_length=self._episode_length, limit=self._length_limit.view(1),
+            blind=self._blind[0], ends=ended,
+        )  # fmt: skip
+        out = filled(state_kernels.Ended, total=self.reward, done=self.done, time_out=self.time_out, rates=rates)
+        inputs = [given, *map(wp.from_torch, (reward, self.nan, self._wrong, count)), out]
+        wp.launch(state_kernels.judge, dim=self.num_envs, inputs=inputs, device=self.device)
         return rates, reward
 
     @contextmanager
@@ -355,17 +359,11 @@ class HandEnv(VecEnv):
         """Turn actions [N, J] into targets. `relative`: the target moves by action * scale a step, held within the
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
         the joint's range."""
-        act = self.task["action"]
-        wp.launch(
-            state_kernels.act,
-            dim=actions.shape,
-            inputs=[
-                wp.from_torch(actions.to(torch.float32)), act["mode"] == "relative", act.get("scale", 0.0),
-                act.get("lead", 0.0),
-                *self._act_args,
-            ],
-            device=self.device,
-        )  # fmt: skip
+        act, reach = self.task["action"], self._reach
+        reach.relative, reach.scale = act["mode"] == "relative", act.get("scale", 0.0)
+        reach.lead = act.get("lead", 0.0)
+        inputs = [wp.from_torch(actions.to(torch.float32)), reach, *self._act_args]
+        wp.launch(state_kernels.act, dim=actions.shape, inputs=inputs, device=self.device)
         if self.reality is None:
             self.servo.send(self.target)
         else:
@@ -530,8 +528,11 @@ class HandEnv(VecEnv):
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
             state.xmat, at, seen,
         ]  # fmt: skip
-        own = (self.q, self.q_low, self.q_high, self.q_mid, self.q_half, self.action, self.last_action, self.target)
-        self._act_args = [wp.from_torch(x) for x in own]
+        self._reach = filled(
+            state_kernels.Reach, relative=False, scale=0.0, lead=0.0, low=self.q_low, high=self.q_high,
+            middle=self.q_mid, half=self.q_half,
+        )  # fmt: skip
+        self._act_args = [wp.from_torch(x) for x in (self.q, self.action, self.last_action, self.target)]
         touch = self.touch
         self._touch_args = [
             at.tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
