@@ -476,6 +476,24 @@ class TouchRules:
         "back",
         "test_the_gain_of_a_taxel_is_believed_to_be_one",
     )
+    touched: float = _rule(
+        0.15,
+        "N of a taxel, at least, while something is touched: a joint that moves then is not judged",
+        "above a count of 0.1 N, by which a taxel may flicker at rest",
+        "test_a_little_force_is_no_touch",
+    )
+    loaded: float = _rule(
+        0.3,
+        "N of a load cell, at least, while something is touched, where no taxels are recorded",
+        "fifteen times the 20 mN of a cell's noise, for its zero may drift by more than it",
+        "test_a_little_force_is_no_touch",
+    )
+    neighbours: int = _rule(
+        3,
+        "of a taxel that never changes: as many must feel the touch for it to be dead",
+        "at the edge of a touch one or two of the taxels beside a sound one feel it",
+        "test_neighbours_of_a_dead_taxel_feel_the_touch",
+    )
     spread: float = _rule(
         0.15,
         "share that may pass to the taxels beside because pressure spreads by another law than the plant's: neighbours "

@@ -204,6 +204,7 @@ class JointSelection(JointScan):
                 followed[member.id] = drafts[-1][2].loss
             self._on(0.03)
         drafts.sort(key=lambda d: d[2].loss)
+        # how many are looked at: two, and others that may still win when they are fitted on long windows
         return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
 
     def _finished(
@@ -680,6 +681,7 @@ class JointSearch(JointSelection):
                 )
             )
             f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
+        # a fit that is no better than rounding, or that long windows speak against, is left as it was
         if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
             with self._fix(trial.members):
                 again = self.fitter.fit(params, x0=f.x, iterations=0)
