@@ -149,7 +149,7 @@ class Mapped(PadSearch):
     def _swaps(self, values):
         return None
 
-    def _common(self, current, evaluations):
+    def _common(self, effect, current, evaluations):
         return self.fit((*current.ids, "tactile_gain"), {})
 
 

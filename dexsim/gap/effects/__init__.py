@@ -48,6 +48,12 @@ class PadFacts:
     slid: bool = False
     judged: bool = True
 
+    def believed(self, setting: str) -> float | None:
+        """What was believed of a setting of the whole world (`PadSettings.shared`), None where this pad cannot say."""
+        told = {"object.friction": (self.friction, self.slid), "contact.stiffness": (self.stiffness, True)}
+        value, known = told[setting]
+        return value if self.judged and known else None
+
 
 @dataclass
 class PadSettings:

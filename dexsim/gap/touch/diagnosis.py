@@ -354,10 +354,8 @@ def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Se
 
 def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
     """One range for all fingertips: every fit, and what was believed of a fingertip that was judged and follows it."""
-    if name == "object.friction":
-        believed = [x.friction for pad, x in facts.items() if x.judged and x.slid and pad not in by_pad]
-    else:
-        believed = [x.stiffness for pad, x in facts.items() if x.judged and pad not in by_pad]
+    others = [x.believed(name) for pad, x in facts.items() if pad not in by_pad]
+    believed = [x for x in others if x is not None]
     value, low, high = (np.array(x) for x in zip(*by_pad.values(), strict=True))
     return float(value.mean()), float(min([*low, *believed])), float(max([*high, *believed]))
 
