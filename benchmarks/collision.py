@@ -161,8 +161,8 @@ class Run:
             try:
                 env = make_env(cfg, cfg["worlds"], self.device, 0, "warp")
             except Exception as error:  # the other figures do not need it
-                self.out["compile_together"] = f"{type(error).__name__}: {error}"
-                warp_engine.compile_together = lambda program, device: 0
+                self.out["compile_side_by_side"] = f"{type(error).__name__}: {error}"
+                warp_engine.compile_side_by_side = lambda program, device: 0
                 env = make_env(cfg, cfg["worlds"], self.device, 0, "warp")
             self.envs[setting] = env
             made = time.perf_counter()
@@ -327,7 +327,7 @@ class Run:
                 for k, v in kept.items():
                     setattr(newton, k, v)
 
-        warp_engine.compile_together(launch_all, self.device)
+        warp_engine.compile_side_by_side(launch_all, self.device)
 
     def peers(self) -> dict:
         """Milliseconds of a control step of each (the best of two turns), and over dexsim's full step."""

@@ -91,12 +91,12 @@ def as_on_a_gpu(env: Any) -> Iterator[None]:
     """Choose what a GPU would be given, where the code asks."""
     multiply, to_matrix = rotation.multiply, rotation.to_matrix
     rotation.multiply, rotation.to_matrix = rotation._multiply_in_few, rotation._to_matrix_in_few
-    env.draws_together, before = True, env.draws_together
+    env.draws_ahead, before = True, env.draws_ahead
     try:
         yield
     finally:
         rotation.multiply, rotation.to_matrix = multiply, to_matrix
-        env.draws_together = before
+        env.draws_ahead = before
 
 
 def count(env: Any, actions: torch.Tensor) -> dict[str, Counter[str]]:

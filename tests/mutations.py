@@ -278,7 +278,7 @@ MUTATIONS = (
         "dexsim/gap/judge/conclude.py",
         "(p.joint in d.ringing or _followed(d, p.joint))",
         "_followed(d, p.joint)",
-        "tests/test_gap_shaking.py::test_what_is_followed_to_the_noise_is_not_pushed",
+        "tests/test_gap_ringing.py::test_what_is_followed_to_the_noise_is_not_pushed",
     ),
     Mutation(
         "a joint that rings as white as noise is noisy, whatever its torque does",

@@ -438,7 +438,8 @@ class Drives:  # of 400 worlds
 
 left, judge = [], Steps.judge
 def judged(self):
-    case, search, outcome = self.outcomes[0]
+    x = self.searched[0]
+    case, search, outcome = x.case, x.search, x.outcome
     for trial in (outcome.none, outcome.best):
         torque, on = residual_torque(case, self.w.runs, search.polish(trial), 0)
         left.append(float(np.sqrt(np.mean(torque[on] ** 2))))
@@ -470,7 +471,7 @@ import numpy as np, torch, warp as wp
 from test_servo import StubEngine
 from dexsim.actuator import Servo
 from dexsim.actuator.table import ServoTable
-from dexsim.recording.tap import copy_kernel
+from dexsim.recording.tap import copy_kernel, tap
 
 engine = StubEngine(1, 3, wp.float64)
 servo = Servo(engine, ["j0", "j1", "j2"], ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "belt": 0.1}}}))
@@ -480,9 +481,8 @@ first = servo.position()[0].tolist()  # nothing is remembered yet
 servo.state[:, :, servo.slots["fresh"]] = 0.0
 rows = wp.zeros((1, 1, 10), dtype=wp.float64)
 index = lambda *x: wp.array(x, dtype=int)
-wp.launch(copy_kernel(wp.float64, servo.features), dim=(1, 7), inputs=[index(0), index(7, 8, 9), index(6, 7, 8), 0,
-    engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params, servo._state, servo.first_memory,
-    index(0), rows])
+copy, kind = copy_kernel(wp.float64, servo.features)
+wp.launch(copy, dim=(1, 7), inputs=[index(0), tap(kind, engine, servo, [7, 8, 9], [6, 7, 8], 0), index(0), rows])
 shown = servo.position()
 print(json.dumps([shown[0].tolist(), servo.velocity()[0].tolist(), rows.numpy()[0, 0, 1:7].tolist(),
                   servo.unmeasured(shown)[0].tolist(), first]))

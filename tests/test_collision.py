@@ -398,7 +398,7 @@ def test_all_kernels_of_a_step_are_listed_for_compiling_together(grasping):
     e._one_step()
     used = {kernel.module for kernel, _ in _launched(e._one_step)}
     assert used and used <= {module for module, _ in warmup.listed(e._one_step)}
-    assert warmup.compile_together(e._one_step, "cpu") == 0
+    assert warmup.compile_side_by_side(e._one_step, "cpu") == 0
 
 
 def _launched(program) -> list:

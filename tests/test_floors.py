@@ -39,9 +39,9 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
 """Parts of dexsim from the ground up. A part imports itself and lower floors only."""
 NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
 """What a part does not import though it stands lower."""
-STEPS = ("read", "locate", "plant", "search", "judge", "report")
-"""The steps of a diagnosis, each a part of `dexsim.gap` (and of `dexsim.gap.touch` what it has of them): what is
-measured goes down them, so that none imports from a later one."""
+STEPS = ("read", "plant", "search", "locate", "judge", "report")
+"""The steps of a diagnosis in the order in which `gap.inquiry.Steps` takes them, each a part of `dexsim.gap` (and of
+`dexsim.gap.touch` what it has of them): what is measured goes down them, so that none imports from a later one."""
 CIRCLES: dict[frozenset[str], str] = {}
 """Circles of files that are allowed, each with its reason. None is."""
 WARP = re.compile(r"@wp\.(kernel|func|func_native|struct)\b|wp\.kernel\(")
@@ -148,11 +148,22 @@ def step(module: str) -> tuple[str, int] | None:
     return (room, STEPS.index(name)) if module.startswith("dexsim.gap.") and name in STEPS else None
 
 
+def reached(graph: dict[str, set[str]], module: str) -> set[str]:
+    """All modules that one imports, itself or by what it imports."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        new = graph.get(waiting.pop(), set()) - found
+        found |= new
+        waiting += new
+    return found
+
+
 def later(graph: dict[str, set[str]]) -> list[str]:
-    """Imports of a step of the diagnosis from a later one of the same room."""
+    """Imports of a step of the diagnosis from a later one of the same room, by way of others too."""
     wrong = []
-    for module, others in graph.items():
-        for other in others:
+    for module in graph:
+        for other in reached(graph, module):
             mine, theirs = step(module), step(other)
             if mine and theirs and mine[0] == theirs[0] and theirs[1] > mine[1]:
                 wrong.append(f"{module} imports {other}")
@@ -167,6 +178,8 @@ def test_no_step_of_the_diagnosis_imports_from_a_later_one(graph):
     assert later({"dexsim.gap.search.fit": {"dexsim.gap.judge.held_out", "dexsim.gap.plant.case"}}) == [
         "dexsim.gap.search.fit imports dexsim.gap.judge.held_out"
     ]
+    by_way = {"dexsim.gap.read.inputs": {"dexsim.gap.effects"}, "dexsim.gap.effects": {"dexsim.gap.plant.columns"}}
+    assert later(by_way) == ["dexsim.gap.read.inputs imports dexsim.gap.plant.columns"]
 
 
 def test_no_circles_of_files(graph):

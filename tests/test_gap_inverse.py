@@ -10,9 +10,9 @@ import pytest
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.effects import ByTorque
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.search import inverse_dynamics
+from dexsim.gap.effects.friction import ViscousFriction
 from dexsim.gap.search.inverse_dynamics import identify
-from dexsim.gap.search.logged_torque import believe
+from dexsim.gap.search.logged_torque import IdentifiedJoint, believe
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):
@@ -66,7 +66,7 @@ def test_no_direction_has_a_negative_friction():
     assert abs(named.value) <= wide.full["viscous_friction"] and not wide.refused
     beyond = identify(*carriage(-280.0), test=carriage(-280.0, 1))  # pushes along backwards: no friction does
     assert "viscous_friction" not in {n.effect for n in beyond.named}
-    assert "neither direction's can be negative" in beyond.refused[inverse_dynamics.BY_DIRECTION]
+    assert "neither direction's can be negative" in beyond.refused[ViscousFriction.by_torque]
     effect, joint = EFFECTS["viscous_friction"], {"viscous_friction": 60.0}
     assert effect.possible_by_torque(-59.0, joint, 5.0) and not effect.possible_by_torque(61.0, joint, 5.0)
     assert not effect.possible_by_torque(1.0, {}, 5.0)  # beside none on the whole
@@ -93,7 +93,7 @@ def test_unknown_friction_is_believed_as_the_torque_tells_it():
 
     x = identify(*carriage())
     open_, known = case("viscous_friction", "coulomb_friction", "kd"), case("kd")
-    assert len(believe([(open_, x, []), (known, x, [])])) == 1
+    assert len(believe([IdentifiedJoint(open_, x, []), IdentifiedJoint(known, x, [])])) == 1
     assert open_.told and open_.unknown == ("kd",) and not known.told and not known.ranges
     for name, true in (("viscous_friction", 200), ("coulomb_friction", 20), ("friction_asymmetry", -0.3)):
         assert open_.plant.nominal[:, INDEX[name]] == pytest.approx([true, true], rel=0.02)

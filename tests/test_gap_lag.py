@@ -15,7 +15,7 @@ from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import JointConstants, build
 from dexsim.gap.plant.columns import INDEX, NEUTRAL, SERIES, SERIES_INDEX
 from dexsim.gap.read import conditions
-from dexsim.gap.search import shaking
+from dexsim.gap.search import ringing
 from dexsim.gap.search.hypotheses import Member, Outcome, Trial
 from dexsim.gap.search.search import JointSearch
 
@@ -106,13 +106,13 @@ def swinging() -> tuple[JointSearch, Outcome]:
 
 def test_a_loop_that_swings_between_its_limits_is_told_by_the_law_of_its_lag(swinging):
     search, nothing = swinging
-    assert shaking.Shaking(search, nothing.none).loud.sum() > 2
-    found = shaking.answered(search, nothing)
+    assert ringing.Ringing(search, nothing.none).loud.sum() > 2
+    found = ringing.answered(search, nothing)
     (member,) = found.best.members
     at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
     assert member.id == "lag" and ("lag_stages", 2.0) in member.variant.fixed
     assert at["lag.time_constant"] == pytest.approx(LATE["lag"], rel=0.3)
-    assert shaking.shown(search, found, [2], None)
+    assert ringing.shown(search, found, [2], None)
 
 
 def test_training_gets_the_first_order_with_the_same_mean_delay_and_is_told(swinging):

@@ -12,7 +12,7 @@ from dexsim.gap.inquiry import Inquiry, Settings
 from dexsim.gap.judge import full_model
 from dexsim.gap.plant.case import build
 from dexsim.gap.search import baseline
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, SearchedJoint
 from dexsim.gap.touch.diagnosis import SEARCHING, Touch
 from tests.test_gap import model, plant_run
 
@@ -138,7 +138,7 @@ def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
     drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None)
     drives.noise = SimpleNamespace(floor=1.0)
     search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=None, best=None)
-    drives.outcomes = [(SimpleNamespace(joint=j), search, outcome) for j in "abc"]
+    drives.searched = [SearchedJoint(SimpleNamespace(joint=j), search, outcome) for j in "abc"]
     joints = {j: {"after": 1e3} for j in "abc"}
     d = SimpleNamespace(joints=joints, data={"findings": []}, standins=[], notes=[])
     clock[0] = 100 * spent
@@ -187,7 +187,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
         limit=limit, runs=[], settings=settings, m=None, readable=[], clock=SimpleNamespace(lap=lambda _: None)
     )
     drives.parts = SimpleNamespace(test=[1], span_test=None)
-    drives.outcomes, drives.noise = [], SimpleNamespace(floor=1.0)
+    drives.searched, drives.noise = [], SimpleNamespace(floor=1.0)
     drives._hypotheses = lambda d: []
     clock[0] = seconds * spent
     drives.confirm(SimpleNamespace(notes=[]))

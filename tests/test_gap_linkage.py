@@ -219,9 +219,9 @@ def test_the_other_end_of_a_linkage_is_asked_for_it():
     drives._search_with = lambda answers, cases: asked.append(cases)
     found = [outcome("f"), None, outcome("f", "d", "z"), outcome(), outcome("f", "b"), outcome()]
     answers = [(SimpleNamespace(case=c), x) for c, x in zip(drives.cases, found, strict=True)]
-    drives._other_ends(answers, [0, 2, 4])
+    drives._search_draggers(answers, [0, 2, 4])
     (ends,) = asked
     assert list(ends) == [5] and ends[5].scales.others == ("a", "b", "c", "e")
     answers[5] = answers[5][0], SimpleNamespace(best=SimpleNamespace(members=()))  # nothing there to be explained
-    drives._other_ends(answers, [4])
+    drives._search_draggers(answers, [4])
     assert asked[1] == {}

@@ -13,6 +13,7 @@ from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import Run, channels, inputs
+from dexsim.gap.rules import SIGNAL
 from dexsim.recording import read, write
 
 TWO = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/>
@@ -100,7 +101,7 @@ def test_a_lead_is_that_of_the_plain_correlation(lead):
         run.t - 0.02 + lead, run.t, np.convolve(np.pad(steps, 8, mode="edge"), np.ones(9) / 9, "same")[8:-8]
     )
     assert channels._lead(run, 0) == pytest.approx(plain_lead(run), abs=0.0051)
-    assert (channels._lead(run, 0) > channels.EARLY) == (lead > 0)
+    assert (channels._lead(run, 0) > SIGNAL.early) == (lead > 0)
 
 
 def test_enabled_acts_in_the_recording_that_has_it_and_a_second_is_enough(tmp_path):

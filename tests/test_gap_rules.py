@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import test_gap_rules_belief
+import test_gap_rules_signal
 import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
@@ -28,11 +29,11 @@ from dexsim.gap.plant.case import coupled
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.report import files, next_recording
+from dexsim.gap.search import ringing
 from dexsim.gap.search import search as selecting
-from dexsim.gap.search import shaking
 from dexsim.gap.search.fit import Fitted
-from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, thin
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, thin
+from dexsim.gap.search.search import JointSearch, SearchedJoint
 from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
 
@@ -83,6 +84,14 @@ def test_a_rule_that_is_moved_fails_its_test(name, factor):
 def test_an_effect_must_remove_a_least_share():
     search, old = Made(), trial(10.0)
     assert not search._earns(trial(9.0), old) and search._earns(trial(8.6), old)
+
+
+def test_what_can_imitate_another_effect_must_do_better():
+    scales = SimpleNamespace(apart=False, slide=False, span=2.0)
+    one, other = EFFECTS["position_scale"].variants(scales)[-2:]  # an eccentricity, and one whose zero is elsewhere
+    price = lambda variant: complexity_price(SimpleNamespace(members=[SimpleNamespace(variant=variant)]))  # noqa: E731
+    for better, chosen in ((0.05, False), (0.10, True)):
+        assert ((1 - better) * price(other) < price(one)) is chosen, better
 
 
 def test_an_effect_must_help_in_nearly_all_bootstraps():
@@ -228,7 +237,7 @@ class Selecting(Made):
     _approximate = _more_general = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
-    _dear = lambda self, trial: 1.0  # noqa: E731
+    _price_factor = lambda self, trial: 1.0  # noqa: E731
     plain = lambda self: None  # noqa: E731
 
 
@@ -610,8 +619,8 @@ def test_a_stand_in_is_offered_where_much_is_left():
     for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
         d = SimpleNamespace(joints={"j": {"after": left}}, data={"findings": []}, standins=[], notes=[])
         parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
-        drives = SimpleNamespace(outcomes=[(SimpleNamespace(joint="j"), SimpleNamespace(polish=lambda t: t),
-                                            SimpleNamespace(best=None, none=None))],
+        search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(best=None, none=None)
+        drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
                                  w=SimpleNamespace(runs=[], limit=TimeLimit(),
                                                    settings=SimpleNamespace(seed=0)))  # fmt: skip
@@ -640,7 +649,7 @@ def test_what_stands_tells_of_no_load_under_which_it_slides():
         assert bool(inseparable("coulomb_friction", case, [0])) is alike, speed
 
 
-class Shook(shaking.Shaking):
+class Shook(ringing.Ringing):
     """Windows of a second in which a joint swings from sample to sample by the sizes given, and not at all as it is
     simulated."""
 
@@ -664,7 +673,7 @@ def test_a_joint_shakes_that_is_far_louder_than_at_its_quietest():
 
 
 def test_a_joint_must_shake_in_some_windows():
-    made, rings = shaking.Shaking, SimpleNamespace(effect=SimpleNamespace(rings=True))
+    made, rings = ringing.Ringing, SimpleNamespace(effect=SimpleNamespace(rings=True))
     outcome = SimpleNamespace(none="none", best=SimpleNamespace(members=(rings,)))
     try:
         # in what was fitted, in what was held out, of which one must shake
@@ -679,14 +688,14 @@ def test_a_joint_must_shake_in_some_windows():
                     of=lambda t: np.full(count, 9.0 if t == "none" else 1.0),
                 )
 
-            shaking.Shaking = counted
-            assert (shaking.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, (fitted, kept)
+            ringing.Ringing = counted
+            assert (ringing.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, (fitted, kept)
     finally:
-        shaking.Shaking = made
+        ringing.Ringing = made
 
 
 def test_an_effect_must_plainly_tell_how_a_joint_rings():
-    made, catalogue = shaking.Shaking, shaking.CATALOGUE
+    made, catalogue = ringing.Ringing, ringing.CATALOGUE
     p = param("softness", "softness", "set", 0.0, 1.0)
     gives = SimpleNamespace(id="gives", rings=True, variants=lambda _: [Variant((p,), ((0.1,),))])
     fit = SimpleNamespace(loss=100.0)
@@ -696,16 +705,16 @@ def test_an_effect_must_plainly_tell_how_a_joint_rings():
     )  # fmt: skip
     nothing = SimpleNamespace(joint="j", none=Trial((), fit), best=Trial((), fit), scanned=[])
     try:
-        shaking.CATALOGUE = [gives]
+        ringing.CATALOGUE = [gives]
         for left, named in ((0.7, True), (0.8, False)):  # of what is missed without it
-            shaking.Shaking = lambda *_, left=left: SimpleNamespace(
+            ringing.Ringing = lambda *_, left=left: SimpleNamespace(
                 loud=np.ones(10, bool),
                 of=lambda t: np.full(10, left if t.members else 1.0),
                 best=lambda *_: (10 * left, [], np.zeros(0)),
             )
-            assert (shaking.answered(search, nothing).best.ids == ("gives",)) is named, left
+            assert (ringing.answered(search, nothing).best.ids == ("gives",)) is named, left
     finally:
-        shaking.Shaking, shaking.CATALOGUE = made, catalogue
+        ringing.Ringing, ringing.CATALOGUE = made, catalogue
 
 
 def test_joints_are_searched_again_that_feel_each_others_motion():
@@ -737,7 +746,7 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
 
 def test_each_parameter_costs_a_part_of_the_loss():
     search = Made()
-    search._dear = lambda trial: 1.0
+    search._price_factor = lambda trial: 1.0
     member = lambda n: SimpleNamespace(variant=SimpleNamespace(params=range(n)))  # noqa: E731
     for loss, better in ((0.96, True), (0.98, False)):  # with a parameter more
         assert (search._score(trial(loss, (member(2),))) < search._score(trial(1.0, (member(1),)))) is better, loss
@@ -750,7 +759,7 @@ def test_rivals_are_told_apart_by_what_they_lose():
     current, rival = (SimpleNamespace(loss=np.full(40, x), fit=fit, members=(m,), ids=(m.id,), left_out=None)
                       for x, m in ((1.0, mine), (1.03, other)))  # fmt: skip
     search.none_loss, search.fitted = np.full(40, 50.0), {frozenset(("backlash",)): rival}
-    search._fix, search._on, search._dear = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
+    search._fix, search._on, search._price_factor = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
     search.cross, search._by_condition = lambda _: None, lambda *_: []
     search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.zeros(()))
     rows, own, _ = search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"]
@@ -854,7 +863,7 @@ def takes_part(here: float, now: float, draft: float | None = None) -> bool:
                                       members=(m,), ids=(m.id,), left_out=None)
                       for loss, m in ((here, mine), (now, other)))  # fmt: skip
     search.none_loss, search.fitted = np.full(40, 50.0), {} if draft is not None else {frozenset(("backlash",)): rival}
-    search._fix, search._on, search._dear = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
+    search._fix, search._on, search._price_factor = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
     search.cross, search._by_condition, search.deadline = lambda _: None, lambda *_: [], Deadline()
     search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.array(here))
     search.draft = lambda *_: (None, None, SimpleNamespace(loss=draft))
@@ -1030,7 +1039,8 @@ def test_a_belief_without_a_trace_is_not_refitted():
     assert [p.key for p in search.nuisances] == ["kp"]
 
 
-TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | vars(test_gap_rules_belief) | globals()
+FILES = (test_gap_rules_touch, test_gap_rules_torque, test_gap_rules_belief, test_gap_rules_signal)
+TESTS = {k: v for file in FILES for k, v in vars(file).items()} | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
+from dexsim.gap.effects.friction import LoadFriction, ViscousFriction
+from dexsim.gap.effects.signals import Lag
 from dexsim.gap.inquiry import Judged, empty
 from dexsim.gap.judge import conclude
 from dexsim.gap.read import inputs, stage_tests
@@ -17,6 +19,7 @@ from dexsim.gap.read.stage_tests import Stage
 from dexsim.gap.rules import BELIEF, JUDGE
 from dexsim.gap.search import baseline, inverse_dynamics, logged_torque
 from dexsim.gap.search.inverse_dynamics import WEIGHT, Columns, least
+from dexsim.gap.search.logged_torque import IdentifiedJoint
 
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 STEP, BLOCKS, A_BLOCK = 0.01, 80, 50
@@ -165,7 +168,7 @@ def test_a_push_is_a_hint_where_the_rest_does_not_fit():
 
 
 def test_a_loop_tells_of_the_joint_where_its_law_is_right_in_the_main():
-    given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
+    given = [IdentifiedJoint(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, [])]
     for fit, tells in ((0.75, True), (0.65, False)):
         unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit, slope_high=1.1)], [])
         assert (unknown == set()) is tells, fit
@@ -236,7 +239,7 @@ def test_a_weight_is_believed_where_the_torque_cannot_tell():
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
     """Whether friction that differs by direction is named, of this column, beside a constant torque."""
     own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {"viscous_friction": 10.0})
-    name = inverse_dynamics.BY_DIRECTION
+    name = ViscousFriction.by_torque
     found, *_ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
     return [n.text for n in found] == [name]
 
@@ -262,7 +265,7 @@ def test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps():
 def test_a_torque_that_acts_far_later_is_no_lag():
     """A radian of 5 Hz is 32 ms."""
     for late, is_lag in ((0.03, True), (0.035, False)):
-        assert inverse_dynamics._sensible(inverse_dynamics.LAG, 2.0 * late, {"inertia": 2.0}) is is_lag, late
+        assert inverse_dynamics._sensible(Lag.by_torque, 2.0 * late, {"inertia": 2.0}) is is_lag, late
 
 
 def test_a_torque_that_fits_nothing_is_no_witness():
@@ -271,7 +274,7 @@ def test_a_torque_that_fits_nothing_is_no_witness():
         scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=1.0)
         case = SimpleNamespace(joint="j", unknown=("coulomb_friction",), scales=scales, ranges={}, factors={},
                                told=False, plant=SimpleNamespace(nominal=np.zeros((1, len(INDEX)))))  # fmt: skip
-        logged_torque.believe([(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
+        logged_torque.believe([IdentifiedJoint(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
         assert case.told is told, left
 
 
@@ -293,13 +296,15 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
 
 def told(after: float) -> float:
     """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held out."""
-    n = SimpleNamespace(effect=inverse_dynamics.LOAD, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
-                        after=after, rival=None, text="grows with the load", removed=(0.1, 0.2))  # fmt: skip
+    n = SimpleNamespace(effect=LoadFriction.id, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
+                        after=after, rival=None, text="friction that grows with the load",
+                        removed=(0.1, 0.2))  # fmt: skip
     case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logged_torque, "intervals_of", lambda *_: [])
-        (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n], full={}), ["a"])], ["j"], [], [])
+        given = [IdentifiedJoint(case, SimpleNamespace(named=[n], full={}), ["a"])]
+        (finding,) = logged_torque.findings(given, ["j"], [], [])
     return finding["confidence"]
 
 
@@ -317,7 +322,8 @@ def test_what_the_torque_names_is_a_part_of_the_answer():
         held = {"before": 1.0, "after": left, "removed_low": 0.1, "error": "effort_rmse_Nm"}
         finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": held, "confidence": 0.9}
         d = SimpleNamespace(data=empty(), touch=None, judged=Judged({}))
-        conclude.add_behind(d, [finding], [(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])])
+        by_torque = [IdentifiedJoint(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
+        conclude.add_behind(d, [finding], by_torque)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(conclude, "sentence", lambda *_: "")
             conclude.decide(d)
@@ -330,7 +336,8 @@ def fitted_from_torque(samples=1000, seconds=10.0) -> bool:
     run = SimpleNamespace(name="a", t=0.01 * np.arange(samples))
     of = SimpleNamespace(u=np.zeros(samples), seconds=seconds, loaded=False)
     with pytest.MonkeyPatch.context() as patch:
-        for name, answer in (("readable", True), ("moved", ("motion", "body")), ("columns_of", of), ("solve", "fit")):
+        stretch = inverse_dynamics.Stretch("motion", "body")
+        for name, answer in (("readable", True), ("moved", stretch), ("columns_of", of), ("solve", "fit")):
             patch.setattr(logged_torque, name, lambda *_, answer=answer: answer)
         patch.setattr(inverse_dynamics, "highest", lambda t: 10.0)
         return logged_torque.identify_joints([case], [run], [0], [], None) != []
@@ -343,7 +350,7 @@ def test_gravity_that_matters_is_fitted():
         one = np.ones_like(m.u)
         m.u[:] = one
         b = inverse_dynamics.Body(share * one, share * one, 0 * one, one)
-        assert inverse_dynamics.columns_of([(m, b)], 0).loaded is fitted, share
+        assert inverse_dynamics.columns_of([inverse_dynamics.Stretch(m, b)], 0).loaded is fitted, share
 
 
 def test_a_torque_is_fitted_where_enough_was_logged():

@@ -10,12 +10,13 @@ import pytest
 
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.touch import judge
+from dexsim.gap.touch import judge, read
 from dexsim.gap.touch import search as pad_search
 from dexsim.gap.touch.diagnosis import Pad, Touch
 from dexsim.gap.touch.judge import PadAnswer
 from dexsim.gap.touch.plant import PARAMS
 from dexsim.gap.touch.search import PadFit, PadSearch, TouchTrial
+from dexsim.recording.schema import TACTILE, Series
 
 
 class Felt(PadSearch):
@@ -62,7 +63,7 @@ def test_a_pad_must_be_touched_for_a_while():
         touch.pads = [Pad(1, [SimpleNamespace(recording="a", name="index", t=t, z=np.ones((len(t), 4)))])]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("dexsim.gap.touch.diagnosis.PadSearch", lambda *_: "search")
-            touch.model()
+            touch.plant()
         assert (touch.pads[0].search == "search") is judged_, seconds
 
 
@@ -148,7 +149,7 @@ class Mapped(PadSearch):
     def _swaps(self, values):
         return None
 
-    def _common(self, current, evaluations):
+    def _common(self, effect, current, evaluations):
         return self.fit((*current.ids, "tactile_gain"), {})
 
 
@@ -359,7 +360,24 @@ def test_exchanged_taxels_save_more_than_noise():
             assert (PadSearch._swaps(search, {}) is not None) is found, size
 
 
+def test_a_little_force_is_no_touch():
+    t = 0.01 * np.arange(200)
+    on = (t > 0.5) & (t < 1.0)
+    taxel = lambda newtons: np.stack([newtons * on] * 12, 1).reshape(-1, 1, 4, 3)  # noqa: E731
+    for newtons, touched in ((0.12, 0), (0.18, 1)):
+        r = SimpleNamespace(tactile=Series(t, taxel(newtons), TACTILE), external_force=None)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(read, "newtons", lambda r: (r.tactile.value, True))
+            assert len(read.stretches(r)) == touched, newtons
+    for newtons, touched in ((0.25, 0), (0.4, 1)):
+        force = np.stack([newtons * on, 0 * t, 0 * t], 1)
+        assert len(read.stretches(SimpleNamespace(tactile=None, external_force=Series(t, force, "")))) == touched
+
+
 def test_neighbours_of_a_dead_taxel_feel_the_touch():
+    few, many = [[1, 2]] + [[0]] * 4, [[1, 2, 3, 4]] + [[0]] * 4
+    felt = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    assert judge._constant(felt, few) == set() and judge._constant(felt, many) == {0}
     near = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], [0, 1, 2]]
     for share, dead in ((0.17, {0}), (0.13, set())):
         assert judge._constant(np.array([0.0, share, share, share, 1.0]), near) == dead, share

@@ -221,7 +221,7 @@ def as_pull(times: float, *, level_known: bool = False, stiff: bool = False) -> 
 
     search.fitter, search._fix, search.thorough = SimpleNamespace(fit=fit), lambda members: nullcontext(), lambda t: t
     search._left = lambda t: np.full(4, t.fit.loss)
-    search._dear, search._shrunk = (lambda t: 1.0), lambda t: False
+    search._price_factor, search._shrunk = (lambda t: 1.0), lambda t: False
     return search._more_general(current).ids, begun
 
 

@@ -13,6 +13,7 @@ from dexsim.actuator.columns import INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.search import logged_torque
 from dexsim.gap.search.inverse_dynamics import body, motion
+from dexsim.gap.search.search import SearchedJoint
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper">
  <joint name="shoulder" axis="0 1 0" armature="0.02" damping="0.05"/>
@@ -78,13 +79,14 @@ def test_friction_of_coupled_joints_under_gravity_is_read_off_at_100_hz():
     model = arm()
     runs = [run(model, 0), run(model, 1)]
     given = logged_torque.identify_joints(cases(), runs, [0], [1], model=model)
-    assert [c.joint for c, *_ in given] == list(JOINTS) and given[0][2] == ["run1.mcap"]
-    for (_, x, _), coulomb, viscous in zip(given, COULOMB, VISCOUS, strict=True):
+    assert [x.case.joint for x in given] == list(JOINTS) and given[0].judges == ["run1.mcap"]
+    for joint, coulomb, viscous in zip(given, COULOMB, VISCOUS, strict=True):
+        x = joint.inverse
         assert x.value["coulomb_friction"] == pytest.approx(coulomb, rel=0.05)
         assert x.value["viscous_friction"] == pytest.approx(viscous, rel=0.1)  # beyond the model's own damping
         assert x.residual < 0.05 and not x.refused
         assert abs(x.value.get("gravity", 0.0)) < 0.02
-    assert given[0][1].value["inertia"] == pytest.approx(
+    assert given[0].inverse.value["inertia"] == pytest.approx(
         np.median(body(model, np.array([0, 0, -9.81]), JOINTS, moved(runs[0])).inertia[:, 0]), rel=0.05
     )
 
@@ -97,7 +99,7 @@ def test_a_heavier_arm_is_not_taken_for_friction():
     model, heavy = arm(), arm()
     heavy.body_mass[:] *= 1.1
     heavy.body_inertia[:] *= 1.1
-    x = logged_torque.identify_joints(cases(), [run(heavy, 0)], [0], [], model=model)[0][1]
+    x = logged_torque.identify_joints(cases(), [run(heavy, 0)], [0], [], model=model)[0].inverse
     assert x.value["gravity"] == pytest.approx(0.1, abs=0.02)
     assert x.value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
@@ -109,7 +111,7 @@ def test_what_is_held_out_takes_no_part():
     given = logged_torque.identify_joints(
         cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)}
     )
-    assert given[0][1].value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
+    assert given[0].inverse.value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
 
 @pytest.mark.parametrize("fitted_weighs", (True, False))
@@ -120,8 +122,8 @@ def test_gravity_may_matter_in_what_is_fitted_alone_or_in_what_is_held_out_alone
     for r, m in zip(runs, (heavy, light) if fitted_weighs else (light, heavy), strict=True):
         r.gravity = m.opt.gravity.copy()
     given = logged_torque.identify_joints(cases(), runs, [0], [1], model=heavy)
-    assert [judged for _, _, judged in given] == [["run1.mcap"]] * 2
-    for k, (_, x, _) in enumerate(given):
+    assert [x.judges for x in given] == [["run1.mcap"]] * 2
+    for k, x in enumerate(joint.inverse for joint in given):
         assert x.low["coulomb_friction"] < COULOMB[k] < x.high["coulomb_friction"]
         assert all(np.isfinite(n.after) for n in x.named)
 
@@ -130,14 +132,14 @@ def test_a_negative_friction_is_a_refusal_with_a_reason():
     model = arm()
     r = run(model, 0, friction=(0.5, -0.2))
     given = logged_torque.identify_joints(cases(), [r], [0], [], model=model)
-    x = given[1][1]
+    x = given[1].inverse
     assert x.value["coulomb_friction"] == 0.0 and "negative coulomb friction" in x.refused["coulomb_friction"]
-    assert "negative coulomb friction" in logged_torque.torque_texts(given)[1] and not given[0][1].refused
+    assert "negative coulomb friction" in logged_torque.torque_texts(given)[1] and not given[0].inverse.refused
     for c in cases():
         c.unknown, c.told, c.ranges = ("coulomb_friction",), False, {}
-    given[1][0].unknown, given[1][0].told = ("coulomb_friction",), False
+    given[1].case.unknown, given[1].case.told = ("coulomb_friction",), False
     said = logged_torque.believe(given[1:])
-    assert len(said) == 1 and "no coulomb friction is taken" in said[0] and not given[1][0].told
+    assert len(said) == 1 and "no coulomb friction is taken" in said[0] and not given[1].case.told
 
 
 def test_readings_too_slow_or_in_no_unit_of_torque_say_nothing():
@@ -151,7 +153,7 @@ def test_readings_too_slow_or_in_no_unit_of_torque_say_nothing():
 def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_one():
     model = arm()
     given = logged_torque.identify_joints(cases(), [run(model, 0)], [0], [], model=model)
-    case, x, _ = given[0]
+    case, x = given[0].case, given[0].inverse
     case.unknown, case.ranges, case.factors, case.told = ("coulomb_friction", "viscous_friction"), {}, {}, False
     case.scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=x.value["inertia"])
     case.plant = SimpleNamespace(nominal=np.zeros((1, len(INDEX))))
@@ -161,8 +163,8 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     )
     d = SimpleNamespace(servo=servo, notes=[], data={"findings": [], "nuisance": {"coulomb_friction@shoulder": 9.0}})
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
-    outcomes = [(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
-    logged_torque.hand_on(given[:1], d, outcomes, [], None, [SimpleNamespace(joint="shoulder", sound=False)])
+    searched = [SearchedJoint(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
+    logged_torque.hand_on(given[:1], d, searched, [], None, [SimpleNamespace(joint="shoulder", sound=False)])
     told = servo.value("shoulder", "coulomb_friction")
     assert told.value == pytest.approx(COULOMB[0], rel=0.05) and told.low < told.value < told.high
     assert d.data["nuisance"]["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
@@ -172,7 +174,7 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     # of the elbow the torque told nothing
     stage = lambda joint, fit, high=1.1: SimpleNamespace(joint=joint, fit=fit, slope_high=high)  # noqa: E731
     stages = [stage("shoulder", 0.1), stage("elbow", 0.1)]
-    given[1][0].told = False
+    given[1].case.told = False
     assert logged_torque.unknown_controllers(given, stages, notes) == {"shoulder"}
     assert "controller is another" in notes[0]
     assert logged_torque.unknown_controllers(given, [stage("shoulder", 0.9)], notes) == set()

@@ -15,6 +15,7 @@ from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.hypotheses import Outcome
+from dexsim.gap.search.search import SearchedJoint
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
@@ -435,7 +436,6 @@ def test_what_is_taken_back_does_not_reach_a_search():
     assert (found.best, answer.outcome.best) == ("three", "one")
     assert [answer.earlier.outcome.best, answer.earlier.earlier.outcome.best] == ["two", "three"]
     drives = object.__new__(Drives)
-    drives.outcomes, drives._answer = [("case", "search", found)], lambda search, outcome: answer
-    drives.w = SimpleNamespace(settings=SimpleNamespace(seed=0))
-    drives.locate()
-    assert drives.outcomes == [("case", "search", answer.outcome)] and found.best == "three"
+    drives.searched, drives._answer = [SearchedJoint("case", "search", found)], lambda search, outcome: answer
+    drives._take_back()
+    assert drives.searched == [SearchedJoint("case", "search", answer.outcome)] and found.best == "three"

@@ -170,12 +170,12 @@ def test_drawn_together_is_what_is_drawn_one_by_one():
         ]
 
     s, alone = sampler(cfg), sampler(cfg)
-    with s.together("episode"):
+    with s.drawn_ahead("episode"):
         for a, b in zip(ask(s), ask(alone), strict=True):
             assert torch.equal(a, b)
     s.width.fill_(0.5)
     alone.width.fill_(0.5)
-    with s.together("episode"):
+    with s.drawn_ahead("episode"):
         got = ask(s)
     for a, b in zip(got, ask(alone), strict=True):
         assert a.shape == b.shape and a.dtype == b.dtype
@@ -190,16 +190,16 @@ def test_drawn_together_is_what_is_drawn_one_by_one():
     columns = torch.cat([x.reshape(N, -1) for x in got if float(x.std()) > 0], 1)
     c = torch.corrcoef(columns.T) - torch.eye(columns.shape[1])
     assert float(c.abs().max()) < 6 / N**0.5
-    with s.together("episode"):
+    with s.drawn_ahead("episode"):
         again = ask(s)
     assert not torch.equal(again[0], got[0])
 
 
 def test_something_else_than_planned_is_drawn_too():
     s = sampler({"x": [1.0, 2.0], "y": [5.0, 6.0]})
-    with s.together("episode"):
+    with s.drawn_ahead("episode"):
         s.draw("x"), s.draw("y")
-    with s.together("episode"):
+    with s.drawn_ahead("episode"):
         y, x, z = s.draw("y"), s.draw("x", 4), s.draw("y")
     assert x.shape == (N, 4) and 1 <= float(x.min()) and float(x.max()) <= 2
     assert all(v.shape == (N,) and 5 <= float(v.min()) and float(v.max()) <= 6 for v in (y, z))

@@ -3,14 +3,17 @@ forms."""
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
-from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, laws
+from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, kernel, laws
 from dexsim.actuator.columns import INDEX
+from dexsim.actuator.laws import LEAST_ROTOR
 from dexsim.actuator.reference import measured_position, torque_along, viscous
 from dexsim.actuator.reference import servo as servo_reference
 from dexsim.gap import demo
@@ -452,6 +455,29 @@ def searched(torque: wp.array(dtype=wp.float64), v: wp.array(dtype=wp.float64), 
     )
     out[i, 2] = laws.gear_load_friction(torque[i], v[i], wp.float64(0.1), wp.float64(0.4), one, wp.float64(2.0))
     out[i, 3] = laws.duty_torque(torque[i], wp.float64(0.4), wp.float64(1.2), wp.float64(0.04), v[i])
+
+
+def test_every_law_says_its_equation_units_and_source():
+    """A unit in brackets, and where it is from: a publication or a standard, a law of physics or a definition, another
+    law of the file, or ours."""
+    functions = {name: x for name, x in vars(laws).items() if isinstance(x, wp.Function)}
+    assert len(functions) > 30
+    unit = re.compile(r"\[[^\]]*\b(1|s|rad|N\.m|N\.m\.s|kg\.m2|degC)\b[^\]]*\]")
+    source = re.compile(
+        r"\b(ours|geometry|by definition|source:|(19|20)\d\d|section \d|IEC|(Ohm|Kirchhoff)'s law|the paper's)(?!\w)",
+        re.IGNORECASE,
+    )
+    for name, x in functions.items():
+        said = " ".join((x.func.__doc__ or "").split())
+        assert unit.search(said), f"{name}: no unit"
+        assert source.search(said), f"{name}: no source"
+
+
+def test_the_limits_of_the_numerics_that_kernel_and_check_share():
+    """The check takes these from what it checks, which it could not see change."""
+    assert (LEAST_ROTOR, kernel.BORROWED) == (0.03, 0.5)
+    assert (kernel.STOP_RATE, kernel.STOP_GAIN) == (2 * np.pi * 40.0, 30.0)
+    assert (kernel.SNAP, kernel.SEED, kernel.EDGE) == (1e-3, 1e-6, 1.0 + 1e-6)
 
 
 def test_laws_that_only_the_search_has():

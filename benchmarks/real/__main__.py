@@ -103,7 +103,7 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
     result["found"] = found
     result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
     # the tool's own stage for a logged motor torque, as its report has it
-    from dexsim.gap.search.inverse_dynamics import LAG, SQUARE, identify
+    from dexsim.gap.search.inverse_dynamics import SQUARE, identify
 
     given = {n: force.load(data, n) for n in force.FILES}
     tool = identify(*given["estimation"], test=given["pulses"])
@@ -111,7 +111,7 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
     by = {k: tool.value[n] for k, n in names.items()}
     more = {k: tool.full[n] for k, n in names.items()}
     for n in tool.named:
-        if n.text == LAG:
+        if n.effect == "lag":
             more["late"] = n.value / tool.full["inertia"]
         elif n.effect == "viscous_friction":
             more["by_direction"] = n.value

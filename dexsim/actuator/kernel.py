@@ -50,6 +50,7 @@ import warp as wp
 
 from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY
 from dexsim.actuator.laws import (
+    LEAST_ROTOR,
     amplifier,
     arrived,
     command_delay,
@@ -57,7 +58,9 @@ from dexsim.actuator.laws import (
     dragged_target,
     dry_friction,
     encoder_error,
+    encoder_line,
     encoder_memory,
+    feed_forward,
     friction_acts,
     heard_speed,
     hold,
@@ -68,6 +71,7 @@ from dexsim.actuator.laws import (
     pd,
     preslide,
     preslide_slope,
+    stand_in,
     supply_left,
     torque_limits,
     transmission,
@@ -92,7 +96,6 @@ SEED = 1.0e-6  # of the stall torque: braking from the no-load speed starts from
 EDGE = 1.0 + SEED
 STOP_RATE = 2.0 * 3.141592653589793 * 40.0  # rad/s: how stiff the ends of a play are, over the inertia, and
 STOP_GAIN = 30.0  # over the loop's own stiffness
-LEAST_ROTOR = 0.03  # of the joint's inertia
 BORROWED = 0.5  # of the joint's inertia: what a rotor beyond the model's armature may take from the link
 SNAP = 1.0e-3  # parts of a step shorter than this are rounding of the clock
 WHOLE = 1.0 - SNAP
@@ -285,7 +288,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         s.scale = d.params[w, j, SCALE]
         kept = remember(d.params[w, j], turned, memory, fresh, dt)
         error = encoder(d.params[w, j], turned, kept, False)
-        s.q = s.scale * turned + d.params[w, j, OFFSET]
+        s.q = encoder_line(turned, s.scale, d.params[w, j, OFFSET])
         s.q += error[0] + error[1]
         s.scale += error[2]
         s.rate = s.scale * turning
@@ -352,7 +355,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         if wp.static(not controller):
             return wp.vector(u[0], u[1], u[2]), kept
         wish = target_rates(d.state, w, j, queue, end - dt, dt)
-        feed = d.params[w, j, FEED_SPEED] * wish[0] + d.params[w, j, FEED_ACCELERATION] * wish[1]
+        feed = feed_forward(d.params[w, j, FEED_SPEED], d.params[w, j, FEED_ACCELERATION], wish[0], wish[1])
         gain = d.params[w, j, INTEGRAL_GAIN]
         integral = real(0.0)
         if d.state[w, j, ENABLED] != real(0.0):
@@ -590,8 +593,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         applied = t.end
         damping = t.slope
         pull = d.params[w, j, REST_POSITION]
-        brake = d.params[w, j, REST_SPEED] + d.params[w, j, REST_DRAG] * wp.abs(v)
-        applied += d.params[w, j, REST] + pull * q + brake * v
+        unknown = stand_in(d.params[w, j, REST], pull, d.params[w, j, REST_SPEED], d.params[w, j, REST_DRAG], q, v)
+        brake = unknown[1]
+        applied += unknown[0]
         spring = wp.max(real(0.0), -pull)
         applied -= spring * dt * v
         damping += spring * dt

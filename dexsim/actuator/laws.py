@@ -57,6 +57,13 @@ def eccentricity(q: Any, sine: Any, cosine: Any):
     return wp.vector(sine * s, cosine * (c - type(q)(1.0)), sine * c - cosine * s)
 
 
+@wp.func
+def encoder_line(q: Any, scale: Any, offset: Any):
+    """Position [rad] that an encoder of this scale and offset [rad] shows at q [rad], but for `encoder_error`: scale *
+    q + offset. A scale of 1 and no offset by definition of a right one; ours, as far as it is off."""
+    return scale * q + offset
+
+
 @cache
 def encoder_error(features: frozenset[str] = frozenset()) -> Any:
     """The Warp function of what an encoder shows beyond scale * q + offset, as a sum of laws of the position, for a
@@ -125,7 +132,7 @@ def command_delay(features: frozenset[str] = frozenset()) -> Any:
 @wp.func
 def arrived(end: Any, stamp: Any, dt: Any):
     """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in
-    force, (end - stamp) / dt within 0 .. 1: a delay that ends inside a step acts for the rest of it."""
+    force, (end - stamp) / dt within 0 .. 1: a delay that ends inside a step acts for the rest of it. Ours."""
     return wp.clamp((end - stamp) / dt, type(dt)(0.0), type(dt)(1.0))
 
 
@@ -161,8 +168,9 @@ def lag_share(time: Any, dt: Any):
 
 @wp.func
 def stage_before(before: Any, after: Any, share: Any):
-    """What went into a first-order lag whose output went from `before` to `after` in a step of this `lag_share`: of a
-    lag of second order the first stage, where the output of the second is known."""
+    """What went into a first-order lag [N.m, or what it lags] whose output went from `before` to `after` in a step of
+    this `lag_share`: u = before + (after - before) / share, of a lag of second order the first stage, where the output
+    of the second is known (source: `lag_share`, solved for u)."""
     return before + (after - before) / share
 
 
@@ -270,7 +278,7 @@ def amplifier(features: frozenset[str] = frozenset()) -> Any:
 @wp.func
 def sagging(supply: Any, per_torque: Any, others: Any):
     """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque|
-    [N.m]). A source with an internal resistance, currents in proportion to torques."""
+    [N.m]). Ohm's law of a source with an internal resistance, currents in proportion to torques; the bound is ours."""
     return supply * wp.max(type(supply)(1.0) - per_torque * others, type(supply)(0.05))
 
 
@@ -294,6 +302,7 @@ def supply_left(features: frozenset[str] = frozenset()) -> Any:
     return left
 
 
+LEAST_ROTOR = 0.03  # of a joint's inertia: what each of rotor and link has at least of it
 LEAST_LEFT = wp.constant(0.2)  # of what a drive gives: a supply that sags below that resets the drive
 
 
@@ -301,21 +310,23 @@ LEAST_LEFT = wp.constant(0.2)  # of what a drive gives: a supply that sags below
 def sagged_torque(others: Any, per_own: Any, torque: Any):
     """Share that is left of a drive's torque where it and the other motors load one supply: 1 - others - per_own
     [1/N.m] * |torque| [N.m], at least LEAST_LEFT; others: the part that the other motors take, torque: the drive's own
-    in the step before. The source of `sagging`, seen at the torque instead of the supply: what a search can tell of a
-    drive whose supply is not in its model."""
+    in the step before. Ours: the loss of `sagging`, seen at the torque instead of the supply, which is what a search
+    can tell of a drive whose supply is not in its model."""
     return wp.max(type(torque)(1.0) - others - per_own * wp.abs(torque), type(torque)(LEAST_LEFT))
 
 
 @wp.func
 def duty_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
     """Torque [N.m] of a DC motor at a duty of its supply: tau0 * supply * duty - line * v, line = stall torque over
-    no-load speed [N.m.s/rad]. The circuit R i = u - k v with torque = k i, without an inductance."""
+    no-load speed [N.m.s/rad]. Kirchhoff's law of the armature, R i = u - k v with torque = k i, without an
+    inductance."""
     return tau0 * supply * duty - line * v
 
 
 @wp.func
 def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
-    """`duty_torque` of a drive that cannot give more than its supply: the duty clipped to -1 .. 1."""
+    """Torque [N.m] of a drive that cannot give more than its supply: tau0 * supply * clip(duty, -1, 1) - line * v, as
+    of `duty_torque` (source: there)."""
     return duty_torque(wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)), tau0, supply, line, v)
 
 
@@ -337,7 +348,7 @@ def torque_limit(tau0: Any, x: Any, slope: Any):
 @wp.func
 def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
     """(lower, upper) >= 0: the torque lies in -lower .. upper [N.m] at speed v [rad/s], x = |v| / no-load speed;
-    `torque_limit` with slope 1 in the direction of v, with `slope` against it."""
+    `torque_limit` with slope 1 in the direction of v, with `slope` against it (source: there)."""
     upper = torque_limit(tau0, x, type(x)(1.0))
     lower = upper
     if v > type(v)(0.0):
@@ -364,7 +375,8 @@ def transmission(turn: Any, stiff: Any, hardening: Any):
 @wp.func
 def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: Any):
     """Damping [N.m.s/rad] of a spring [N.m/rad] between two inertias [kg.m2] at the damping ratio `rebound`:
-    2 rebound sqrt(stiff * rotor * link / both), both = rotor + link: of one mass on a spring, at their reduced one."""
+    2 rebound sqrt(stiff * rotor * link / both), both = rotor + link. By definition of the damping ratio of one mass on
+    a spring, at the reduced mass of the two."""
     return type(stiff)(2.0) * rebound * wp.sqrt(stiff * rotor * link / both)
 
 
@@ -373,8 +385,8 @@ def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: 
 
 @wp.func
 def stribeck_power(ratio: Any, exponent: Any):
-    """p of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed /
-    stribeck_speed.
+    """p [1] of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed /
+    stribeck_speed [1].
 
     2: Gaussian (Armstrong-Helouvry 1994, Tustin's exponential is 1); see B. Armstrong-Helouvry, P. Dupont, C. Canudas
     de Wit, A survey of models ... for the control of machines with friction, Automatica 30 (1994).
@@ -399,10 +411,10 @@ def viscous(high: Any, more: Any, half: Any, v: Any):
 
 @wp.func
 def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
-    """Dry friction per motor torque of a gear: `driving` where the motor drives the load (torque and speed agree),
-    `backdriven` where the load drives the motor (they do not). The friction is this share of |torque| (P. Hamon, M.
-    Gautier, P. Garrec, Dynamic identification of robots with a dry friction model depending on load and velocity, IROS
-    2010)."""
+    """Dry friction per motor torque [1] of a gear: `driving` where the motor drives the load (torque [N.m] and speed v
+    [rad/s] agree), `backdriven` where the load drives the motor (they do not). The friction is this share of |torque|
+    (P. Hamon, M. Gautier, P. Garrec, Dynamic identification of robots with a dry friction model depending on load and
+    velocity, IROS 2010)."""
     share = driving
     if torque * v < type(v)(0.0):
         share = backdriven
@@ -523,8 +535,8 @@ def friction_acts(features: frozenset[str] = frozenset()) -> Any:
 
 @wp.func
 def preslide(taken: Any, turned: Any):
-    """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn /
-    presliding.
+    """Share [1] of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn /
+    presliding [1].
 
     Dahl's law dz/dy = 1 - z sign(y) (P. Dahl, A solid friction model, 1968), taken implicitly over the turn."""
     return (taken + turned) / (type(taken)(1.0) + wp.abs(turned))
@@ -532,8 +544,8 @@ def preslide(taken: Any, turned: Any):
 
 @wp.func
 def preslide_slope(taken: Any, turned: Any):
-    """Slope of `preslide` from no turn to this one, (z' - z) / y >= 0: of a line in the turn that is right at both
-    ends."""
+    """Slope [1] of `preslide` from no turn to this one, (z' - z) / y = (1 - z sign(y)) / (1 + |y|) >= 0: of a line in
+    the turn that is right at both ends (source: there)."""
     ahead = taken  # what of it lies in the direction of the turn; from rest either way
     if turned < type(turned)(0.0):
         ahead = -taken
@@ -545,7 +557,7 @@ def preslide_slope(taken: Any, turned: Any):
 @wp.func
 def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
     """Speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) + level z'
-    = 0.
+    = 0. Ours, for Dahl's law.
 
     a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction;
     level [N.m]; w = presliding / step: the speed that takes up all of the friction in one step."""
@@ -613,6 +625,15 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
         return wp.vector(torque, by_position, by_speed), memory
 
     return parasitic
+
+
+@wp.func
+def stand_in(constant: Any, by_position: Any, by_speed: Any, by_square: Any, q: Any, v: Any):
+    """(torque [N.m], its slope [N.m.s/rad] in the speed) that stands in for what is not known of a drive, at position q
+    [rad] and speed v [rad/s] of the joint: constant + by_position q + (by_speed + by_square |v|) v. Ours, for the
+    columns `standin_*`."""
+    brake = by_speed + by_square * wp.abs(v)
+    return wp.vector(constant + by_position * q + brake * v, brake)
 
 
 # -- the controller ----------------------------------------------------------------------------------------------------
@@ -685,7 +706,7 @@ def pd(
     e: error of the measured position [rad]; lost: what of it does not count (`lost_error`). v, v_end: measured speed
     that kd acts on, now and then [rad/s]; rate: measured speed of the position; scale: what the encoder shows over what
     turns; share: of a change of speed, what kd's filter passes in the step; age: of the position [s]. acts: as of
-    `lost_error`."""
+    `lost_error`. The paper's law (`kernel.py`), backward Euler ours."""
     now = kp * e - kd * v
     end = kp * e - kd * v_end - kp * dt * rate
     slope = scale * (kp * (dt - age) + share * kd)
@@ -710,7 +731,7 @@ def pd(
 @wp.func
 def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
     """(now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term [N.m]; the
-    integral goes on over the step: + gain * dt * (e - rate dt), gain = `integral_gain`."""
+    integral goes on over the step: + gain * dt * (e - rate dt), gain = `integral_gain` (source: above)."""
     now = asked[0]
     end = asked[1]
     slope = asked[2]
@@ -723,6 +744,13 @@ def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scal
     return wp.vector(now, end, slope)
 
 
+@wp.func
+def feed_forward(by_speed: Any, by_acceleration: Any, speed: Any, acceleration: Any):
+    """Torque [N.m] of the feed-forward: speed_feedforward * r' + acceleration_feedforward * r'', of a target's speed
+    [rad/s] and acceleration [rad/s2] (source: above)."""
+    return by_speed * speed + by_acceleration * acceleration
+
+
 # intervals between targets for which their speed counts, if no other target comes: one may be late
 HOLDS = wp.constant(2.0)
 SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this are one
@@ -730,8 +758,8 @@ SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this ar
 
 @wp.func
 def difference(new: Any, old: Any, span: Any, dt: Any):
-    """Backward difference (new - old) / span of two targets, or of two of their speeds, span [s] apart; 0 for a jump in
-    no time."""
+    """Backward difference (new - old) / span [rad/s, rad/s2] of two targets [rad], or of two of their speeds, span [s]
+    apart; 0 for a jump in no time. By definition of what a drive can take from its targets; the bound is ours."""
     rate = type(new)(0.0)
     if span > type(dt)(SHORTEST) * dt:
         rate = (new - old) / span
@@ -740,9 +768,9 @@ def difference(new: Any, old: Any, span: Any, dt: Any):
 
 @wp.func
 def hold(stamp: Any, span: Any, until: Any, begin: Any, dt: Any):
-    """Share of the step [begin, begin + dt] in which a target's speed is in force: from the target's time `stamp` to
-    `until` (the step's end, or the next target), for at most HOLDS times the interval `span` that it was taken over
-    [s]."""
+    """Share of the step [begin, begin + dt] in which a target's speed is in force, (min(until, stamp + HOLDS span) -
+    max(stamp, begin)) / dt >= 0: from the target's time `stamp` to `until` (the step's end, or the next target), for at
+    most HOLDS times the interval `span` that it was taken over [s]. Ours."""
     end = wp.min(until, stamp + type(span)(HOLDS) * span)
     return wp.max(end - wp.max(stamp, begin), type(dt)(0.0)) / dt
 

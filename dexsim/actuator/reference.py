@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX, MEMORY
-from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
+from dexsim.actuator.kernel import BORROWED, EDGE, SEED, SNAP, STOP_GAIN, STOP_RATE
+from dexsim.actuator.laws import LEAST_ROTOR
 
 Numbers = float | np.ndarray
 
@@ -162,6 +163,14 @@ def heard_speed(
     now = np.where(step.fresh, v, before + share * (v - before))
     step.memory["filtered"] = now
     return now, now + share * (v - now), share
+
+
+def loop_torque(p: Mapping[str, Numbers], e: Numbers, v: Numbers, acts: Numbers) -> np.ndarray:
+    """Torque [...] N.m, or duty, that a loop asks for: kp e - kd v of the error e [...] rad that counts and the
+    measured speed v [...] rad/s that kd acts on. acts [...]: 0 nothing, 1 all but the error's, 2 all of it
+    (`lost_error`)."""
+    damping = p["kd"] * v
+    return np.where(np.greater(acts, 1.5), p["kp"] * e - damping, np.where(np.greater(acts, 0.5), -damping, 0.0))
 
 
 def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float) -> np.ndarray:
@@ -429,12 +438,9 @@ def servo(
 
     lost, bend, acts = lost_error(p, target, target - q_m, features, step)
     e, heeded = target - q_m - lost, 1.0 - bend
-    now = p["kp"] * e - p["kd"] * v_d
-    pd = p["kp"] * (e - heeded * dt * v_m) - p["kd"] * v_next
+    now, pd = loop_torque(p, e, v_d, acts), loop_torque(p, e - heeded * dt * v_m, v_next, acts)
     slope = scale * (p["kp"] * heeded * dt + kd_blend * p["kd"])
     dead, damped = np.less(acts, 1.5), np.equal(acts, 1.0)
-    now = np.where(damped, -p["kd"] * v_d, np.where(dead, 0.0, now))
-    pd = np.where(damped, -p["kd"] * v_next, np.where(dead, 0.0, pd))
     slope = np.where(damped, scale * kd_blend * p["kd"], np.where(dead, 0.0, slope))
 
     supply = supply_left(p, p["supply"], others, features, step)

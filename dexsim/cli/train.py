@@ -45,7 +45,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None, where: Path | None 
         folder.tidy([Path(start.source).expanduser().parent])
     with (
         ranks.only_leader_prints(),
-        Stop(together=ranks.size > 1) as stop,
+        Stop(several=ranks.size > 1) as stop,
         contextlib.ExitStack() as open_,
         ranks.joined(start.cfg["device"]),
     ):

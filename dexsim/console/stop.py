@@ -18,12 +18,12 @@ class Stop:
     """At once by default; while ``gently`` is set, the first signal only asks the work to end. A SIGHUP that was
     ignored before (nohup) still is. ``status``: the exit status then, 128 + the signal's number.
 
-    together: one of several processes: signals within SAME_SIGNAL_S count as one.
+    several: it is one of several processes: signals within SAME_SIGNAL_S count as one.
     """
 
-    def __init__(self, together: bool = False) -> None:
+    def __init__(self, several: bool = False) -> None:
         self.gently, self.status = False, 130
-        self._asked, self._together, self._last = False, together, -math.inf
+        self._asked, self._several, self._last = False, several, -math.inf
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stop:
@@ -41,7 +41,7 @@ class Stop:
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         before, self._last = self._last, time.monotonic()
-        if self._together and self._last - before < SAME_SIGNAL_S:
+        if self._several and self._last - before < SAME_SIGNAL_S:
             return
         self.status = 128 + number
         if number == signal.SIGHUP:

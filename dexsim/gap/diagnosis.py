@@ -37,8 +37,8 @@ from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next, rival_of
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, logged_torque, shaking
-from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.search import baseline, logged_torque, ringing
+from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
 from dexsim.gap.touch.diagnosis import Touch
 
 
@@ -70,20 +70,20 @@ def diagnose(
         w.clock.lap("stand-in")
     drives.confirm(d)
     w.clock.lap("replay in the engine that trains")
-    _next(d, w, drives.outcomes)
+    _next(d, w, drives.searched)
     d.notes[:0] = w.limit.left_out
     d.shares = w.clock.shares
     return d
 
 
-def _next(d: Diagnosis, w: Inquiry, outcomes: Sequence[tuple[Case, JointSearch, Outcome]]) -> None:
+def _next(d: Diagnosis, w: Inquiry, searched: Sequence[SearchedJoint]) -> None:
     """What to record next, where that was asked for and there is time for it."""
     if not w.settings.next_recording:
         return
     if w.limit.rest() < PLAN:
         w.limit.leave_out("no next recording is planned")
         return
-    plan_next(d, w.settings, w.m, outcomes, w.readable)
+    plan_next(d, w.settings, w.m, searched, w.readable)
     w.clock.lap("next recording")
 
 
@@ -131,19 +131,19 @@ class Drives(Steps):
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
         self.pushes: Sequence[logged_torque.Push] = ()  # from outside
-        # model: a case a joint, what is held out of the fit, the noise
+        # plant: a case a joint, what is held out of the fit, the noise
         self.cases: list[Case] = []
         self.left_out: dict[str, str] = {}  # effects that are not considered, with reasons
         # search: what recorded torque, duty and current say; joints whose closed loop says nothing of them; an answer a
         # joint
         self.stages: Sequence[stage_tests.Stage] = ()
-        self.by_torque: Sequence[tuple] = ()
+        self.by_torque: Sequence[logged_torque.IdentifiedJoint] = ()
         self.unknown_controllers: set[str] = set()
-        self.outcomes: list[tuple[Case, JointSearch, Outcome]] = []
+        self.searched: list[SearchedJoint] = []
+        self.answers: list[JointAnswer] = []
         # what of the judgement needs no other joint, by the search that it is of (`_judged_ahead`)
         self.ahead: dict[int, tuple[JointAnswer, baseline.Baseline | None]] = {}
-        # locate and judge
-        self.answers: list[JointAnswer] = []
+        # judge
         self.plains: list[baseline.Baseline] = []
 
     @property
@@ -201,9 +201,9 @@ class Drives(Steps):
         w.runs, w.held = logged_torque.without_pushes(self.pushes, w.runs, w.held, w.notes)
         w.clock.lap("forces from outside")
 
-    # -- model
+    # -- plant
     # -----------------------------------------------------------------------------------------------------------------
-    def model(self) -> None:
+    def plant(self) -> None:
         """A case a joint: its plant along the motion, what is held out of the fit, the noise floor."""
         w, s = self.w, self.w.settings
         count = len(w.runs[0].joints)
@@ -285,7 +285,7 @@ class Drives(Steps):
             if found is None:
                 w.notes.append(f"{case.joint}: no stretch long enough to simulate")
             else:
-                self.outcomes.append((case, search, found))
+                self.searched.append(SearchedJoint(case, search, found))
         if w.limit.cut:
             why = "it was interrupted" if w.limit.stopped else f"the limit of {w.limit.seconds:g} s"
             joints = ", ".join(sorted(w.limit.cut))
@@ -295,6 +295,15 @@ class Drives(Steps):
                 "not looked for",
             )
         w.clock.lap("search")
+        self._take_back()
+
+    def _take_back(self) -> None:
+        """What was held out against what was found: an effect that it refutes is taken back. Nothing is searched any
+        more: what follows goes on from what stands."""
+        self.answers = compute.each(
+            len(self.searched), lambda k: self._answer(self.searched[k].search, self.searched[k].outcome)
+        )
+        self.searched = [replace(x, outcome=a.outcome) for x, a in zip(self.searched, self.answers, strict=True)]
 
     def _begun(self, k: int, tell: Callable[[float], None]) -> JointSearch:
         """The search of one joint, not yet run."""
@@ -325,7 +334,7 @@ class Drives(Steps):
         if self.w.limit.seconds is not None and case.moved:
             search.plain()  # what all else is held against has its time before anything else
         if case.moved and case.joint not in self.unknown_controllers:
-            found = shaking.answered(search, search.run())
+            found = ringing.answered(search, search.run())
         else:
             found = search.without_search()
         search.settle(found)
@@ -429,24 +438,24 @@ class Drives(Steps):
         several = list(left.values())
         by = compute.each(len(left), lambda i: None if w.limit.left() <= 0 else self._dragger(*several[i]))
         pulled = {k: case for k, case in zip(left, by, strict=True) if case is not None}
-        self._other_ends(answers, self._search_with(answers, pulled))
+        self._search_draggers(answers, self._search_with(answers, pulled))
 
-    def _other_ends(self, answers: Answers, dragged: Sequence[int]) -> None:
+    def _search_draggers(self, answers: Answers, dragged: Sequence[int]) -> None:
         """The joints that drag those of `dragged`, numbers of `answers`, searched once more with what hangs on them: a
         linkage pulls at both its ends, and what is not asked for at the second looks like a friction or a weight of its
         own."""
         number = {search.case.joint: k for k, (search, _) in enumerate(answers)}
-        ends: dict[int, Case] = {}
+        draggers: dict[int, Case] = {}
         for k in dragged:
             search, found = answers[k]
             assert found is not None  # of `_search_with`
             for other in (m.variant.note["from_joint"] for m in found.best.members if m.effect.couples):
                 i = number.get(other)
-                if i is None or i in ends or (mine := answers[i][1]) is None or not mine.best.members:
+                if i is None or i in draggers or (mine := answers[i][1]) is None or not mine.best.members:
                     continue
                 if search.case.joint not in answers[i][0].case.scales.others:
-                    ends[i] = dragged_by(self.cases[i], [self.cases[k]])
-        self._search_with(answers, ends)
+                    draggers[i] = dragged_by(self.cases[i], [self.cases[k]])
+        self._search_with(answers, draggers)
 
     def _search_with(self, answers: Answers, cases: dict[int, Case]) -> list[int]:
         """The joints `cases`, by their number in `answers`, searched once more as these cases have them; `answers` is
@@ -499,7 +508,7 @@ class Drives(Steps):
             cases, w.runs, p.train, p.test, self.mj_model, w.settings.seed, p.span_train, p.span_test
         )
         self.behind = logged_torque.torque_texts(self.by_torque)
-        self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
+        self.nothing_believed = [x.case.joint for x in self.by_torque if "coulomb_friction" in x.case.unknown]
         w.notes += logged_torque.believe(self.by_torque)
         self.unknown_controllers = logged_torque.unknown_controllers(self.by_torque, self.stages, w.notes)
         for text in self.behind[:4]:
@@ -512,9 +521,6 @@ class Drives(Steps):
         """Where each joint's residual lives: speed, load, time since reversal, ..."""
         seed = self.w.settings.seed
         rng = np.random.default_rng(seed)
-        self.answers = compute.each(len(self.outcomes), lambda k: self._answer(*self.outcomes[k][1:]))
-        # nothing is searched any more: what follows goes on from what stands
-        self.outcomes = [(*x[:2], a.outcome) for x, a in zip(self.outcomes, self.answers, strict=True)]
         for a in self.answers:
             a.locate(rng, seed)
 
@@ -522,7 +528,7 @@ class Drives(Steps):
         """The answers on what was held out, and what a plain model of each joint leaves of it."""
         for a in self.answers:
             a.judge(self.w.m)
-        self.plains = [b for b in compute.each(len(self.outcomes), lambda k: self._plain(self.outcomes[k][1])) if b]
+        self.plains = [b for b in compute.each(len(self.searched), lambda k: self._plain(self.searched[k].search)) if b]
         self.w.clock.lap("plain model")
 
     def report(self, d: Diagnosis) -> None:
@@ -537,14 +543,15 @@ class Drives(Steps):
             )
         d.stages = [x.text for x in self.stages] + self.behind
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
-        logged_torque.hand_on(self.by_torque, d, self.outcomes, p.test, p.span_test, self.stages)
+        logged_torque.hand_on(self.by_torque, d, self.searched, p.test, p.span_test, self.stages)
         conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out
 
     def stand_in(self, d: Diagnosis) -> None:
         """Stand-ins for joints of which something is left that no effect explains."""
         p, limit, longest, late = self.parts, self.w.limit, 0.0, []
-        for case, search, outcome in self.outcomes:
+        for x in self.searched:
+            case, search, outcome = x.case, x.search, x.outcome
             if d.joints[case.joint]["after"] < JUDGE.within * self.noise.floor:
                 continue
             if limit.spent(1 - STANDING_IN) or limit.rest() < 2 * longest:
@@ -574,8 +581,8 @@ class Drives(Steps):
             w.limit.leave_out("not replayed in the engine that trains")
             return
         cases, finer = (
-            [case for case, _, _ in self.outcomes],
-            [replace(case, plant=search.whole) for case, search, _ in self.outcomes],
+            [x.case for x in self.searched],
+            [replace(x.case, plant=x.search.whole) for x in self.searched],
         )
         try:
             found = full_model.confirm(
@@ -608,18 +615,19 @@ class Drives(Steps):
         """What is replayed: as believed, as found, and with the first rival in the place of what it rivals."""
         named = [f for f in d.data["findings"] if f["where"]["joints"] and modelled(f)]
         claimed = {j for f in named for j in f["where"]["joints"]}
-        searches = {case.joint: (search, outcome) for case, search, outcome in self.outcomes}
-        none = {case.joint: search.polish(outcome.none) for case, search, outcome in self.outcomes}
-        final = none | {j: searches[j][0].polish(searches[j][1].best) for j in claimed}
+        by = {x.case.joint: x for x in self.searched}
+        none = {j: x.search.polish(x.outcome.none) for j, x in by.items()}
+        final = none | {j: by[j].search.polish(by[j].outcome.best) for j in claimed}
         out = [full_model.Hypothesis("believed", none)] + ([full_model.Hypothesis("found", final)] if claimed else [])
         for f in named:
             rivals = [a["effect"] for a in f["alternatives"]]
             joint = f["where"]["joints"][0]
-            other = rival_of(*searches[joint], f["effect"], rivals[0]) if rivals else None
+            x = by[joint]
+            other = rival_of(x.search, x.outcome, f["effect"], rivals[0]) if rivals else None
             if other is not None:
                 return [
                     *out,
-                    full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}),
+                    full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: x.search.polish(other)}),
                 ]
         return out
 

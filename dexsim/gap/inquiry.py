@@ -18,6 +18,7 @@ from dexsim.errors import UserError
 from dexsim.gap import locate
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import PadFacts
+from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.judge import confidence, full_model, handed_on
 from dexsim.gap.read import Run, channels, inputs
 from dexsim.gap.search.search import Outcome
@@ -240,17 +241,18 @@ class Steps(ABC):
         """What of the recordings tells of this part alone, as arrays."""
 
     @abstractmethod
-    def model(self) -> None:
+    def plant(self) -> None:
         """The plant that simulates it along the recordings, what is held out of the fit, and the noise."""
 
     @abstractmethod
     def search(self) -> None:
-        """Which effects it has: scan, fit, select on conditions left out."""
+        """Which effects it has: scan, fit, select on conditions left out, and what of that stands on what was held out
+        of the fit."""
 
     @abstractmethod
     def locate(self) -> None:
         """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the
-        recordings."""
+        recordings. After the search, which refits them: it also says where what was found leaves something."""
 
     @abstractmethod
     def judge(self) -> None:
@@ -262,7 +264,7 @@ class Steps(ABC):
 
     def run(self) -> None:
         """All steps up to the judgement, in order."""
-        for step in (self.read, self.model, self.search, self.locate, self.judge):
+        for step in (self.read, self.plant, self.search, self.locate, self.judge):
             step()
 
 
@@ -317,7 +319,8 @@ def to_runs(w: Inquiry) -> None:
             w.held.append(len(w.runs))
         w.runs.append(run)
     readable = w.readable
-    w.channel = inputs.channel_findings(readable, w.m.joints)
+    sensors = {e.id: e.experiment for e in CATALOGUE if e.effort_only}
+    w.channel = inputs.channel_findings(readable, w.m.joints, sensors)
     w.notes += [
         f"{r.path.name}: {f.text}"
         for r in readable

@@ -1,10 +1,10 @@
 """The figures that decide: what each means, where its value came from, and which test fails if it is moved.
 
 What stays elsewhere decides no name, confidence or verdict by itself: sizes, bounds and starts of an effect (in its
-class), what a test of a signal goes by (at the top of its file in `read/`; whether a reading is rounded, in
-`plant/case.py`), figures of the numerics (steps, damping, ridges, filters' widths, grids, caps of a misfit, what a fit
-trims, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets, lengths of short
-lists, how many drafts are looked at closely, whose motion is refined: more of it takes longer).
+class), whether a reading is rounded (in `plant/case.py`), by what a lead is told from a correlation (in
+`read/channels.py`), figures of the numerics (steps, damping, ridges, filters' widths, grids, caps of a misfit, what a
+fit trims, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets, lengths of
+short lists, how many drafts are looked at closely, whose motion is refined: more of it takes longer).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ T = TypeVar("T", int, float)
 def _rule(value: T, means: str, source: str, test: str) -> T:
     """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py (touch:
     tests/test_gap_rules_touch.py, torque: tests/test_gap_rules_torque.py, beliefs:
-    tests/test_gap_rules_belief.py)."""
+    tests/test_gap_rules_belief.py, signals: tests/test_gap_rules_signal.py)."""
     made: T = field(default=value, metadata={"means": means, "source": source, "test": test})
     return made
 
@@ -53,6 +53,14 @@ class SearchRules:
         "of what the earlier ones did; of its room, a plain model's figure must differ by more from what is believed",
         "planted sizes are off by 0.6 to 1.3 % in the median",
         "test_intervals_hold_what_no_residual_shows",
+    )
+    imitates: float = _rule(
+        0.08,
+        "relative, of its loss: what a hypothesis must do better that can imitate simpler ones, as an eccentricity "
+        "whose zero is anywhere imitates a zero error",
+        "above two of what nothing is trusted finer than (`apart`); at 0.2 an eccentric encoder of another plant was "
+        "taken for a zero error",
+        "test_what_can_imitate_another_effect_must_do_better",
     )
     bounded: float = _rule(
         1.5,
@@ -468,6 +476,24 @@ class TouchRules:
         "back",
         "test_the_gain_of_a_taxel_is_believed_to_be_one",
     )
+    touched: float = _rule(
+        0.15,
+        "N of a taxel, at least, while something is touched: a joint that moves then is not judged",
+        "above a count of 0.1 N, by which a taxel may flicker at rest",
+        "test_a_little_force_is_no_touch",
+    )
+    loaded: float = _rule(
+        0.3,
+        "N of a load cell, at least, while something is touched, where no taxels are recorded",
+        "fifteen times the 20 mN of a cell's noise, for its zero may drift by more than it",
+        "test_a_little_force_is_no_touch",
+    )
+    neighbours: int = _rule(
+        3,
+        "of a taxel that never changes: as many must feel the touch for it to be dead",
+        "at the edge of a touch one or two of the taxels beside a sound one feel it",
+        "test_neighbours_of_a_dead_taxel_feel_the_touch",
+    )
     spread: float = _rule(
         0.15,
         "share that may pass to the taxels beside because pressure spreads by another law than the plant's: neighbours "
@@ -668,6 +694,195 @@ class BeliefRules:
 
 
 @dataclass(frozen=True)
+class SignalRules:
+    """By what a signal is told that is not what it says, and an end of a joint's motion that the model does not
+    have."""
+
+    told: float = _rule(
+        0.9,
+        "confidence that a signal is not what it says, where the recording shows it",
+        "surer than any fit, since the recording itself shows it; below certainty, for its clock or its units may be "
+        "stated wrong",
+        "test_a_wrong_signal_is_told_surely",
+    )
+    stopped: float = _rule(
+        0.7,
+        "confidence that an encoder is dead where a position stops for good",
+        "more than a hint, and not sure: a jam and a drive that is off look the same",
+        "test_a_wrong_signal_is_told_surely",
+    )
+    far: float = _rule(
+        3.0,
+        "x a joint's range (and more than a turn) beyond which a position or a target is not that joint's",
+        "above 1, a zero that was set at the other end; degrees for radians are 57 times as far",
+        "test_a_position_far_outside_its_range_is_not_that_joints",
+    )
+    against: float = _rule(
+        0.7,
+        "correlation of a position with the negative of its target from which its direction is another",
+        "1 without delay and friction; motions that lag by a third of a period have -0.5",
+        "test_a_joint_that_follows_the_negative_of_its_target_is_named",
+    )
+    follows: float = _rule(
+        0.2,
+        "of the way of its target, at least, that a position must go for its direction to be told",
+        "noise and what a joint is moved by others are a few percent of its own motion",
+        "test_a_joint_that_hardly_moves_has_no_direction",
+    )
+    early: float = _rule(
+        0.015,
+        "s by which a joint that moves before its target is on another clock",
+        "above the period of 10 ms of most recordings, in which a reading may seem early",
+        "test_a_joint_that_moves_before_its_target_is_on_another_clock",
+    )
+    blind: float = _rule(
+        0.5,
+        "s without a reading, or with an old one, over which the motion is not known",
+        "the smoothing of a motion spans a tenth of that, and a finger may go to and fro in it",
+        "test_over_a_long_pause_the_motion_is_not_known",
+    )
+    still: float = _rule(
+        0.1,
+        "rad (m) that the target of a joint that never moves must span for its encoder to be dead",
+        "dry friction holds small hand joints against errors of some hundredths of a radian",
+        "test_a_joint_that_never_moves_must_have_been_asked_to",
+    )
+    holds: float = _rule(
+        1.5,
+        "x the error at which dry friction has held the joint before: what it does not hold",
+        "breakaway friction scatters by some tens of percent from rest to rest",
+        "test_dry_friction_may_hold_a_joint_as_it_has_before",
+    )
+    rest: float = _rule(
+        0.05,
+        "s of equal readings that are a rest",
+        "above a period of the slowest encoders, of 30 Hz",
+        "test_a_rest_lasts_a_while",
+    )
+    held: float = _rule(
+        0.06,
+        "s: readings that stay the same for as long while a joint moves, and then jump, are old ones",
+        "as `rest`, and a period of 10 ms more",
+        "test_readings_that_stand_while_a_joint_moves_are_old_ones",
+    )
+    jump: float = _rule(
+        2.5,
+        "x the step of nine in ten moving samples: a jump after readings that stood",
+        "a reading that is sent twice makes a step of 2",
+        "test_readings_that_stand_while_a_joint_moves_are_old_ones",
+    )
+    moving: float = _rule(
+        0.1,
+        "of that step, at least, before readings froze: the joint was moving",
+        "a joint that comes to rest, or starts from it, goes through slower steps than a tenth in a sample or two",
+        "test_readings_that_stand_while_a_joint_moves_are_old_ones",
+    )
+    long: float = _rule(
+        0.1,
+        "s: equal readings for as long are looked at beside what the joint does elsewhere",
+        "twice a rest",
+        "test_a_frozen_encoder_is_told_by_what_the_joint_does_elsewhere",
+    )
+    pulse: float = _rule(
+        2.0,
+        "x the largest jump elsewhere in the recordings of the joint: one that ends frozen readings",
+        "noise, quantum and stick-slip make jumps of one size, an encoder that catches up one of another",
+        "test_a_frozen_encoder_is_told_by_what_the_joint_does_elsewhere",
+    )
+    passed: float = _rule(
+        2.0,
+        "x the way that the target has gone in any other rest of the joint",
+        "friction that held a joint so far may hold it a little further",
+        "test_a_frozen_encoder_is_told_by_what_the_joint_does_elsewhere",
+    )
+    way: float = _rule(
+        0.1,
+        "of all the way of the target, at least, that it goes while readings are frozen",
+        "what moves less changes no fit",
+        "test_a_frozen_encoder_is_told_by_what_the_joint_does_elsewhere",
+    )
+    often: float = _rule(
+        0.02,
+        "of a recording's samples that repeat the one before while the joint moves: it is said from there on",
+        "at 100 Hz two a second, which the smoothing of a motion bears",
+        "test_a_few_repeated_samples_say_nothing",
+    )
+    few: int = _rule(
+        8,
+        "repeated samples, at least",
+        "a short recording of half a second at 100 Hz has one in fifty by accident",
+        "test_a_few_repeated_samples_say_nothing",
+    )
+    leap: float = _rule(
+        3.0,
+        "smallest steps of an encoder: a reading that stood and changes by as many at once has been read anew",
+        "between 2, of a count that jitters, and the tens of a joint that moves at its usual speed",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    leaps: float = _rule(
+        0.25,
+        "of all changes that must be leaps",
+        "a motion to and fro is slow, and leaps by less, for up to half of the time",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    seldom: float = _rule(
+        4.0,
+        "samples, at least, from one new reading to the next",
+        "every second or third sample is what a bus does that is a little slower than its log",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    between: float = _rule(
+        0.1,
+        "of all changes that may come early in the rhythm, before the next reading is due",
+        "a log whose clock jitters puts one in twenty a sample early",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    rhythm: float = _rule(
+        0.85,
+        "mean length of the turns of new readings round their period: 1 all in step, 0 none",
+        "readings within a twelfth of the period have 0.87, those of a joint that sticks and slips below a half",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    anew: int = _rule(
+        10,
+        "new readings that make a rhythm",
+        "of ten turns at random the mean is longer than `rhythm` less than once in a thousand times",
+        "test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm",
+    )
+    near: float = _rule(
+        0.012,
+        "of a joint's whole motion: as near to its outermost position as a stop lets it; an error of three times as "
+        "much",
+        "the give of a stop and of the links is some thousandths of a motion",
+        "test_an_end_is_met_hard_long_and_again",
+    )
+    pressed: float = _rule(
+        5.0,
+        "x the usual error at rest: what no friction would hold",
+        "as a push (`torque.far`)",
+        "test_an_end_is_met_hard_long_and_again",
+    )
+    hard: float = _rule(
+        5.0,
+        "x gravity, at least, of the torque asked for at an end: what no load would hold",
+        "a hand's finger with an object weighs up to three times as much as without",
+        "test_an_end_bears_more_than_a_load",
+    )
+    meeting: float = _rule(
+        0.1,
+        "s: the shortest meeting of an end",
+        "as `long`",
+        "test_an_end_is_met_hard_long_and_again",
+    )
+    times: int = _rule(
+        2,
+        "separate times that a joint must meet an end",
+        "a jam is met once",
+        "test_an_end_is_met_hard_long_and_again",
+    )
+
+
+@dataclass(frozen=True)
 class Rules:
     """All of them."""
 
@@ -676,10 +891,12 @@ class Rules:
     touch: TouchRules = TouchRules()
     torque: TorqueRules = TorqueRules()
     belief: BeliefRules = BeliefRules()
+    signal: SignalRules = SignalRules()
 
 
 RULES = Rules()
 SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = RULES.search, RULES.judge, RULES.touch, RULES.torque, RULES.belief
+SIGNAL = RULES.signal
 
 
 # x something: what is left of 1 is what decides

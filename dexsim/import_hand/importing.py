@@ -133,7 +133,7 @@ def import_hand(
     apart = poses.near_the_palm(m, found)
     own = build.build(name, m, found, made, known, apart, text)
     search = _search(own, m, found, motions, thumbs, palm)
-    drawn = poses.drawn_together(search)
+    drawn = poses.always_overlapping(search)
     if drawn:
         own = build.build(name, m, found, made, known, apart + drawn, text)
         search = _search(own, m, found, motions, thumbs, palm)

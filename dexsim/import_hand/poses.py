@@ -181,7 +181,7 @@ def near_the_palm(m: mujoco.MjModel, tree: Tree) -> list[tuple[str, str]]:
     return list(dict.fromkeys(out))
 
 
-def drawn_together(s: Search, count: int = 150, seed: int = 1) -> list[tuple[str, str]]:
+def always_overlapping(s: Search, count: int = 150, seed: int = 1) -> list[tuple[str, str]]:
     """Pairs of bodies that overlap in most postures: drawn into each other, not in each other's way."""
     m, rng = s.m, np.random.default_rng(seed)
     times: dict[tuple[str, str], int] = {}

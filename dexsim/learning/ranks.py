@@ -117,7 +117,7 @@ class Ranks:
             dist.destroy_process_group()
 
     @property
-    def together(self) -> bool:
+    def several(self) -> bool:
         """Whether there are others to talk to now."""
         return self._lifeline is not None
 
@@ -128,7 +128,7 @@ class Ranks:
 
     def tell(self, value: Any) -> Any:
         """The leader's value, everywhere (pickled; small things)."""
-        if not self.together:
+        if not self.several:
             return value
         box = [value]
         dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
@@ -140,7 +140,7 @@ class Ranks:
 
     def any(self, flag: bool) -> bool:
         """Whether the flag is set on any rank; decided in host memory, so that no GPU is waited for."""
-        if not self.together:
+        if not self.several:
             return flag
         votes = torch.tensor([int(flag)])
         dist.all_reduce(votes, op=dist.ReduceOp.MAX)
@@ -148,7 +148,7 @@ class Ranks:
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
         """``values`` summed over ranks, in place, on their device."""
-        if self.together:
+        if self.several:
             dist.all_reduce(values)
         return values
 
@@ -157,10 +157,10 @@ class Ranks:
         """Around what compiles kernels: the first rank of each machine does it alone, the others then find them
         cached."""
         first = self.local == 0
-        if self.together and not first:
+        if self.several and not first:
             self.wait()
         yield
-        if self.together and first:
+        if self.several and first:
             self.wait()
 
     @contextlib.contextmanager

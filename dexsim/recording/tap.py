@@ -16,7 +16,8 @@ import yaml
 from dexsim import outputs, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY, NAMES
 from dexsim.actuator.kernel import EXTENDED, FRESH
-from dexsim.actuator.laws import encoder_error
+from dexsim.actuator.laws import encoder_error, encoder_line
+from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
@@ -28,12 +29,26 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 
 @cache
-def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel:
+def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.Kernel, Any]:
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
     object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph.
-    features: of the servo, those of `columns.FEATURES`."""
+    features: of the servo, those of `columns.FEATURES`. The kernel, and the struct that it takes, shapes and units as
+    in `servo.Servo`."""
     encoder, Memory = encoder_error(features), wp.types.vector(len(MEMORY), real)
     remembers = bool(features & EXTENDED)
+
+    @wp.struct
+    class Tapped:
+        q_index: wp.array(dtype=int)  # [J] addresses
+        v_index: wp.array(dtype=int)
+        object_q: int
+        time: wp.array(dtype=real)
+        qpos: wp.array2d(dtype=real)
+        qvel: wp.array2d(dtype=real)
+        torque: wp.array2d(dtype=real)
+        params: wp.array3d(dtype=real)
+        state: wp.array3d(dtype=real)
+        first_memory: int  # of the state's slots
 
     @wp.func
     def remembered(w: int, j: int, first: int, state: wp.array3d(dtype=real)):
@@ -49,41 +64,45 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> wp.Kernel
     @wp.kernel(module="unique", enable_backward=False)
     def copy_rows(
         worlds: wp.array(dtype=int),
-        q_index: wp.array(dtype=int),
-        v_index: wp.array(dtype=int),
-        object_q: int,
-        time: wp.array(dtype=real),
-        qpos: wp.array2d(dtype=real),
-        qvel: wp.array2d(dtype=real),
-        torque: wp.array2d(dtype=real),
-        params: wp.array3d(dtype=real),
-        state: wp.array3d(dtype=real),
-        first_memory: int,  # of the state's slots
+        x: Tapped,
         slot: wp.array(dtype=int),
         rows: wp.array3d(dtype=real),
     ):
         s, c = wp.tid()
         w = worlds[s]
-        joints = q_index.shape[0]
-        value = time[w]
+        joints = x.q_index.shape[0]
+        value = x.time[w]
         if c >= 1 and c <= joints:
             j = c - 1
-            memory, fresh = remembered(w, j, first_memory, state)
-            error = encoder(params[w, j], qpos[w, q_index[j]], memory, fresh)
-            value = params[w, j, SCALE] * qpos[w, q_index[j]] + params[w, j, OFFSET]
+            memory, fresh = remembered(w, j, x.first_memory, x.state)
+            error = encoder(x.params[w, j], x.qpos[w, x.q_index[j]], memory, fresh)
+            value = encoder_line(x.qpos[w, x.q_index[j]], x.params[w, j, SCALE], x.params[w, j, OFFSET])
             value += error[0] + error[1]
         elif c > joints and c <= 2 * joints:
             j = c - 1 - joints
-            memory, fresh = remembered(w, j, first_memory, state)
-            slope = params[w, j, SCALE] + encoder(params[w, j], qpos[w, q_index[j]], memory, fresh)[2]
-            value = slope * qvel[w, v_index[j]]
+            memory, fresh = remembered(w, j, x.first_memory, x.state)
+            slope = x.params[w, j, SCALE] + encoder(x.params[w, j], x.qpos[w, x.q_index[j]], memory, fresh)[2]
+            value = slope * x.qvel[w, x.v_index[j]]
         elif c > 2 * joints and c <= 3 * joints:
-            value = torque[w, c - 1 - 2 * joints]
+            value = x.torque[w, c - 1 - 2 * joints]
         elif c > 3 * joints:
-            value = qpos[w, object_q + c - 1 - 3 * joints]
+            value = x.qpos[w, x.object_q + c - 1 - 3 * joints]
         rows[slot[0], s, c] = value
 
-    return copy_rows
+    return copy_rows, Tapped
+
+
+def tap(
+    kind: Any, engine: Any, servo: Servo, q_index: np.ndarray, v_index: np.ndarray, object_q: int
+) -> Any:
+    """The struct of a `copy_kernel` with an engine's and its servo's arrays; where joints and object are in the
+    state."""
+    made = kind()
+    made.q_index, made.v_index, made.object_q = wp.array(q_index, dtype=int), wp.array(v_index, dtype=int), object_q
+    made.time, made.qpos, made.qvel = engine.wp.time, engine.wp.qpos, engine.wp.qvel
+    made.torque, made.params, made.state = servo._torque, servo._params, servo._state
+    made.first_memory = servo.first_memory
+    return made
 
 
 @wp.kernel(enable_backward=False)
@@ -125,17 +144,13 @@ class PlayRecorder:
         self.joints = tuple(servo.joints)
         J, K, count = len(self.joints), env.decimation, len(chosen)
         with wp.ScopedDevice(engine.device):
-            self._args = [
-                wp.array(chosen, dtype=int), wp.array(engine.qpos_index(self.joints), dtype=int),
-                wp.array(engine.dof_index(self.joints), dtype=int),
-                int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]),
-                engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params, servo._state,
-                servo.first_memory,
-                wp.zeros(1, dtype=int), wp.zeros((K, count, 1 + 3 * J + 7), dtype=engine.real),
-            ]  # fmt: skip
-        self._slot, self._rows = self._args[-2], self._args[-1]
+            at = int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")])
+            self._kernel, kind = copy_kernel(engine.real, servo.features)
+            of = tap(kind, engine, servo, engine.qpos_index(self.joints), engine.dof_index(self.joints), at)
+            self._slot = wp.zeros(1, dtype=int)
+            self._rows = wp.zeros((K, count, 1 + 3 * J + 7), dtype=engine.real)
+            self._args = [wp.array(chosen, dtype=int), of, self._slot, self._rows]
         self._rows_t = wp.to_torch(self._rows)
-        self._kernel = copy_kernel(engine.real, servo.features)
         self._servo_before, self._step = servo.before_each, env.step
         self._imu = env.task.get("perception") == "imu"  # an IMU in the object
         self._waiting: list[torch.Tensor] = []

@@ -35,47 +35,54 @@ def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair], slots: int =
     return table
 
 
+@wp.struct
+class Contacts:
+    """MuJoCo-Warp's contact list and the forces of its constraints."""
+
+    nacon: wp.array(dtype=int)
+    geom: wp.array(dtype=wp.vec2i)
+    worldid: wp.array(dtype=int)
+    frame: wp.array(dtype=wp.mat33)
+    dim: wp.array(dtype=int)
+    friction: wp.array(dtype=vec5)
+    efc_address: wp.array2d(dtype=int)
+    efc_force: wp.array2d(dtype=float)
+    njmax: int
+    pyramidal: int
+
+
 @wp.kernel(enable_backward=False)
 def add_contacts(
-    nacon: wp.array(dtype=int),
-    geom: wp.array(dtype=wp.vec2i),
-    worldid: wp.array(dtype=int),
-    frame: wp.array(dtype=wp.mat33),
-    dim: wp.array(dtype=int),
-    friction: wp.array(dtype=vec5),
-    efc_address: wp.array2d(dtype=int),
-    efc_force: wp.array2d(dtype=float),
-    njmax: int,
-    pyramidal: int,
+    x: Contacts,
     table: wp.array3d(dtype=int),
     # out
     normal_sum: wp.array2d(dtype=int),
     force_sum: wp.array3d(dtype=int),
 ):
     c = wp.tid()
-    if c >= nacon[0]:
+    if c >= x.nacon[0]:
         return
-    adr = efc_address[c, 0]
-    g = geom[c]
+    adr = x.efc_address[c, 0]
+    g = x.geom[c]
     if adr < 0 or g[0] < 0 or g[1] < 0:
         return
-    w = worldid[c]
+    w = x.worldid[c]
     f = wp.vec3(0.0, 0.0, 0.0)
-    if pyramidal == 1 and dim[c] > 1:
+    if x.pyramidal == 1 and x.dim[c] > 1:
         # rows are the edges n +- mu_i t_i of the pyramid, two a direction
-        for i in range(dim[c] - 1):
-            if adr + 2 * i + 1 < njmax:
-                plus, minus = efc_force[w, adr + 2 * i], efc_force[w, adr + 2 * i + 1]
+        for i in range(x.dim[c] - 1):
+            if adr + 2 * i + 1 < x.njmax:
+                plus, minus = x.efc_force[w, adr + 2 * i], x.efc_force[w, adr + 2 * i + 1]
                 f[0] += plus + minus
                 if i < 2:
-                    f[i + 1] = (plus - minus) * friction[c][i]
+                    f[i + 1] = (plus - minus) * x.friction[c][i]
     else:
-        for i in range(wp.min(dim[c], 3)):
-            a = efc_address[c, i]
-            if a >= 0 and a < njmax:
-                f[i] = efc_force[w, a]
+        for i in range(wp.min(x.dim[c], 3)):
+            a = x.efc_address[c, i]
+            if a >= 0 and a < x.njmax:
+                f[i] = x.efc_force[w, a]
     # the frame's first row is the normal, from geom[0] to geom[1]; f acts on geom[1]
-    world = wp.transpose(frame[c]) * f
+    world = wp.transpose(x.frame[c]) * f
     for k in range(table.shape[2]):
         p = table[g[0], g[1], k]
         if p != 0:

@@ -17,7 +17,7 @@ import warp as wp
 from warp._src import context
 
 
-def compile_together(program: Callable[[], None], device: str) -> int:
+def compile_side_by_side(program: Callable[[], None], device: str) -> int:
     """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what
     it reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
     where = wp.get_device(device)

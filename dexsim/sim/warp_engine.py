@@ -18,7 +18,7 @@ from dexsim.sim import contact
 from dexsim.sim import solver as newton
 from dexsim.sim.begin import Begin
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
-from dexsim.sim.warmup import compile_together
+from dexsim.sim.warmup import compile_side_by_side
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 _STREAMS: dict[int, wp.Stream] = {}
@@ -115,7 +115,7 @@ class WarpEngine(Engine):
         self._fields_t = {k: wp.to_torch(v) for k, v in self._fields.items()}
         self._graphs: dict = {}
         self._eager_done: set = set()
-        compile_together(self._one_step, device)
+        compile_side_by_side(self._one_step, device)
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:
@@ -181,22 +181,15 @@ class WarpEngine(Engine):
     def _outputs(self) -> None:
         d = self.d
         if self.pairs:
+            now = contact.Contacts()
+            for name in ("geom", "worldid", "frame", "dim", "friction", "efc_address"):
+                setattr(now, name, getattr(d.contact, name))
+            now.nacon, now.efc_force, now.njmax = d.nacon, d.efc.force, d.njmax
+            now.pyramidal = int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
             wp.launch(
                 contact.add_contacts,
                 dim=d.naconmax,
-                inputs=[
-                    d.nacon,
-                    d.contact.geom,
-                    d.contact.worldid,
-                    d.contact.frame,
-                    d.contact.dim,
-                    d.contact.friction,
-                    d.contact.efc_address,
-                    d.efc.force,
-                    d.njmax,
-                    int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
-                    self._table,
-                ],
+                inputs=[now, self._table],
                 outputs=[self._normal_sum, self._force_sum],
             )
             wp.launch(

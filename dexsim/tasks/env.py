@@ -34,7 +34,7 @@ from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.memory import give_back
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
-from dexsim.sim.warmup import compile_together
+from dexsim.sim.warmup import compile_side_by_side
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
@@ -184,7 +184,7 @@ class HandEnv(VecEnv):
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
-        compile_together(self._name_kernels, device)
+        compile_side_by_side(self._name_kernels, device)
         self.reset_all()
 
     def _check_rewards(self) -> None:
@@ -288,7 +288,7 @@ class HandEnv(VecEnv):
 
     def _before(self) -> None:
         self.act(self._action_in)
-        with self._drawn_together("orders"):
+        with self._drawn_ahead("orders"):
             self.before_physics()
         self._nan_dump.before()
 
@@ -314,15 +314,19 @@ class HandEnv(VecEnv):
         ended = torch.stack(list(ends.values())) if ends else self.nan[None][:0]
         rates = torch.empty(len(ends) + 2, self.num_envs, device=self.device)
         count = self.nan_count.view(1)
-        given = (self._episode_length, self._length_limit.view(1), self._blind[0], ended, reward, self.nan, self._wrong)
-        args = (*given, count, self.reward, self.done, self.time_out, rates)
-        wp.launch(state_kernels.judge, dim=self.num_envs, inputs=[*map(wp.from_torch, args)], device=self.device)
+        given = filled(
+            state_kernels.Ends, episode_length=self._episode_length, limit=self._length_limit.view(1),
+            blind=self._blind[0], ends=ended,
+        )  # fmt: skip
+        out = filled(state_kernels.Ended, total=self.reward, done=self.done, time_out=self.time_out, rates=rates)
+        inputs = [given, *map(wp.from_torch, (reward, self.nan, self._wrong, count)), out]
+        wp.launch(state_kernels.judge, dim=self.num_envs, inputs=inputs, device=self.device)
         return rates, reward
 
     @contextmanager
-    def _drawn_together(self, name: str) -> Iterator[None]:
+    def _drawn_ahead(self, name: str) -> Iterator[None]:
         """On a GPU, all random numbers of a part of the step at once; evaluation draws as ever, whatever the device."""
-        with self.sampler.together(name) if self.graphs and self.draws_together else nullcontext():
+        with self.sampler.drawn_ahead(name) if self.graphs and self.draws_ahead else nullcontext():
             yield
 
     def _reset_done(self) -> None:
@@ -355,17 +359,11 @@ class HandEnv(VecEnv):
         """Turn actions [N, J] into targets. `relative`: the target moves by action * scale a step, held within the
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
         the joint's range."""
-        act = self.task["action"]
-        wp.launch(
-            state_kernels.act,
-            dim=actions.shape,
-            inputs=[
-                wp.from_torch(actions.to(torch.float32)), act["mode"] == "relative", act.get("scale", 0.0),
-                act.get("lead", 0.0),
-                *self._act_args,
-            ],
-            device=self.device,
-        )  # fmt: skip
+        act, reach = self.task["action"], self._reach
+        reach.relative, reach.scale = act["mode"] == "relative", act.get("scale", 0.0)
+        reach.lead = act.get("lead", 0.0)
+        inputs = [wp.from_torch(actions.to(torch.float32)), reach, *self._act_args]
+        wp.launch(state_kernels.act, dim=actions.shape, inputs=inputs, device=self.device)
         if self.reality is None:
             self.servo.send(self.target)
         else:
@@ -379,7 +377,7 @@ class HandEnv(VecEnv):
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
-        with self._drawn_together("episodes"):
+        with self._drawn_ahead("episodes"):
             self.begin_episodes(mask)
         self.engine.refresh()
         self._clear_touch(mask)
@@ -391,7 +389,7 @@ class HandEnv(VecEnv):
 
     def _observe_all(self) -> None:
         self._blind.zero_()
-        with self._drawn_together("observations"):
+        with self._drawn_ahead("observations"):
             observed = self.observe(advance=True)
         for row, (group, value) in enumerate(observed.items(), 1):
             if group not in self.obs:
@@ -429,7 +427,7 @@ class HandEnv(VecEnv):
         return [*own, object_kernel.write_kernel(real), servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
-        """For `compile_together`, which asks of a launch only which kernel it is of."""
+        """For `compile_side_by_side`, which asks of a launch only which kernel it is of."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)
 
@@ -505,7 +503,7 @@ class HandEnv(VecEnv):
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
         self.graphs, self.keep_final_obs = True, False
-        self.draws_together = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
+        self.draws_ahead = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
         # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step.
         # (The random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
         self.skip_idle_resets = self.engine.kind == "mujoco"
@@ -530,8 +528,11 @@ class HandEnv(VecEnv):
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
             state.xmat, at, seen,
         ]  # fmt: skip
-        own = (self.q, self.q_low, self.q_high, self.q_mid, self.q_half, self.action, self.last_action, self.target)
-        self._act_args = [wp.from_torch(x) for x in own]
+        self._reach = filled(
+            state_kernels.Reach, relative=False, scale=0.0, lead=0.0, low=self.q_low, high=self.q_high,
+            middle=self.q_mid, half=self.q_half,
+        )  # fmt: skip
+        self._act_args = [wp.from_torch(x) for x in (self.q, self.action, self.last_action, self.target)]
         touch = self.touch
         self._touch_args = [
             at.tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),

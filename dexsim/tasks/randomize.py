@@ -92,7 +92,7 @@ class Sampler:
         self._ahead: deque[tuple[Request, torch.Tensor]] = deque()
 
     @contextmanager
-    def together(self, name: str) -> Iterator[None]:
+    def drawn_ahead(self, name: str) -> Iterator[None]:
         """Within this, what is drawn is drawn by a dozen kernels, and not by six for each range.
 
         The first time under a `name` notes what is asked for, in which order. From then on all of that is drawn at the

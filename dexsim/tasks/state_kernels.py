@@ -113,17 +113,24 @@ def clear_touch(
         centre_clean[w, f] = here
 
 
+@wp.struct
+class Reach:
+    """What targets a joint may be given. Relative: an action moves the target, else it spans the range."""
+
+    relative: bool
+    scale: float  # rad a control step; relative only
+    lead: float  # rad that a target may be ahead of the measured angle; relative only
+    low: wp.array(dtype=float)  # [J] rad
+    high: wp.array(dtype=float)
+    middle: wp.array(dtype=float)
+    half: wp.array(dtype=float)
+
+
 @wp.kernel(enable_backward=False)
 def act(
     given: wp.array2d(dtype=float),
-    relative: bool,
-    scale: float,  # rad a control step; relative only
-    lead: float,  # rad that a target may be ahead of the measured angle; relative only
+    reach: Reach,
     q: wp.array2d(dtype=float),
-    low: wp.array(dtype=float),
-    high: wp.array(dtype=float),
-    middle: wp.array(dtype=float),
-    half: wp.array(dtype=float),
     # in and out
     action: wp.array2d(dtype=float),
     last_action: wp.array2d(dtype=float),
@@ -137,29 +144,42 @@ def act(
     a = wp.clamp(a, -1.0, 1.0)
     last_action[w, j] = action[w, j]
     action[w, j] = a
-    t = middle[j] + a * half[j]
-    if relative:
-        t = target[w, j] + a * scale
-        t = wp.max(wp.min(t, q[w, j] + lead), q[w, j] - lead)
-    target[w, j] = wp.max(wp.min(t, high[j]), low[j])
+    t = reach.middle[j] + a * reach.half[j]
+    if reach.relative:
+        t = target[w, j] + a * reach.scale
+        t = wp.max(wp.min(t, q[w, j] + reach.lead), q[w, j] - reach.lead)
+    target[w, j] = wp.max(wp.min(t, reach.high[j]), reach.low[j])
+
+
+@wp.struct
+class Ends:
+    """What ends the episodes of N worlds."""
+
+    episode_length: wp.array(dtype=wp.int64)  # [N] control steps
+    limit: wp.array(dtype=wp.int64)  # [1]
+    blind: wp.array(dtype=wp.bool)  # [N] an observation is not finite
+    ends: wp.array2d(dtype=wp.bool)  # [E, N]
+
+
+@wp.struct
+class Ended:
+    """Which worlds end, and what they earned."""
+
+    total: wp.array(dtype=float)  # [N]
+    done: wp.array(dtype=wp.bool)
+    time_out: wp.array(dtype=wp.bool)
+    rates: wp.array2d(dtype=float)  # [E + 2, N] of each end, of nan and of time_out: 1 or 0
 
 
 @wp.kernel(enable_backward=False)
 def judge(
-    episode_length: wp.array(dtype=wp.int64),
-    limit: wp.array(dtype=wp.int64),
-    blind: wp.array(dtype=wp.bool),
-    ends: wp.array2d(dtype=wp.bool),  # [E, N]
+    given: Ends,
     # in and out
     reward: wp.array2d(dtype=float),  # [T, N]
     nan: wp.array(dtype=wp.bool),
     wrong: wp.array(dtype=wp.int64),  # [1 + T + 1] world-steps: of states, of each reward, of observations
     nan_count: wp.array(dtype=wp.int64),
-    # out
-    total: wp.array(dtype=float),
-    done: wp.array(dtype=wp.bool),
-    time_out: wp.array(dtype=wp.bool),
-    rates: wp.array2d(dtype=float),  # [E + 2, N] of each end, of nan and of time_out: 1 or 0
+    out: Ended,
 ):
     """Which worlds end, and what they earned. One whose state, a reward or the last observation is not finite ends as
     `nan` and earns nothing."""
@@ -177,7 +197,7 @@ def judge(
             if not bad:
                 wp.atomic_add(wrong, 1 + k, wp.int64(1))
             found = True
-    if blind[w]:
+    if given.blind[w]:
         wp.atomic_add(wrong, 1 + terms, wp.int64(1))
         found = True
     if found:
@@ -187,16 +207,16 @@ def judge(
             reward[k, w] = float(0.0)
     nan[w] = found
     dead = found
-    count = ends.shape[0]
+    count = given.ends.shape[0]
     for k in range(count):
-        rates[k, w] = wp.where(ends[k, w], float(1.0), float(0.0))
-        dead = dead or ends[k, w]
-    late = episode_length[w] >= limit[0] and not dead
-    rates[count, w] = wp.where(found, float(1.0), float(0.0))
-    rates[count + 1, w] = wp.where(late, float(1.0), float(0.0))
-    total[w] = total_here
-    time_out[w] = late
-    done[w] = dead or late
+        out.rates[k, w] = wp.where(given.ends[k, w], float(1.0), float(0.0))
+        dead = dead or given.ends[k, w]
+    late = given.episode_length[w] >= given.limit[0] and not dead
+    out.rates[count, w] = wp.where(found, float(1.0), float(0.0))
+    out.rates[count + 1, w] = wp.where(late, float(1.0), float(0.0))
+    out.total[w] = total_here
+    out.time_out[w] = late
+    out.done[w] = dead or late
 
 
 @wp.kernel(enable_backward=False)

@@ -8,7 +8,7 @@ Of an effect that training has no use for the columns stand in `dexsim.gap.plant
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from dexsim.actuator.table import ServoTable
     from dexsim.gap.plant.case import Case
+    from dexsim.gap.search.inverse_dynamics import Columns
     from dexsim.gap.touch.read import PadRun
     from dexsim.gap.touch.search import PadSearch, TouchTrial
 
@@ -46,6 +47,12 @@ class PadFacts:
     friction: float = FRICTION
     slid: bool = False
     judged: bool = True
+
+    def believed(self, setting: str) -> float | None:
+        """What was believed of a setting of the whole world (`PadSettings.shared`), None where this pad cannot say."""
+        told = {"object.friction": (self.friction, self.slid), "contact.stiffness": (self.stiffness, True)}
+        value, known = told[setting]
+        return value if self.judged and known else None
 
 
 @dataclass
@@ -97,7 +104,7 @@ class Variant:
     note: dict = field(default_factory=dict)
     refines: bool = False  # adds parameters to the first variant: tried only where that one was found
     approximate: bool = False  # the servo table has it less exactly: tried only where what stands in for it leaves much
-    dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
+    complexity_price: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
     laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)
 
     def by_law(self) -> list[Variant]:
@@ -213,6 +220,8 @@ class Effect:
     jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
     by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
+    # whether that column names it; else it only keeps others from taking its trace for their own
+    named_by_torque: ClassVar[bool] = True
     # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
     approximated: ClassVar[tuple[str, ...]] = ()
 
@@ -236,6 +245,16 @@ class Effect:
         """Parameters by the keys of `diagnosis.json`, with 90 % intervals."""
         raise NotImplementedError
 
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        """What it adds to the torque per unit of its coefficient, as columns [m] of what inverse dynamics filtered; by
+        `by_torque`, behind it in brackets what else its law was given. own: what is fitted."""
+        return {}
+
+    @property
+    def shows_by_torque(self) -> str:
+        """The regime of what logged torque names."""
+        return self.shows
+
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         """The same where logged torque showed it and not the motion: for those of `search.inverse_dynamics`."""
         raise NotImplementedError
@@ -248,6 +267,11 @@ class Effect:
         """Whether a coefficient of inverse dynamics can be what it is called. joint: as of `ByTorque`; slowest: the
         lowest cutoff [Hz] of what was filtered."""
         return True
+
+    def impossible_by_torque(self, value: float, joint: dict[str, float]) -> str:
+        """Why such a coefficient is told as a refusal where it is not possible; empty where it is not. The arguments:
+        as of `possible_by_torque`."""
+        return ""
 
     def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
         """Servo columns in the place of those `approximated`. row: the plant's, as fitted."""

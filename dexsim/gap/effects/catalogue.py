@@ -47,6 +47,9 @@ FIRST = (
     "external_force",
 )
 """The order in which the search asks; an effect that is not named here comes after, in the order of the files."""
+FIRST_BY_TORQUE = ("viscous_friction", "lag", "load_friction", "stribeck_friction")
+"""The same for inverse dynamics: of two effects that are the best to add in as many bootstraps, the first is the
+rival."""
 FIRST_TOUCH = (
     "tactile_gain",
     "tactile_stiffening",
@@ -70,12 +73,19 @@ def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[
         for c in vars(family).values()
         if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
     ]
+    return in_order(found, first)
+
+
+def in_order(found: Sequence[Entry], first: Sequence[str]) -> tuple[Entry, ...]:
+    """Entries with those of the ids `first` before all others."""
     return tuple(sorted(found, key=lambda e: first.index(e.id) if e.id in first else len(first)))
 
 
 CATALOGUE = gathered(Effect, (friction, transmission, signals, drive, body), FIRST)
 """Effects of a joint and its drive."""
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
+BY_TORQUE = in_order([e for e in CATALOGUE if e.by_torque], FIRST_BY_TORQUE)
+"""Those that inverse dynamics have a column of."""
 TOUCH_CATALOGUE = gathered(TouchEffect, (touch,), FIRST_TOUCH)
 """Effects of touch and contact."""
 TOUCH_EFFECTS: dict[str, TouchEffect] = {e.id: e for e in TOUCH_CATALOGUE}

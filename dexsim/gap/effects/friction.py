@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from dexsim.gap.rules import BELIEF, JUDGE
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
+    from dexsim.gap.search.inverse_dynamics import Columns
 
 
 class CoulombFriction(Effect):
@@ -103,6 +106,13 @@ class ViscousFriction(Effect):
             "half_speed": fit.entry("half_speed", f"{fit.length}/s"),
         }
 
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        return {self.by_torque: lambda d: np.abs(d.v)}
+
+    @property
+    def shows_by_torque(self) -> str:
+        return f"{self.shows}; differs by direction"
+
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of what differs by direction
         own = found.joint["viscous_friction"]
         unit = f"{found.force}.s/{found.length}"
@@ -113,6 +123,16 @@ class ViscousFriction(Effect):
 
     def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
         return abs(value) <= joint.get("viscous_friction", 0.0)
+
+    def impossible_by_torque(self, value: float, joint: dict[str, float]) -> str:
+        return (
+            f"the least squares give {joint.get('viscous_friction', 0.0):.3g} with {value:.3g} more forwards and less "
+            "backwards, and neither direction's can be negative"
+        )
+
+
+SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)
+"""Of the top speed of a recorded motion: where inverse dynamics try Stribeck's excess to be down to 1/e."""
 
 
 class StribeckFriction(Effect):
@@ -143,12 +163,21 @@ class StribeckFriction(Effect):
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"peak": fit.entry("peak", fit.force), "v_s": fit.entry("v_s", f"{fit.length}/s")}
 
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        top = float(np.abs(own.v).max())
+        return {f"{self.by_torque} (v_s {k * top:.3g})": partial(_falling, speed=k * top) for k in SPEEDS}
+
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         v_s = found.speed
         return {"peak": found.entry(found.force), "v_s": entry(v_s, 0.5 * v_s, 2 * v_s, f"{found.length}/s")}
 
     def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
         return value > 0  # an excess is more
+
+
+def _falling(d: Columns, speed: float) -> np.ndarray:
+    """[m] dry friction of one that falls with speed [rad/s], exp(-(v / speed)^2)."""
+    return d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / speed) ** 2)))
 
 
 class LoadFriction(Effect):
@@ -192,6 +221,9 @@ class LoadFriction(Effect):
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}
 
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        return {self.by_torque: lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))} if own.loaded else {}
+
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         return {"fraction": found.entry("1")}
 
@@ -215,6 +247,10 @@ def give(s: Scales) -> float:
     return BELIEF.gives_slide if s.slide else BELIEF.gives
 
 
+DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
+"""Of a whole recorded motion: over which inverse dynamics try dry friction to give way."""
+
+
 class Presliding(Effect):
     """Dry friction that gives way elastically before it slides.
 
@@ -223,6 +259,8 @@ class Presliding(Effect):
     """
 
     id = "presliding"
+    by_torque = "dry friction that gives way before it slides"
+    named_by_torque = False
     words = "gives way elastically before its dry friction slides"
     shows = "after reversals and in small motions"
     experiment = "slow reversals about a pose, from far below a degree up, without and with a load"
@@ -244,3 +282,28 @@ class Presliding(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"distance": fit.entry("distance", fit.length)}
+
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        ways = (k * own.span for k in DISTANCES)
+        return {f"{self.by_torque} (over {way:.2g})": partial(_gives, way=way) for way in ways}
+
+    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+        return 0 < value < 2 * joint.get("coulomb_friction", 0.0)  # what gives way is friction that is there
+
+
+def _gives(d: Columns, way: float) -> np.ndarray:
+    """[m] dry friction of one that is taken up over a way [rad], less what is there at once."""
+    return d.column(lambda q, v, load: taken_up(q, way) - np.sign(v))
+
+
+def taken_up(q: np.ndarray, distance: float) -> np.ndarray:
+    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
+    exactly (P. Dahl 1968)."""
+    z, out = 0.0, np.empty(len(q))
+    steps = np.diff(q, prepend=q[0])
+    keep = np.exp(-np.abs(steps) / distance)
+    for i, (step, k) in enumerate(zip(steps, keep, strict=True)):
+        way = 1.0 if step > 0 else -1.0
+        z = way + (z - way) * k
+        out[i] = z
+    return out

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dexsim.gap.effects import ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
+from dexsim.gap.rules import SEARCH
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
+    from dexsim.gap.search.inverse_dynamics import Columns
 
 
 class CommandDelay(Effect):
@@ -78,6 +81,9 @@ class Lag(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"time_constant": fit.entry("time_constant", "s")}
+
+    def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
+        return {self.by_torque: lambda d: d.rise}
 
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of the rate of acceleration
         return {"time_constant": found.entry("s", over=found.joint["inertia"])}
@@ -158,7 +164,7 @@ class PositionScale(Effect):
                     params,
                     ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)),
                     "eccentricity, its zero elsewhere",
-                    dear=0.08,
+                    complexity_price=SEARCH.imitates,
                 )
             )
         return out

@@ -18,9 +18,10 @@ from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
+from dexsim.gap.read import wrong_signal
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, logged_torque, shaking
+from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
@@ -166,7 +167,7 @@ def _rings(a: JointAnswer) -> float:
     where the error there is lower with it anyway."""
     if _less(a.numbers["after"], a.numbers["before"]):
         return 0.0
-    return shaking.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
+    return ringing.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
 
 
 def _take_back(
@@ -379,28 +380,28 @@ def _weight(f: dict, rings: dict[str, float]) -> float:
     return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
 
 
-def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
+def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[logged_torque.IdentifiedJoint]) -> None:
     """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
     that is left on the recording held out, where the loop's own error shows nothing."""
     taken = {(f["effect"], *f["where"]["joints"]) for f in d.data["findings"]}
     findings = [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
     d.data["findings"] += findings
     sure = [f for f in findings if f["confidence"] >= JUDGE.firm]
-    judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in sure)]
+    judged = [x for x in by_torque if any(x.case.joint in f["where"]["joints"] for f in sure)]
     if not judged:
         return
     # not what the catalogue has no name for
-    last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]
+    last = [next(n for n in reversed(x.inverse.named) if n.effect) for x in judged]
     b, a = (
         float(np.sqrt(sum(y**2 for y in ys)))
-        for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last])
+        for ys in ([x.inverse.named[0].before for x in judged], [n.after for n in last])
     )
     assert d.judged is not None  # the joints come first
     d.judged.torque = _error(
         sure[0]["held_out"]["error"],
         (b, None, None),
         (a, None, None),
-        judged[0][1],
+        judged[0].judges,
         "the motor torque recorded there, from the motion, with what was fitted elsewhere",
     )
 
@@ -459,7 +460,7 @@ def decide(d: Diagnosis) -> None:
     if felt is not None and touch is not None:
         word = _of_both(joints, touch)
         depends += felt.depends_on if word not in ("none", "explained") else []
-        named = [f for f in mine if f["effect"] != "bad_channel" and not f.get("hint")]
+        named = [f for f in mine if not wrong_signal(f) and not f.get("hint")]
         felt_alone = not named and (joints == "none" or any(not f.get("hint") for f in of_touch)) and touch != "none"
         if joints == "unusable" or (felt_alone and felt.before is not None):
             error = _error_of_touch(felt)
@@ -645,7 +646,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
     named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
-    bad = [f for f in data["findings"] if f["effect"] == "bad_channel" and not f.get("hint")]
+    bad = [f for f in data["findings"] if wrong_signal(f) and not f.get("hint")]
     prefix = _first_of_all([f for f in data["findings"] if not f.get("hint")], bad, d)
     if data["verdict"] == "none":
         return (

@@ -19,6 +19,7 @@ from dexsim.actuator.reference import (
     dry_friction,
     friction_acts,
     lagged,
+    loop_torque,
     lost_error,
     over_time,
     parasitic_torque,
@@ -310,8 +311,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     cmd = cmd + over_time(dragged_target, columns, t, away)
     error = cmd - shown[1]
     lost, _, acts = over_time(lost_error, columns, t, cmd, error, features=KINDLESS)
-    damped = p("kd") * shown[2]
-    asked = np.where(acts > 1.5, p("kp") * (error - lost) - damped, np.where(acts > 0.5, -damped, 0.0))
+    asked = loop_torque(columns, error - lost, shown[2], acts)
     supply = over_time(supply_left, columns, t, s("supply"), s("others_torque")) if plant.voltage else 1.0
     able = lambda of, gave, *rest: warm_motor(of, gave, plant.voltage, *rest)  # noqa: E731
     motor = np.zeros_like(asked)

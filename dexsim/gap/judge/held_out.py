@@ -14,7 +14,7 @@ from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.read import BLOCK, Run, same_commands
+from dexsim.gap.read import BLOCK, Run, same_commands, wrong_signal
 from dexsim.gap.rules import JUDGE, SEARCH
 
 # -- what is held out -------------------------------------------------------------------------------------------------
@@ -327,7 +327,7 @@ def lowers(f: dict[str, Any]) -> bool:
 
 def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The findings that a signal is not what it says, where they are more than hints."""
-    return [f for f in findings if f["effect"] == "bad_channel" and f["confidence"] >= JUDGE.firm]
+    return [f for f in findings if wrong_signal(f) and f["confidence"] >= JUDGE.firm]
 
 
 def verdict(

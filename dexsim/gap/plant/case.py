@@ -533,7 +533,7 @@ def _regimes(
 ) -> dict[str, np.ndarray]:
     """Variables [n] of each measured sample, that a residual may depend on."""
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
-    since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _together(run_of)])
+    since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _rows_by_run(run_of)])
     out = {
         "time since reversal": since,
         "speed": np.abs(v),
@@ -557,7 +557,7 @@ def _regimes(
     return out
 
 
-def _together(run_of: np.ndarray) -> list[np.ndarray]:
+def _rows_by_run(run_of: np.ndarray) -> list[np.ndarray]:
     """Rows [n] of each run, in their order."""
     return [np.flatnonzero(run_of == r) for r in np.unique(run_of)]
 

@@ -19,6 +19,7 @@ import warp as wp
 from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
+    LEAST_ROTOR,
     amplifier,
     arrived,
     command_delay,
@@ -27,7 +28,9 @@ from dexsim.actuator.laws import (
     dry_friction,
     duty_torque,
     encoder_error,
+    encoder_line,
     encoder_memory,
+    feed_forward,
     friction_acts,
     gear_load_friction,
     heard_speed,
@@ -332,7 +335,7 @@ def guess(c: Recorded, h: int, dt: f64):
 def shown(of: wp.array(dtype=f64), q: f64, x: State, p: Guess):
     """(what the encoder shows at position q, what it shows of a speed there over that speed)."""
     error = encoder(of, q, x.memory, x.fresh != f64(0.0))
-    m = p.scale * q + p.offset
+    m = encoder_line(q, p.scale, p.offset)
     m += error[0] + error[1]
     return wp.vec2d(m, p.scale + error[2])
 
@@ -393,7 +396,7 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
         share = hold(since, span, until, end - dt, dt)
         speed += share * rate
         acceleration += share * difference(rate, earlier, span, dt)
-    return wp.vec2d(target, p.feed_v * speed + p.feed_a * acceleration)
+    return wp.vec2d(target, feed_forward(p.feed_v, p.feed_a, speed, acceleration))
 
 
 # -- what holds in a step ----------------------------------------------------------------------------------------------
@@ -465,7 +468,8 @@ def pair_now(c: Recorded, h: int, p: Guess, n: Now):
     """What the sub-steps of rotor and link share: divisions and a root are most of what one costs."""
     b = Pair()
     if p.two:
-        b.rotor = wp.clamp(p.rotor, f64(0.03) * n.inertia, f64(0.97) * n.inertia)
+        least = wp.static(f64(LEAST_ROTOR)) * n.inertia
+        b.rotor = wp.clamp(p.rotor, least, wp.static(f64(1.0 - LEAST_ROTOR)) * n.inertia)
         b.link = n.inertia - b.rotor
         b.stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
         b.hardening = c.params[h, P_HARD]

@@ -4,6 +4,7 @@ plain arrays, in the order of the joints that are diagnosed."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,14 @@ from dexsim.actuator.table import ServoTable
 
 BLOCK = 0.5
 """s of a stretch whose samples are resampled together: errors that lie nearer to each other are not independent."""
+
+WRONG_SIGNAL = "bad_channel"
+"""Of a finding that is no effect: a signal is not what it says (`effect` in `diagnosis.json`)."""
+
+
+def wrong_signal(finding: dict[str, Any]) -> bool:
+    """Whether a finding says that a signal is not what it says."""
+    return bool(finding["effect"] == WRONG_SIGNAL)
 
 
 @dataclass

@@ -24,38 +24,28 @@ import numpy as np
 from scipy import signal
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.read import Run
+from dexsim.gap.read import WRONG_SIGNAL, Run
+from dexsim.gap.rules import SIGNAL
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
-# what the tests of a signal go by
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
-HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
-BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judged before and after it
-EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
 PAUSE = 1.0  # s without a sample, over which no lag is measured
-STILL = 0.1  # rad that the target of a joint that never moves must span
-REST = 0.05  # s: the shortest rest
-HOLDS = 1.5  # x the error at which dry friction has held the joint before
+# of the correlation of two clocks' motions: what it must be, and by how much more than without a lead, since a periodic
+# motion fits at many shifts (only a clear gain before the target counts)
+CLEAR, BEYOND = 0.6, 0.15
 TURN = 180 / np.pi
-LONG = 0.1  # s: what stays the same for as long is looked at
-PULSE = 2.0  # x the largest pulse that does not end a rest
-PASSED = 2.0  # x the way that a target has gone during another rest
-WAY = 0.1  # of all the way that the target spans: less tells nothing
-OFTEN = 0.02  # of a recording's samples (and `FEW` at least): repeated ones of a moving joint are named from there on
-FEW = 8  # samples
-FAR = 3.0  # x a joint's range, beyond which a position or a target is not that joint's
 
 Spans = list[tuple[float, float]]  # s
 
 
 def finding(
-    kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9
+    kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float | None = None
 ) -> dict[str, Any]:
-    """A finding bad_channel as `diagnosis.json` has it."""
+    """A finding that a signal is not what it says, as `diagnosis.json` has it."""
     return {
-        "effect": "bad_channel",
-        "confidence": confidence,
+        "effect": WRONG_SIGNAL,
+        "confidence": SIGNAL.told if confidence is None else confidence,
         "alternatives": [],
         "indistinguishable": [],
         "separating_experiment": None,
@@ -109,7 +99,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     beat = {joint: common_rhythm(runs, joint) for joint in long}
 
     def add(
-        kind: str, text: str, run: Run, joint: str, topics: list[str], spans: Spans, confidence: float = 0.9
+        kind: str, text: str, run: Run, joint: str, topics: list[str], spans: Spans, confidence: float | None = None
     ) -> None:
         entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
         entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
@@ -153,7 +143,7 @@ def _repeated(
     held, single = _held(t, q), repeated_samples(t, q)
     for a, b in long:
         held[a + 1 : b + 1] = True
-    lost = [(float(t[a]), float(t[b])) for a, b in long if t[b] - t[a] > BLIND]
+    lost = [(float(t[a]), float(t[b])) for a, b in long if t[b] - t[a] > SIGNAL.blind]
     said: list[tuple[str, Spans]] = []
     if held.any():
         edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
@@ -180,7 +170,7 @@ class _Wrong:
     text: str
     topics: list[str]
     spans: list[tuple[float, float]] = field(default_factory=list)
-    confidence: float = 0.9
+    confidence: float | None = None
 
 
 def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong | None:
@@ -198,7 +188,7 @@ def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong |
     far = [] if limits is None else [
         (what, topic, _farthest(x, limits))
         for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
-        if _outside(x, limits) > max(FAR * (limits[1] - limits[0]), 2 * np.pi)
+        if _outside(x, limits) > max(SIGNAL.far * (limits[1] - limits[0]), 2 * np.pi)
         and not (what == "target" and _within_drive(run, j))
     ]
     if limits is not None and far:
@@ -209,14 +199,14 @@ def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong |
             f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
             [topic for _, topic, _ in far],
         )
-    if np.ptp(cmd) > 1e-3 and np.ptp(q) > 0.2 * np.ptp(cmd) and _sign(run, q, j) < -0.7:
+    if np.ptp(cmd) > 1e-3 and np.ptp(q) > SIGNAL.follows * np.ptp(cmd) and _sign(run, q, j) < -SIGNAL.against:
         return _Wrong(
             "sign",
             f"{joint} follows the negative of its target: another direction of its position or its commands",
             [STATES, COMMANDS],
         )
     lead = _lead(run, j)
-    if lead > EARLY:
+    if lead > SIGNAL.early:
         return _Wrong(
             "clock_skew",
             f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
@@ -231,7 +221,7 @@ def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong |
             "drive that is off",
             [STATES],
             [(stop, run.t[-1])],
-            0.7,
+            SIGNAL.stopped,
         )
     return None
 
@@ -280,7 +270,7 @@ def _pauses(run: Run) -> list[tuple[float, float]]:
     """Stretches [s] without samples, and those over which the clock was set anew: a joint is judged before and after
     them."""
     step = np.diff(run.t)
-    long = np.flatnonzero(step > max(BLIND, 8 * float(np.median(step))))
+    long = np.flatnonzero(step > max(SIGNAL.blind, 8 * float(np.median(step))))
     out = [(float(run.t[k]), float(run.t[k + 1])) for k in long]
     # the first sample after a break is of the other time already
     first, last = float(run.t[0]), float(run.t[-1])
@@ -332,7 +322,7 @@ def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
     """Far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn outside: the
     model's range may be the one in degrees.)"""
     wide = 0.1 * (limits[1] - limits[0])
-    outside = lambda x: _outside(x, limits) > FAR * (limits[1] - limits[0])  # noqa: E731
+    outside = lambda x: _outside(x, limits) > SIGNAL.far * (limits[1] - limits[0])  # noqa: E731
     inside = (q / TURN).min() > limits[0] - wide and (q / TURN).max() < limits[1] + wide
     return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
 
@@ -369,8 +359,8 @@ def _lead(run: Run, j: int) -> float:
     scores = signal.correlate(dc, dq, "valid", "fft") / norm
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
-    # periodic motion fits at many shifts: only a clear gain before the target counts
-    return step * (best - after) if best > after and scores[best] > 0.6 and scores[best] > causal + 0.15 else 0.0
+    ahead = best > after and scores[best] > CLEAR and scores[best] > causal + BEYOND
+    return step * (best - after) if ahead else 0.0
 
 
 def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float | None:
@@ -385,10 +375,10 @@ def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float 
     if run.enabled is not None and (run.enabled[k:, j] < 0.5).any():
         return None
     moved = np.ptp(cmd[:k]) if k else 0.0
-    if np.ptp(cmd[k:]) <= max(0.3 * max(moved, np.ptp(q)), 0.0 if k else STILL):
+    if np.ptp(cmd[k:]) <= max(0.3 * max(moved, np.ptp(q)), 0.0 if k else SIGNAL.still):
         return None
     held = [_holds(r, r.joints.index(joint), k if r is run else len(r.t)) for r in runs if joint in r.joints]
-    return None if np.abs(cmd[k:] - q[-1]).max() < HOLDS * max(held) else float(run.t[k])
+    return None if np.abs(cmd[k:] - q[-1]).max() < SIGNAL.holds * max(held) else float(run.t[k])
 
 
 def _holds(run: Run, j: int, end: int) -> float:
@@ -396,7 +386,7 @@ def _holds(run: Run, j: int, end: int) -> float:
     `end`."""
     q = run.q[:end, j]
     error = np.abs(run.command_at(run.t[:end])[:, j] - q)
-    stood = [(a, b) for a, b in rests(q) if b + 1 < end and run.t[b] - run.t[a] >= REST]
+    stood = [(a, b) for a, b in rests(q) if b + 1 < end and run.t[b] - run.t[a] >= SIGNAL.rest]
     return max((float(np.median(error[max(b - 2, a) : b + 1])) for a, b in stood), default=0.0)
 
 
@@ -411,10 +401,13 @@ def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         return out
     usual = float(np.percentile(moving, 90))
     edge = np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0]))
-    jumps = [(a, b) for a, b in zip(edge[::2], edge[1::2], strict=True)
-             if b < len(q) and t[b - 1] - t[a - 1] >= HELD and abs(q[b] - q[b - 1]) > 2.5 * usual]  # fmt: skip
+    jumps = [
+        (a, b)
+        for a, b in zip(edge[::2], edge[1::2], strict=True)
+        if b < len(q) and t[b - 1] - t[a - 1] >= SIGNAL.held and abs(q[b] - q[b - 1]) > SIGNAL.jump * usual
+    ]
     # a joint at rest may start with a jump: at least two must have been moving when they froze
-    if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > 0.1 * usual for a, _ in jumps) >= 2:
+    if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > SIGNAL.moving * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
             out[a:b] = True
     return out
@@ -458,7 +451,7 @@ def repeated_stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, 
         size = pulses(run.t, q)
         spans.append(float(np.ptp(cmd)))
         for a, b in rests(q):
-            if b + 1 < len(q) and run.t[b] - run.t[a] >= LONG:
+            if b + 1 < len(q) and run.t[b] - run.t[a] >= SIGNAL.long:
                 seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
                 size[b] = 0.0
         pulse.append(size)
@@ -466,10 +459,10 @@ def repeated_stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, 
     if not seen:
         return out
     usual = float(max(x.max() for x in pulse))
-    jump = [s for s in seen if s[3] > PULSE * usual]
+    jump = [s for s in seen if s[3] > SIGNAL.pulse * usual]
     passed = max((s[4] for s in seen if s not in jump), default=0.0)
     for k, a, b, _, way in jump:
-        if way > max(PASSED * passed, WAY * max(spans)):
+        if way > max(SIGNAL.passed * passed, SIGNAL.way * max(spans)):
             out[k].append((a, b))
     return out
 
@@ -478,19 +471,11 @@ def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """[S] bool: single readings that repeat the one before in a steady motion and are made up for by the next; none
     where there are few."""
     again = repeats(t, q)
-    return again if again.sum() >= max(FEW, OFTEN * len(t)) else np.zeros(len(t), bool)
+    return again if again.sum() >= max(SIGNAL.few, SIGNAL.often * len(t)) else np.zeros(len(t), bool)
 
 
 # -- the rhythm of an encoder's readings ------------------------------------------------------------------------------
 # An encoder that is read more seldom than it is logged: the rhythm of its readings, and the samples between them.
-
-# what this test of a signal goes by
-LEAP = 3.0  # steps of the encoder: a reading that stood and changes by as many at once has been read anew
-LEAPS = 0.25  # of all its changes: so many leaps
-SELDOM = 4.0  # samples, at least, from one new reading to the next
-RHYTHM = 0.85  # mean length of the times of new readings round their period: 1 all in step, 0 none
-ANEW = 10  # new readings that make a rhythm
-
 
 def common_rhythm(runs: Sequence[Run], joint: str) -> float:
     """s between readings of a joint that is read more seldom than it is logged, in most of the runs that can tell; 0
@@ -509,18 +494,18 @@ def rhythm(t: np.ndarray, q: np.ndarray) -> float:
     turns slowly past a coarse encoder's steps has a rhythm but no leaps, one that sticks and slips leaps but in no
     rhythm."""
     change = np.flatnonzero(np.diff(q) != 0) + 1
-    if len(change) < ANEW:
+    if len(change) < SIGNAL.anew:
         return float("nan")
     size, since = np.abs(q[change] - q[change - 1]), np.diff(t[change])
-    leap, usual = t[change[size > LEAP * size.min()]], float(np.median(since))
-    if len(leap) < LEAPS * len(change) or usual < SELDOM * float(np.median(np.diff(t))):
+    leap, usual = t[change[size > SIGNAL.leap * size.min()]], float(np.median(since))
+    if len(leap) < SIGNAL.leaps * len(change) or usual < SIGNAL.seldom * float(np.median(np.diff(t))):
         return 0.0
-    if np.mean(since < 0.7 * usual) > 0.1:  # it moves between its leaps
+    if np.mean(since < 0.7 * usual) > SIGNAL.between:  # it moves between its leaps
         return 0.0
-    if len(leap) < ANEW:
+    if len(leap) < SIGNAL.anew:
         return float("nan")
     period, turn = _beat(leap, usual, 0.1)
-    return period if np.abs(turn) > RHYTHM else 0.0
+    return period if np.abs(turn) > SIGNAL.rhythm else 0.0
 
 
 def between_readings(t: np.ndarray, q: np.ndarray, period: float) -> np.ndarray:

@@ -14,15 +14,15 @@ from scipy.interpolate import PchipInterpolator
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap.effects.signals import CurrentSensor
-from dexsim.gap.read import Run
+from dexsim.gap.read import WRONG_SIGNAL, Run
+from dexsim.gap.rules import SIGNAL
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import COMMANDS_FIX, DUTY, STATES, Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
-BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
+WRONG = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
 SHORTEST = 0.5  # s: what a recording must last to be read
 
 
@@ -316,12 +316,15 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
     return runs
 
 
-def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list[dict[str, Any]]:
-    """Findings of signals that are not what they say, as `diagnosis.json` has them (effect bad_channel)."""
+def channel_findings(
+    recordings: list[Recording], joints: Sequence[str], sensors: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Findings of signals that are not what they say, as `diagnosis.json` has them. sensors: ids of the effects that
+    make the same of an effort's sign, each with the experiment that shows it."""
     out: dict[tuple, dict[str, Any]] = {}
     for r in recordings:
         for f in r.findings:
-            if f.kind not in BAD_CHANNEL or f.severity != "error":
+            if f.kind not in WRONG or f.severity != "error":
                 continue
             # dry friction may hold it: `channels.inspect` tells beside the others
             if f.kind == "stuck" and f.text.startswith("position"):
@@ -331,11 +334,11 @@ def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list
             entry = out.setdefault(
                 key,
                 {
-                    "effect": "bad_channel",
-                    "confidence": 0.9,
+                    "effect": WRONG_SIGNAL,
+                    "confidence": SIGNAL.told,
                     "alternatives": [],
-                    "indistinguishable": ["bad_channel", CurrentSensor.id] if sensor else [],
-                    "separating_experiment": CurrentSensor.experiment if sensor else None,
+                    "indistinguishable": [WRONG_SIGNAL, *sensors] if sensor else [],
+                    "separating_experiment": next(iter(sensors.values()), None) if sensor else None,
                     "where": {
                         "joints": [f.joint] if f.joint in joints else [],
                         "taxels": [],
@@ -427,14 +430,6 @@ def merged_spans(*several: dict[str, list[tuple[float, float]]]) -> dict[str, li
 # -- end stops --------------------------------------------------------------------------------------------------------
 # Ends of a joint's motion that the model does not have: a joint that its drive presses against something hard.
 
-# what this test of a signal goes by
-NEAR = 0.012  # of the joint's whole motion: as near to its outermost position
-PRESSED = 5.0  # x the usual error at rest: what no friction would hold
-AGAINST = 5.0  # x gravity, at least, of the torque asked for: what no load would hold
-LAST = 0.1  # s: the shortest meeting
-TIMES = 2  # separate times that it must meet the end
-
-
 def used_end_stops(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
     """Narrows the model's ranges to the ends that joints meet; in words, one line each.
 
@@ -493,7 +488,7 @@ def _end(
     """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it
     meets none."""
     outer = max(float((side * r.q[:, j]).max()) for r in runs)
-    near = NEAR * (max(float(r.q[:, j].max()) for r in runs) - min(float(r.q[:, j].min()) for r in runs))
+    near = SIGNAL.near * (max(float(r.q[:, j].max()) for r in runs) - min(float(r.q[:, j].min()) for r in runs))
     errors = [side * (r.command_at(r.t)[:, j] - r.q[:, j]) for r in runs]
     at = [side * r.q[:, j] > outer - near for r in runs]
     still = [_still(r, j, near) for r in runs]
@@ -502,7 +497,7 @@ def _end(
         usual = np.concatenate([np.abs(e[~a]) for e, a in zip(errors, at, strict=True)])
     if not near > 0 or len(usual) < 50:
         return None
-    need = max(PRESSED * float(np.quantile(usual, 0.95)), 3 * near)
+    need = max(SIGNAL.pressed * float(np.quantile(usual, 0.95)), 3 * near)
     ends, names = [], []
     for run, error, on in zip(runs, errors, at, strict=True):
         on = on & (error > need)
@@ -510,7 +505,7 @@ def _end(
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             q, target = run.q[a:b, j], run.q[a:b, j] + side * error[a:b]
             if (
-                run.t[b - 1] - run.t[a] < LAST
+                run.t[b - 1] - run.t[a] < SIGNAL.meeting
                 or np.ptp(target) < 3 * np.ptp(q)
                 or np.ptp(q) > near
                 or not _hard(model, data, run, j, a + int(np.argmax(error[a:b])))
@@ -518,7 +513,7 @@ def _end(
                 continue
             ends.append(float(np.median(q)))
             names.append(run.name)
-    if len(ends) < TIMES:
+    if len(ends) < SIGNAL.times:
         return None
     return side * max(side * e for e in ends), ", ".join(dict.fromkeys(names)), near
 
@@ -544,4 +539,4 @@ def _hard(model: mujoco.MjModel, data: mujoco.MjData, run: Run, j: int, i: int) 
     for k, name in enumerate(run.joints):
         data.qpos[model.jnt_qposadr[model.joint(name).id]] = run.q[i, k]
     mujoco.mj_forward(model, data)
-    return asked > AGAINST * abs(float(data.qfrc_bias[model.jnt_dofadr[model.joint(run.joints[j]).id]]))
+    return asked > SIGNAL.hard * abs(float(data.qfrc_bias[model.jnt_dofadr[model.joint(run.joints[j]).id]]))

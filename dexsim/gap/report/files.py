@@ -25,6 +25,7 @@ from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.conclude import place, spoken, words_of
 from dexsim.gap.judge.full_model import TASKS
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
+from dexsim.gap.read import wrong_signal
 from dexsim.gap.report import charts
 from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
@@ -271,7 +272,7 @@ class Where(Section):
             return name, k * h[which], low, high, colour
 
         rows = [row("before", "before", charts.BEFORE)]
-        if any(f["effect"] != "bad_channel" for f in d.data["findings"]):
+        if any(not wrong_signal(f) for f in d.data["findings"]):
             rows.append(row("after", "after", charts.AFTER))
         plain = d.data["baseline"] if h["error"].startswith("position") else {}
         if plain:
@@ -302,7 +303,7 @@ class Findings(Section):
         unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
         doubtful = f["indistinguishable"] or f.get("hint")
         return {
-            "kind": "bad" if f["effect"] == "bad_channel" else "set" if doubtful else "",
+            "kind": "bad" if wrong_signal(f) else "set" if doubtful else "",
             "name": _name(f["effect"]),
             "where": where,
             "confidence": f"{100 * f['confidence']:.0f}",

@@ -24,7 +24,7 @@ from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import INDEX, expand
 from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
 from dexsim.recording import excitation
 from dexsim.recording.excitation import Plan
 from dexsim.recording.mechanism import Mechanism
@@ -37,7 +37,7 @@ def plan_next(
     d: Diagnosis,
     s: Settings,
     m: Mechanism,
-    outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (),
+    searched: Sequence[SearchedJoint] = (),
     recordings: Sequence[Any] = (),
 ) -> None:
     """What to record next, written ready to send where a safe plan exists."""
@@ -62,7 +62,7 @@ def plan_next(
         )
         experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f["effect"]].experiment
         why = f"{head}: {experiment}"
-        choice = _choice(d, s, m, outcomes, f, rivals)
+        choice = _choice(d, s, m, searched, f, rivals)
         if choice is not None:
             kinds = choice.chosen
             why = (
@@ -89,13 +89,14 @@ def _choice(
     d: Diagnosis,
     s: Settings,
     m: Mechanism,
-    outcomes: Sequence[tuple[Case, JointSearch, Outcome]],
+    searched: Sequence[SearchedJoint],
     f: dict,
     rivals: list[str],
 ) -> Choice | None:
     """The motions on which the finding's hypotheses disagree most; None where they cannot be simulated or planned."""
-    for case, search, outcome in outcomes:
-        if case.joint not in f["where"]["joints"] or not outcome.best.members:
+    for x in searched:
+        search, outcome = x.search, x.outcome
+        if x.case.joint not in f["where"]["joints"] or not outcome.best.members:
             continue
         other = rival_of(search, outcome, f["effect"], rivals[1] if len(rivals) > 1 else None)
         if other is None:

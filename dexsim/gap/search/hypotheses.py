@@ -93,9 +93,9 @@ def named(member: Member) -> list[Param]:
     return [replace(p, key=f"{member.id}.{p.key}") for p in member.variant.params]
 
 
-def dear_of(trial: Trial) -> float:
+def complexity_price(trial: Trial) -> float:
     """Factor on the losses of a hypothesis that can imitate simpler ones."""
-    return float(np.prod([1 + m.variant.dear for m in trial.members]))
+    return float(np.prod([1 + m.variant.complexity_price for m in trial.members]))
 
 
 def fits_beside(a: Member, b: Member) -> bool:

@@ -14,16 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import mujoco
 import numpy as np
 from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
-from dexsim.gap.effects.catalogue import CATALOGUE
-from dexsim.gap.effects.friction import LoadFriction, StribeckFriction, ViscousFriction
-from dexsim.gap.effects.signals import Lag
+from dexsim.gap.effects.catalogue import BY_TORQUE
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
@@ -140,6 +137,16 @@ def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: M
     return Body(torque, back(pull), back(across), inertia)
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """A recorded motion with what the model's body asks for along it (None: it has none), and the span [s from its
+    start] that is used, None for all."""
+
+    motion: Motion
+    body: Body | None
+    span: tuple[float, float] | None = None
+
+
 @dataclass
 class Piece:
     """One recording at its full rate: q, v, load (the body's torque) [n] and which samples are kept."""
@@ -185,28 +192,31 @@ class Columns:
         return out | ({"inertia": out["inertia"] + self.inertia} if "inertia" in out else {"inertia": self.inertia})
 
 
-def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
-    """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed;
-    loaded: whether gravity's factors are among the columns, by default where it matters in these recordings."""
+def columns_of(given: Sequence[Stretch], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
+    """Of joint j; given: of each recording; efficiency: of the drive, believed; loaded: whether gravity's factors are
+    among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
-    bodies = [(m, b) for m, b, *_ in given if b is not None]
+    bodies = [(x.motion, x.body) for x in given if x.body is not None]
     inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b in bodies]))) if bodies else 0.0
     if loaded is None:
         weights = [np.abs(b.gravity[:, j]).max() / max(np.abs(m.u[:, j]).max(), 1e-12) for m, b in bodies]
         loaded = bool(max(weights, default=0.0) > BELIEF.tolerance)
-    for m, b, *rest in given:
+    for x in given:
+        m, b = x.motion, x.body
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
         load = np.zeros_like(q) if b is None else b.torque[:, j]
         keep = np.zeros(len(q), bool)
         keep[m.edge : len(q) - m.edge : max(int(1.0 / (PER_CUTOFF * m.cutoff * m.step)), 1)] = True
-        if rest and rest[0] is not None:
-            keep &= (m.t - m.t[0] >= rest[0][0]) & (m.t - m.t[0] <= rest[0][1])
+        if x.span is not None:
+            keep &= (m.t - m.t[0] >= x.span[0]) & (m.t - m.t[0] <= x.span[1])
         columns = [m.a[:, j], v, m.smooth(np.sign(v)), np.ones(len(v))]
-        columns += [b.gravity[:, j], b.across[:, j]] if loaded else []
+        if loaded:
+            assert b is not None  # gravity pulls at a body
+            columns += [b.gravity[:, j], b.across[:, j]]
         rise = np.gradient(m.a[:, j] if b is None else load / inertia, m.step)
         block = at + ((m.t - m.t[0]) / BLOCK).astype(int)
         at = int(block.max()) + 1
-        parts.append(tuple(x[keep] for x in (np.stack(columns, 1), torque - load, v, rise, torque, block)))
+        parts.append(tuple(c[keep] for c in (np.stack(columns, 1), torque - load, v, rise, torque, block)))
         pieces.append(Piece(m, q, v, load, keep))
     X, u, v, rise, torque, block = (np.concatenate(x) for x in zip(*parts, strict=True))
     q = np.concatenate([p.q[p.keep] for p in pieces])
@@ -233,10 +243,11 @@ def readable(run: Run, j: int) -> bool:
     return 1 / np.median(np.diff(run.t)) >= 0.97 * RATE
 
 
-def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> tuple[Motion, Body]:
+def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> Stretch:
+    """A run's motion beside the model's body."""
     assert run.torque is not None  # as `readable` has looked
     m = motion(run.t, run.q, np.nan_to_num(run.torque), cutoff)
-    return m, body(model, run.gravity, run.joints, m)
+    return Stretch(m, body(model, run.gravity, run.joints, m))
 
 
 def sums(X: np.ndarray, u: np.ndarray, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -278,14 +289,8 @@ def unphysical(d: Columns) -> dict[str, str]:
 DRAWS = 300  # of a bootstrap
 STRETCH = 4  # neighbouring blocks that the bootstrap of what an effect removes draws together
 QUARTERS = 4  # of a recording, each left out in turn
-EFFECT = {e.by_torque: e for e in CATALOGUE if e.by_torque}
-BY_DIRECTION, LAG, STRIBECK = ViscousFriction.by_torque, Lag.by_torque, StribeckFriction.by_torque
-LOAD = LoadFriction.by_torque
-# laws that the catalogue has no effect for
-SQUARE = "friction with the square of the speed"
-GIVES = "dry friction that gives way before it slides"
-DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # of the whole motion: over which it may give way (P. Dahl 1968)
-SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck's excess may be down to 1/e
+EFFECT = {e.by_torque: e for e in BY_TORQUE}
+SQUARE = "friction with the square of the speed"  # a law that the catalogue has no effect for
 
 
 @dataclass
@@ -347,7 +352,7 @@ def identify(
             motion(x[0], x[1][:, None], x[2][:, None], cutoff)
             for x in ((t, q, torque), *([] if test is None else [test]))
         ]
-        made = [columns_of([(m, None)], 0) for m in given]
+        made = [columns_of([Stretch(m, None)], 0) for m in given]
         return made[0], made[-1]
 
     return solve(at, highest(t), seed)
@@ -425,11 +430,8 @@ def _name(
             c = least(A, own.u)
             if _sensible(name, c[-1], own.pack(c)):
                 tried[name] = left_out(A)
-            elif name == BY_DIRECTION and left_out(A).sum() < (1 - SEARCH.least) * now.sum():
-                impossible[name] = (
-                    f"the least squares give {own.pack(c).get('viscous_friction', 0.0):.3g} with {c[-1]:.3g} more "
-                    "forwards and less backwards, and neither direction's can be negative"
-                )
+            elif (why := _impossible(name, c[-1], own.pack(c))) and left_out(A).sum() < (1 - SEARCH.least) * now.sum():
+                impossible[name] = why
         if not tried:
             break
         best = min(tried, key=lambda n: tried[n].sum())
@@ -445,14 +447,14 @@ def _name(
         now, X, Y = tried[best], np.column_stack([X, mine[best]]), np.column_stack([Y, theirs[best]])
     # what the catalogue has no name for must not lend its trace to what has one
     known = [n for n in chosen if _effect(n)]
-    if BY_DIRECTION in known:
-        both = least(np.column_stack([own.X, *(mine[n] for n in known)]), own.u)
-        if not _sensible(BY_DIRECTION, both[base + known.index(BY_DIRECTION)], own.pack(both)):
-            rest = {n: c for n, c in mine.items() if n != BY_DIRECTION}
-            named, theta, more = _name(own, other, rest, theirs, rng)
-            others = " and ".join(_kind(n).replace("_", " ") for n in known if n != BY_DIRECTION)
-            why = f"beside {others} one direction's would be negative"
-            return named, theta, impossible | more | {BY_DIRECTION: why}
+    both = least(np.column_stack([own.X, *(mine[n] for n in known)]), own.u)
+    for i, wrong in enumerate(known):
+        if _sensible(wrong, both[base + i], own.pack(both)) or not _impossible(wrong, both[base + i], own.pack(both)):
+            continue
+        rest = {n: c for n, c in mine.items() if n != wrong}
+        named, theta, more = _name(own, other, rest, theirs, rng)
+        others = " and ".join(_kind(n).replace("_", " ") for n in known if n != wrong)
+        return named, theta, impossible | more | {wrong: f"beside {others} one direction's would be negative"}
     theta, low, high = _intervals(np.column_stack([own.X, *(mine[n] for n in known)]), own.u, own.blocks, rng)
     size = {n: (theta[base + i], low[base + i], high[base + i]) for i, n in enumerate(known)}
     all_, below, above = _intervals(X, own.u, own.blocks, rng)
@@ -477,8 +479,8 @@ def _removed(before: np.ndarray, after: np.ndarray, blocks: np.ndarray) -> tuple
 
 
 def _effect(name: str) -> str:
-    kind = _kind(name)
-    return EFFECT[kind].id if kind in EFFECT else ""
+    e = EFFECT.get(_kind(name))
+    return e.id if e is not None and e.named_by_torque else ""
 
 
 def _kind(name: str) -> str:
@@ -486,11 +488,15 @@ def _kind(name: str) -> str:
 
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Whether a coefficient can be what it is called; what gives way is friction that is there."""
+    """Whether a coefficient can be what it is called."""
     kind = _kind(name)
-    if kind == GIVES:
-        return 0 < c < 2 * theta.get("coulomb_friction", 0.0)
     return kind not in EFFECT or EFFECT[kind].possible_by_torque(c, theta, LEAST)
+
+
+def _impossible(name: str, c: float, theta: dict[str, float]) -> str:
+    """Why a coefficient that is not sensible is a refusal that is told; empty where it is passed over."""
+    kind = _kind(name)
+    return EFFECT[kind].impossible_by_torque(c, theta) if kind in EFFECT else ""
 
 
 def _intervals(
@@ -505,40 +511,7 @@ def _intervals(
 
 
 def _further(own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
-    """One more effect each, as a column of what was filtered."""
-    top, span = float(np.abs(own.v).max()), own.span
-    out: dict[str, Callable[[Columns], np.ndarray]] = {
-        BY_DIRECTION: lambda d: np.abs(d.v),
-        SQUARE: lambda d: d.v * np.abs(d.v),
-        LAG: lambda d: d.rise,
-    }
-    if own.loaded:
-        out[LOAD] = lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))
-    for part in SPEEDS:
-        out[f"{STRIBECK} (v_s {part * top:.3g})"] = partial(_stribeck, speed=part * top)
-    for part in DISTANCES:
-        out[f"{GIVES} (over {part * span:.2g})"] = partial(_gives, way=part * span)
-    return out
-
-
-def _stribeck(d: Columns, speed: float) -> np.ndarray:
-    """Dry friction that falls with speed [rad/s], exp(-(v / speed)^2)."""
-    return d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / speed) ** 2)))
-
-
-def _gives(d: Columns, way: float) -> np.ndarray:
-    """Dry friction that is taken up over a way [rad], less what is there at once."""
-    return d.column(lambda q, v, load: _taken_up(q, way) - np.sign(v))
-
-
-def _taken_up(q: np.ndarray, distance: float) -> np.ndarray:
-    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
-    exactly."""
-    z, out = 0.0, np.empty(len(q))
-    steps = np.diff(q, prepend=q[0])
-    keep = np.exp(-np.abs(steps) / distance)
-    for i, (step, k) in enumerate(zip(steps, keep, strict=True)):
-        way = 1.0 if step > 0 else -1.0
-        z = way + (z - way) * k
-        out[i] = z
-    return out
+    """One more effect each, as a column of what was filtered, by its law (`_kind`) and what it was given."""
+    laws = [e.torque_columns(own) for e in BY_TORQUE]
+    laws.insert(1, {SQUARE: lambda d: d.v * np.abs(d.v)})  # beside the other friction that grows with speed
+    return {name: column for law in laws for name, column in law.items()}

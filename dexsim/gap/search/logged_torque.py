@@ -21,12 +21,10 @@ from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
-    BY_DIRECTION,
     NAMES,
     PER_CUTOFF,
-    Body,
     Columns,
-    Motion,
+    Stretch,
     columns_of,
     moved,
     readable,
@@ -41,10 +39,20 @@ if TYPE_CHECKING:
 
     from dexsim.gap.inquiry import Diagnosis
     from dexsim.gap.plant.case import Case
-    from dexsim.gap.search.search import JointSearch, Trial
+    from dexsim.gap.read.stage_tests import Stage
+    from dexsim.gap.search.search import JointSearch, SearchedJoint, Trial
 
 
 # -- what inverse dynamics say of each joint --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class IdentifiedJoint:
+    """A joint of which inverse dynamics tell. judges: names of the recordings that judged its further effects."""
+
+    case: Case
+    inverse: inverse_dynamics.Inverse
+    judges: list[str]
 
 
 def identify_joints(
@@ -56,10 +64,11 @@ def identify_joints(
     seed: int = 0,
     span_train: dict[int, tuple[float, float]] | None = None,
     span_test: dict[int, tuple[float, float]] | None = None,
-) -> list[tuple]:
-    """(case, Inverse, names of the recordings that judged its further effects) of each joint whose motor torque was
-    logged in N.m, fast and long enough. span_*: part of each run [s from its start]."""
-    out, motions = [], {}
+) -> list[IdentifiedJoint]:
+    """Each joint whose motor torque was logged in N.m, fast and long enough. span_*: part of each run [s from its
+    start]."""
+    out: list[IdentifiedJoint] = []
+    motions: dict[tuple[int, float], Stretch] = {}
     for case in cases:
         use = [r for r in train if readable(runs[r], case.index)]
         judge = [r for r in test if readable(runs[r], case.index) and (r not in train or span_test is not None)]
@@ -69,10 +78,10 @@ def identify_joints(
         def at(
             cutoff: float, case: Case = case, use: list[int] = use, judge: list[int] = judge
         ) -> tuple[Columns, Columns]:
-            def piece(r: int, span: Spans | None) -> tuple[Motion, Body, tuple[float, float] | None]:
+            def piece(r: int, span: Spans | None) -> Stretch:
                 if (r, cutoff) not in motions:
                     motions[r, cutoff] = moved(runs[r], model, cutoff)
-                return *motions[r, cutoff], None if span is None else span.get(r)
+                return replace(motions[r, cutoff], span=None if span is None else span.get(r))
 
             efficiency = float(case.scales.nominal.get("efficiency", 1.0))
             own = columns_of([piece(r, span_train) for r in use], case.index, efficiency)
@@ -86,7 +95,7 @@ def identify_joints(
         kept = min(PER_CUTOFF * top * float(np.median(np.diff(runs[use[0]].t))), 1.0)
         if first.seconds < TORQUE.shortest or len(first.u) < inverse_dynamics.RATE * TORQUE.shortest * kept:
             continue
-        out.append((case, solve(at, top, seed), [runs[r].name for r in judge]))
+        out.append(IdentifiedJoint(case, solve(at, top, seed), [runs[r].name for r in judge]))
     return out
 
 
@@ -96,16 +105,17 @@ def _by_torque(case: Case, x: inverse_dynamics.Inverse, n: inverse_dynamics.Name
     return ByTorque(n.value, n.low, n.high, n.speed, x.full, force, length)
 
 
-def torque_texts(given: Sequence[tuple]) -> list[str]:
-    """What `found` gave, in words."""
+def torque_texts(given: Sequence[IdentifiedJoint]) -> list[str]:
+    """What `identify_joints` found, in words."""
     out = []
-    for case, x, judged in given:
+    for joint in given:
+        case, x = joint.case, joint.inverse
         said = ", ".join(f"{n.replace('_', ' ')} {x.value[n]:.4g} ({x.low[n]:.4g} to {x.high[n]:.4g})" for n in NAMES)
         text = (
             f"{case.joint}: by the recorded motor torque alone: {said}; {100 * x.residual:.1f} % of the torque is left"
         )
         text += "".join(f"; {n.replace('_', ' ')}: {why}" for n, why in x.refused.items())
-        where = " in the recording held out" if judged else ""
+        where = " in the recording held out" if joint.judges else ""
         for k, n in enumerate(x.named):
             told = EFFECTS[n.effect].size_by_torque(_by_torque(case, x, n)) if n.effect else ""
             size = f" ({told})" if told else ""
@@ -117,7 +127,7 @@ def torque_texts(given: Sequence[tuple]) -> list[str]:
     return out
 
 
-def believe(given: Sequence[tuple]) -> list[str]:
+def believe(given: Sequence[IdentifiedJoint]) -> list[str]:
     """Writes what the torque tells into the belief of what was unknown, so that the search in closed loop starts from
     it; in words.
 
@@ -126,7 +136,8 @@ def believe(given: Sequence[tuple]) -> list[str]:
     from dexsim.actuator.columns import INDEX as SERVO
 
     said = []
-    for case, x, _ in given:
+    for joint in given:
+        case, x = joint.case, joint.inverse
         open_ = [n for n in ("viscous_friction", "coulomb_friction") if n in case.unknown]
         said += [
             f"{case.joint}: no {n.replace('_', ' ')} is taken from the recorded motor torque: {why}"
@@ -143,7 +154,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
                 "inertia, gravity or friction"
             )
             continue
-        values = {n: (x.value[n], max(x.low[n], 0.0), x.high[n]) for n in open_}
+        values: dict[str, tuple[float, float, float]] = {n: (x.value[n], max(x.low[n], 0.0), x.high[n]) for n in open_}
         if "coulomb_friction" in open_ and case.scales.nominal["friction_asymmetry"] == 0:
             per = 2.0 / x.value["coulomb_friction"]
             a, b, c = (float(np.clip(per * v["offset"], -2, 2)) for v in (x.value, x.low, x.high))
@@ -167,27 +178,27 @@ def believe(given: Sequence[tuple]) -> list[str]:
 
 
 def hand_on(
-    given: Sequence[tuple],
+    given: Sequence[IdentifiedJoint],
     d: Diagnosis,
-    outcomes: Sequence[tuple],
+    searched: Sequence[SearchedJoint],
     test: Sequence[int],
-    span_test: dict | None,
-    stages: Sequence = (),
+    span_test: Spans | None,
+    stages: Sequence[Stage] = (),
 ) -> None:
     """Writes the torque's figures into the servo table that is handed on, and the nuisances, where a joint's closed
     loop does not say otherwise: what it was refitted to then is the fit's own wandering.
 
-    d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run
-    over what was held out is followed better with its own figures, by more than `BELIEF.tolerance`, or where a finding
-    of at least a half is about them; not where `stages` say that the drive itself is not as believed, since what its
-    loop does then speaks of the drive.
+    A closed loop says otherwise where a free run over what was held out is followed better with its own figures, by
+    more than `BELIEF.tolerance`, or where a finding of at least a half is about them; not where `stages` say that the
+    drive itself is not as believed, since what its loop does then speaks of the drive.
     """
     strange = {x.joint for x in stages if not x.sound}
-    by = {case.joint: (search, outcome) for case, search, outcome in outcomes}
-    for case, x, _ in given:
+    by = {x.case.joint: x for x in searched}
+    for joint in given:
+        case, x = joint.case, joint.inverse
         if not case.told or case.joint not in by:
             continue
-        search, outcome = by[case.joint]
+        search, outcome = by[case.joint].search, by[case.joint].outcome
         held = [f for f in d.data["findings"] if f["confidence"] >= JUDGE.firm and case.joint in f["where"]["joints"]]
         trial = search.polish(outcome.best if held else outcome.none)
         claimed = {c for m in trial.members for p in m.variant.params for c in p.columns}
@@ -196,7 +207,7 @@ def hand_on(
             for n in ("viscous_friction", "coulomb_friction", "friction_asymmetry")
             if n in case.ranges and n not in claimed
         ]
-        ours = {n: case.scales.nominal[n] for n in told}
+        ours: dict[str, float] = {n: case.scales.nominal[n] for n in told}
         if "inertia" in case.factors and "inertia_scale" not in claimed:
             ours["inertia"] = x.value["inertia"] / case.scales.inertia
         assert d.servo is not None  # what is handed on
@@ -216,14 +227,14 @@ def hand_on(
         )
 
 
-def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
+def unknown_controllers(given: Sequence[IdentifiedJoint], stages: Sequence[Stage], notes: list[str]) -> set[str]:
     """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly
     in part, or surely pushes the other way: their closed loop speaks of an unknown controller, and no effect of the
     joint is looked for in it. Said in `notes`.
 
     A line through the law and the torque fits well where one is the other's mirror image, too; but no gain of the
     believed law is negative, and the torque's own sign is borne out by its friction, which resists."""
-    told = {case.joint for case, _, _ in given if case.told}
+    told = {x.case.joint for x in given if x.case.told}
     out = set()
     for x in stages:
         against = x.slope_high < 0
@@ -260,12 +271,15 @@ def _alike(
     return error[1] <= (1 + BELIEF.tolerance) * error[0] + 0.1 * case.sigma
 
 
-def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
+def findings(
+    given: Sequence[IdentifiedJoint], unknown: Sequence[str], runs: list[Run], train: list[int]
+) -> list[dict]:
     """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed
     (`unknown`)."""
     out = []
-    for case, x, judged in given:
-        for n in x.named if case.joint in unknown and judged else ():
+    for joint in given:
+        case, x = joint.case, joint.inverse
+        for n in x.named if case.joint in unknown and joint.judges else ():
             if not n.effect:
                 continue
             effect = EFFECTS[n.effect]
@@ -284,7 +298,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
                     "indistinguishable": list(effect.alike_by_torque),
                     "separating_experiment": effect.experiment if effect.alike_by_torque else None,
                     "where": {"joints": [case.joint], "taxels": [], "topics": []},
-                    "regime": effect.shows + ("; differs by direction" if n.text == BY_DIRECTION else ""),
+                    "regime": effect.shows_by_torque,
                     "when": intervals_of(active, case, runs, train),
                     "parameters": parameters,
                     "held_out": {
@@ -368,7 +382,8 @@ class Push:
 def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:
     """Of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; [] where
     no torque was logged."""
-    out, motions = [], {}
+    out: list[Push] = []
+    motions: dict[int, Stretch] = {}
     rng = np.random.default_rng(seed)
     for j, joint in enumerate(runs[0].joints):
         use = [r for r in range(len(runs)) if readable(runs[r], j)]

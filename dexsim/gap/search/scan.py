@@ -16,7 +16,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Fitter, Residuals, disbelief, prior_weight, slopes_of
-from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, dear_of, fits_beside, subset
+from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
 
@@ -34,13 +34,13 @@ class JointLosses(JointHypotheses):
         return (
             float(self._left(trial).sum())
             * (1 + SEARCH.apart * sum(len(m.variant.params) for m in trial.members))
-            * self._dear(trial)
+            * self._price_factor(trial)
         )
 
-    def _dear(self, trial: Trial) -> float:
+    def _price_factor(self, trial: Trial) -> float:
         """Factor on the losses of a hypothesis that can imitate simpler ones, or whose size stopped at the end of what
         is physical: the data would have it where it cannot be."""
-        at, begin = dear_of(trial), 0
+        at, begin = complexity_price(trial), 0
         for m in trial.members:
             fitted = trial.fit.x[begin : begin + len(m.variant.params)]
             begin += len(m.variant.params)

@@ -4,7 +4,7 @@ was found on whole recordings, and intervals."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -161,7 +161,7 @@ class JointSelection(JointScan):
                     with self._fix(members):
                         fits.append(self.fitter.fit(params, x0=np.array([fitted[p.key] for p in params]), iterations=8))
                 new = self.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
-                mine, theirs = (self._left(t).sum() * self._dear(t) for t in (current, new))
+                mine, theirs = (self._left(t).sum() * self._price_factor(t) for t in (current, new))
                 if (1 - SEARCH.least) * theirs < mine and not self._shrunk(new):
                     self.fitted[frozenset(new.ids)] = new
                     return new
@@ -204,6 +204,7 @@ class JointSelection(JointScan):
                 followed[member.id] = drafts[-1][2].loss
             self._on(0.03)
         drafts.sort(key=lambda d: d[2].loss)
+        # how many are looked at: two, and others that may still win when they are fitted on long windows
         return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
 
     def _finished(
@@ -562,7 +563,8 @@ class JointSelection(JointScan):
                 if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
                     self.cross(trial)
                     others.append(trial)
-            table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
+            priced = [self._left(t) * self._price_factor(t) for t in others]
+            table = np.stack([mine * self._price_factor(current), *priced, lost])
             drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
             shares = intervals.wins(table, drawn, SEARCH.apart)
             rows = [
@@ -679,6 +681,7 @@ class JointSearch(JointSelection):
                 )
             )
             f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
+        # a fit that is no better than rounding, or that long windows speak against, is left as it was
         if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
             with self._fix(trial.members):
                 again = self.fitter.fit(params, x0=f.x, iterations=0)
@@ -743,4 +746,13 @@ class JointSearch(JointSelection):
         return np.stack([np.maximum(laws[:, 0] - half, low), np.minimum(laws[:, 1] + half, high)], 1)
 
 
-__all__ = ["JointSearch", "Member", "Outcome", "Trial", "subset"]
+@dataclass(frozen=True)
+class SearchedJoint:
+    """A joint after its search: its case as it was searched, the search, and what it ended with."""
+
+    case: Case
+    search: JointSearch
+    outcome: Outcome
+
+
+__all__ = ["JointSearch", "Member", "Outcome", "SearchedJoint", "Trial", "subset"]

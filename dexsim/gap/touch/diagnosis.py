@@ -20,6 +20,7 @@ from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
 from dexsim.gap.judge import confidence
 from dexsim.gap.judge.held_out import rms_interval
+from dexsim.gap.read import wrong_signal
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer
@@ -85,7 +86,7 @@ class Touch(Steps):
             self.result.notes += self.data.notes
         self.pads = [Pad(k, [r for r in self.data.runs if r.pad == k]) for k in self.data.pads()]
 
-    def model(self) -> None:
+    def plant(self) -> None:
         """The plant of each pad beside its readings, and what of them is held out."""
         for pad in self.pads:
             runs = pad.runs
@@ -197,8 +198,8 @@ def into_diagnosis(d: Diagnosis, felt: TouchResult) -> None:
         data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
     elif felt.floor is not None:
         data["noise_floor"]["tactile_N"] = felt.floor
-    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
-    rest = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    bad = [f for f in data["findings"] if wrong_signal(f)]
+    rest = [f for f in data["findings"] if not wrong_signal(f)]
     data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
     data["nuisance"] |= felt.nuisance
 
@@ -283,10 +284,8 @@ def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Se
 
 def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
     """One range for all fingertips: every fit, and what was believed of a fingertip that was judged and follows it."""
-    if name == "object.friction":
-        believed = [x.friction for pad, x in facts.items() if x.judged and x.slid and pad not in by_pad]
-    else:
-        believed = [x.stiffness for pad, x in facts.items() if x.judged and pad not in by_pad]
+    others = [x.believed(name) for pad, x in facts.items() if pad not in by_pad]
+    believed = [x for x in others if x is not None]
     value, low, high = (np.array(x) for x in zip(*by_pad.values(), strict=True))
     return float(value.mean()), float(min([*low, *believed])), float(max([*high, *believed]))
 

@@ -188,6 +188,7 @@ class PadAnswer:
         low = [max(v - float(half[k]), 0.0) for k, v in zip(chosen, value, strict=True)]
         high = [v + float(half[k]) for k, v in zip(chosen, value, strict=True)]
         each: dict[str, list[float]] = {"value": value, "low": low, "high": high}
+        # one number stands for them where they are; no name hangs on it
         alike = len(chosen) == 1 or (len(chosen) and np.ptp(value) < 0.05)
         gain: dict[str, Any] = {k: float(np.mean(x)) if alike else x for k, x in each.items()} | {"unit": "1"}
         taxels: dict[str, Any] = {"value": ", ".join(names), "low": None, "high": None, "unit": ""}
@@ -241,7 +242,7 @@ def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
             continue
         r = s.run
         p = readings(r, search.base)
-        on = p.max(1) > 5 * search.noise
+        on = p.max(1) > 5 * search.noise  # the pad is touched: elsewhere both errors are noise
         if s.train.any():
             on &= r.t > r.t[0] + 0.75 * (r.t[-1] - r.t[0])
         for k, value in search.silent.items():
@@ -253,7 +254,7 @@ def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
 def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
     """Stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares one, and
     force over depth under and over which a tenth of the force is felt; None where nothing is pressed."""
-    on = (force > 0.2) & (depth > 1e-4)
+    on = (force > 0.2) & (depth > 1e-4)  # below, force over depth is noise over noise
     if on.sum() < 5:
         return None
     force, depth = force[on], depth[on]
@@ -348,13 +349,13 @@ def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[dict[
 
 
 def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
-    """Taxels [K] with no change although three neighbours changed by `TOUCH.spread` of the pad's largest: more than
-    what a touch beside them may pass on."""
+    """Taxels [K] with no change although `TOUCH.neighbours` beside them changed by `TOUCH.spread` of the pad's largest:
+    more than what a touch beside them may pass on."""
     top = float(span.max())
     if top <= 0 or len(span) < len(beside):
         return set()
     felt = span > TOUCH.spread * top
-    return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= 3}
+    return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= TOUCH.neighbours}
 
 
 def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, float]:

@@ -17,6 +17,7 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read import local_polynomial, spans
+from dexsim.gap.rules import TOUCH
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.tactile import reference as ref
@@ -462,11 +463,11 @@ def stretches(r: Recording) -> list[tuple[float, float]]:
     if r.tactile is not None and r.tactile.value.ndim == 4 and len(r.tactile) > 5:
         z = np.nan_to_num(newtons(r)[0][..., 2])
         still = np.ptp(z, axis=0) == 0  # a stuck taxel is no touch
-        t, on = r.tactile.t, np.where(still, 0.0, z).max((1, 2)) > 0.15
+        t, on = r.tactile.t, np.where(still, 0.0, z).max((1, 2)) > TOUCH.touched
     elif r.external_force is not None and len(r.external_force) > 5:
         size = np.linalg.norm(np.nan_to_num(r.external_force.value[:, :3]), axis=1)
         size = size - np.percentile(size, 5)
-        t, on = r.external_force.t, size > max(0.3, 0.05 * float(size.max()))
+        t, on = r.external_force.t, size > max(TOUCH.loaded, 0.05 * float(size.max()))
     else:
         return []
     return [(a, b) for a, b in spans(t, on, 0.3) if b - a > 0.03]

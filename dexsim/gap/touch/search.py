@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 from dexsim import intervals
 from dexsim.gap.effects import TouchEffect
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
-from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TOUCH
@@ -414,8 +413,7 @@ class PadSearch(PadFit):
                 listed += [e for e in TOUCH_CATALOGUE if e.widens and e not in listed and self._possible(current, e)]
             options = [t for e in listed if (t := self._try(current, e)) is not None]
             # one number for the pad, beside one for each taxel
-            if self.scale_known and any(e.by_taxel for e in listed):
-                options.append(self._common(current, 120))
+            options += [self._common(e, current, 120) for e in listed if e.by_taxel and self.scale_known]
             for t in options:
                 trials[frozenset(t.ids)] = t
             options.sort(key=lambda t: float(np.minimum(np.abs(t.res[self.train]), 30).sum()))
@@ -508,7 +506,7 @@ class PadSearch(PadFit):
                 )
             )
             if self.scale_known:
-                tries.append(self._common(current, 60))
+                tries.append(self._common(effect, current, 60))
             # a map where one number does not follow: nearer than this they follow alike
             if len(tries) == 2 and JUDGE.within**2 * self.size(tries[0].res) > self.size(tries[1].res):
                 tries = tries[1:]
@@ -523,8 +521,8 @@ class PadSearch(PadFit):
             best.res = self.residual(best.values, best.gains, best.order)
         return best
 
-    def _common(self, current: TouchTrial, evaluations: int) -> TouchTrial:
-        """The hypothesis with one gain for all of the pad."""
+    def _common(self, effect: TouchEffect, current: TouchTrial, evaluations: int) -> TouchTrial:
+        """The hypothesis with one gain for all of the pad, of an effect that may be another on each taxel."""
         ratio = float(
             np.median(
                 [
@@ -534,8 +532,8 @@ class PadSearch(PadFit):
             )
         )
         return self.fit(
-            (*current.ids, TactileGain.id),
-            current.values | {"gain": ratio},
+            (*current.ids, effect.id),
+            current.values | dict.fromkeys(effect.fits, ratio),
             None,
             current.gains,
             current.order,
@@ -616,7 +614,7 @@ class PadSearch(PadFit):
             if alike and t is not None:  # what is said to be no rival must have been fitted to its end
                 start = t.values
                 if x.by_taxel and t.gains is not None and self.scale_known:
-                    t = self._common(base, 120)
+                    t = self._common(x, base, 120)
                     start = t.values
                 elif current.gains is None:
                     start = x.in_place(t.values, base, current)

@@ -47,7 +47,7 @@ CHUNK = 24  # guesses simulated at once
 DRAWS = 300  # of a bootstrap over windows
 
 
-class Shaking:
+class Ringing:
     """How much a joint shakes in windows of the recordings `runs`. loud [W] bool: windows that shake; rung [W] bool:
     those that begin ringing."""
 
@@ -206,10 +206,10 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
     if followed or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by
-    shaking = Shaking(search, found.none)
-    if shaking.loud.sum() < SEARCH.shaking:
+    swings = Ringing(search, found.none)
+    if swings.loud.sum() < SEARCH.shaking:
         return found
-    before = shaking.of(found.best)
+    before = swings.of(found.best)
     asked = [e for e in CATALOGUE if e.rings and (search.allowed is None or e.id in search.allowed)]
     tries: dict[str, tuple[float, Trial]] = {}
     for effect in asked:
@@ -221,14 +221,14 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
                 if search.deadline.over():
                     continue
                 member = Member(effect, law)
-                lost, params, x = shaking.best(member, search.rng)
+                lost, params, x = swings.best(member, search.rng)
                 if effect.id not in tries or lost < tries[effect.id][0]:
                     with search._fix((member,)):
                         fit = search.fitter.fit(params, x0=x, iterations=0)
                     tries[effect.id] = lost, Trial((member,), fit)
     if not tries:
         return found
-    left = {e: shaking.of(t) for e, (_, t) in tries.items()}
+    left = {e: swings.of(t) for e, (_, t) in tries.items()}
     name = min(left, key=lambda e: float(left[e].sum()))
     gain = 1 - left[name].sum() / before.sum()
     draws = intervals.singles(len(before), search.rng, DRAWS)
@@ -249,12 +249,12 @@ def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict
     away; 0 where it does not ring there."""
     if not any(m.effect.rings for m in outcome.best.members):
         return 0.0
-    fitted = Shaking(search, outcome.none)
+    fitted = Ringing(search, outcome.none)
     if not fitted.loud.any():
         return 0.0
-    shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
+    swings = Ringing(search, outcome.none, runs, span, fitted.quiet)
     # what is held out is a part of the recordings: one stretch of it bears out what several of the others show
-    if not shaking.loud.any() or sum((x.loud | x.rung).sum() for x in (fitted, shaking)) < SEARCH.shaking:
+    if not swings.loud.any() or sum((x.loud | x.rung).sum() for x in (fitted, swings)) < SEARCH.shaking:
         return 0.0
-    before, after = (float(shaking.of(t).sum()) for t in (outcome.none, outcome.best))
+    before, after = (float(swings.of(t).sum()) for t in (outcome.none, outcome.best))
     return max(1.0 - after / before, 0.0)

@@ -14,7 +14,7 @@ from dexsim.gap.judge import conclude, confidence
 from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
-from dexsim.gap.search import logged_torque, shaking
+from dexsim.gap.search import logged_torque, ringing
 from dexsim.gap.search.search import JointSearch
 from dexsim.recording.audit_values import repeats
 
@@ -36,14 +36,14 @@ def soft() -> JointSearch:
 
 def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
     nothing = soft.without_search()
-    ringing = shaking.Shaking(soft, nothing.none)
-    assert 0.2 < ringing.loud.mean() < 0.9  # before the step that begins it the loop is quiet
-    found = shaking.answered(soft, nothing)
+    rung = ringing.Ringing(soft, nothing.none)
+    assert 0.2 < rung.loud.mean() < 0.9  # before the step that begins it the loop is quiet
+    found = ringing.answered(soft, nothing)
     assert found.best.ids == ("compliance",) and found.none is nothing.none
     at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
     assert at["compliance.softness"] == pytest.approx(SOFT["softness"], rel=0.3)
-    assert ringing.of(found.best).sum() < 0.5 * ringing.of(nothing.none).sum()
-    assert shaking.shown(soft, found, [2], None) and not shaking.shown(soft, nothing, [2], None)
+    assert rung.of(found.best).sum() < 0.5 * rung.of(nothing.none).sum()
+    assert ringing.shown(soft, found, [2], None) and not ringing.shown(soft, nothing, [2], None)
 
 
 def test_play_rings_on_where_it_was_struck():
@@ -56,10 +56,10 @@ def test_play_rings_on_where_it_was_struck():
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs), allowed={"backlash"})
     nothing = search.without_search()
-    found = shaking.answered(search, nothing)
+    found = ringing.answered(search, nothing)
     at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
     assert found.best.ids == ("backlash",) and at["backlash.gap"] == pytest.approx(0.03, rel=0.25)
-    rattles = shaking.Shaking(search, nothing.none)
+    rattles = ringing.Ringing(search, nothing.none)
     assert rattles.rung.sum() >= 4 and 0.3 < rattles.speed < 3.0
     begun_ringing = rattles.of(found.best)
     assert begun_ringing.sum() < 0.05 * rattles.of(nothing.none).sum()
@@ -84,7 +84,7 @@ def answer_of(soft: JointSearch, found) -> JointAnswer:
 def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft):
     """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
     does is a hint, and is not handed on."""
-    answer = answer_of(soft, shaking.answered(soft, soft.without_search()))
+    answer = answer_of(soft, ringing.answered(soft, soft.without_search()))
     assert rms(answer.after) > rms(answer.before)
     plainly = {"joint": "a plain model follows better"}  # it does not ring, and keeps step with nothing either
     assert conclude._withheld(plainly, [answer], {"joint"}) == {}
@@ -105,12 +105,12 @@ def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0], None, conditions(runs), allowed={"compliance"})
     nothing = search.without_search()
-    assert nothing.none.fit.loss > 2 and not shaking.Shaking(search, nothing.none).loud.any()
-    assert shaking.answered(search, nothing) is nothing
-    assert not shaking.shown(search, nothing, [1], None)
+    assert nothing.none.fit.loss > 2 and not ringing.Ringing(search, nothing.none).loud.any()
+    assert ringing.answered(search, nothing) is nothing
+    assert not ringing.shown(search, nothing, [1], None)
 
 
-def ringing(t: np.ndarray) -> np.ndarray:
+def swinging(t: np.ndarray) -> np.ndarray:
     """rad: swings of 83 Hz in two stretches."""
     on = ((t > 3.0) & (t < 6.0)) | ((t > 11.0) & (t < 15.0))
     return np.where(on, 0.02 * np.sin(2 * np.pi * 83.0 * t), 0.0)
@@ -122,15 +122,15 @@ def test_nobody_pushes_a_joint_that_rings():
     for seed, rings in ((0, True), (1, False)):
         r = run(model, seed)
         if rings:
-            swing = ringing(r.t)
+            swing = swinging(r.t)
             r.q[:, 1] += swing
             r.torque[:, 1] -= np.where(swing != 0, 5.0 * np.sign(np.sin(2 * np.pi * 0.7 * r.t)), 0.0)
         runs.append(r)
     assert logged_torque.find_pushes(model, runs, [0, 1]) == []
-    runs[0].q[:, 0] += ringing(runs[0].t)  # the shoulder, which carries the elbow, rings in its place
-    runs[0].q[:, 1] -= ringing(runs[0].t)
+    runs[0].q[:, 0] += swinging(runs[0].t)  # the shoulder, which carries the elbow, rings in its place
+    runs[0].q[:, 1] -= swinging(runs[0].t)
     assert logged_torque.find_pushes(model, runs, [0, 1]) == []
-    runs[0].q[:, 0] -= ringing(runs[0].t)  # the same torque where nothing rings
+    runs[0].q[:, 0] -= swinging(runs[0].t)  # the same torque where nothing rings
     assert [p.joint for p in logged_torque.find_pushes(model, runs, [0, 1])] == ["elbow"]
 
 

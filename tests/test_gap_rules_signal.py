@@ -1,0 +1,208 @@
+"""Each figure of `rules.SIGNAL` decides what it says: signals that are not what they say, and ends of a motion.
+`tests/test_gap_rules.py` moves each and sees its test fail."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator.table import ServoTable
+from dexsim.gap.judge import held_out
+from dexsim.gap.read import Run, channels, inputs
+
+STEP = 0.01
+SERVO = {"drive": "torque", "joints": {"*": {"kp": 1.0, "torque_limit": 100.0, "no_load_speed": 10.0}}}
+
+
+def model(span: float = 1.0, mass: float = 1.0) -> mujoco.MjModel:
+    """A joint of the range -span .. span whose load of `mass` kg lies 0.1 m beside its axis."""
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><worldbody><body>
+      <joint name="j" axis="0 1 0" limited="true" range="{-span} {span}"/>
+      <geom size="0.01" pos="0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>""")
+
+
+def run(q: np.ndarray, target: np.ndarray, step: float = STEP) -> Run:
+    """Positions and targets of one joint, every `step` s."""
+    t = step * np.arange(len(q))
+    return Run("a", ("j",), t, np.asarray(target, float)[:, None], t.copy(), np.asarray(q, float)[:, None],
+               ServoTable.from_dict(SERVO), np.array([0.0, 0.0, -9.81]))  # fmt: skip
+
+
+def wrong(r: Run, span: float = 1.0, lead: float = 0.0, sign: float = 0.0) -> str:
+    """The kind of what is wrong with a run's joint, empty for nothing; lead [s], sign: of its position beside its
+    target."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(channels, "_lead", lambda *_: lead)
+        patch.setattr(channels, "_sign", lambda *_: sign)
+        found = channels._wrong([r], r, 0, model(span))
+    return "" if found is None else found.kind
+
+
+def test_a_wrong_signal_is_told_surely():
+    for kind in ("stale", "stuck"):
+        q = np.r_[np.sin(np.arange(200.0)), np.full(200, np.sin(199.0))]
+        stuck = channels._wrong([r := run(q, 3 * np.sin(0.03 * np.arange(400)))], r, 0, model(9.0))
+        assert stuck is not None and stuck.kind == "stuck"
+        f = channels.finding(kind, "so", "j", [], [], stuck.confidence if kind == "stuck" else None)
+        assert held_out.wrong_signals([f]) == [f] and f["confidence"] <= 1.0, kind
+
+
+def test_a_position_far_outside_its_range_is_not_that_joints():
+    for beyond, kind in ((10.0, ""), (14.0, "unit")):  # the range spans 4 rad
+        q = (2.0 + beyond) * np.sin(np.arange(400.0))
+        q *= (2.0 + beyond) / np.abs(q).max()
+        assert wrong(run(q, np.zeros(400)), span=2.0) == kind, beyond
+
+
+def test_a_joint_that_follows_the_negative_of_its_target_is_named():
+    r = run(np.sin(0.1 * np.arange(400)), np.sin(0.1 * np.arange(400)))
+    assert wrong(r, 9.0, sign=-0.6) == "" and wrong(r, 9.0, sign=-0.8) == "sign"
+
+
+def test_a_joint_that_hardly_moves_has_no_direction():
+    wave = np.sin(0.1 * np.arange(400))
+    assert wrong(run(0.15 * wave, wave), 9.0, sign=-1.0) == "" and wrong(run(0.25 * wave, wave), 9.0, sign=-1.0)
+
+
+def test_a_joint_that_moves_before_its_target_is_on_another_clock():
+    r = run(np.sin(0.1 * np.arange(400)), np.sin(0.1 * np.arange(400)))
+    assert wrong(r, 9.0, lead=0.012) == "" and wrong(r, 9.0, lead=0.02) == "clock_skew"
+
+
+def test_over_a_long_pause_the_motion_is_not_known():
+    for pause, blind in ((0.4, 0), (0.6, 1)):
+        r = run(np.zeros(400), np.zeros(400))
+        r.t[200:] += pause - STEP
+        assert len(channels._pauses(r)) == blind, pause
+
+
+def test_a_joint_that_never_moves_must_have_been_asked_to():
+    for way, kind in ((0.08, ""), (0.12, "stuck")):
+        assert wrong(run(np.zeros(400), way * np.linspace(0, 1, 400)), 9.0) == kind, way
+
+
+def test_dry_friction_may_hold_a_joint_as_it_has_before():
+    for way, kind in ((0.28, ""), (0.32, "stuck")):  # it has held 0.2 rad
+        q = np.r_[np.linspace(0, 0.2, 200), np.full(200, 0.2)]
+        target = np.r_[np.linspace(0, 0.2, 200), np.linspace(0.2, 0.2 + way, 200)]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(channels, "_holds", lambda *_: 0.2)
+            assert wrong(run(q, target), 9.0) == kind, way
+
+
+def test_a_rest_lasts_a_while():
+    for stands, held in ((8, 0.0), (12, 1.0)):  # samples of 5 ms
+        q = np.r_[np.arange(20.0), np.full(stands, 19.0), np.arange(20.0, 40.0)]
+        r = run(q, q + 1.0, step=0.005)
+        assert channels._holds(r, 0, len(q)) == held, stands
+
+
+def frozen(stands: int = 8, jump: float = 4.0, before: float = 1.0) -> bool:
+    """Whether old readings are seen where a joint that moves by a step a sample stands for so many samples, twice, and
+    then jumps by so many steps; before: its steps just before."""
+    steps = np.ones(200)
+    for a in (60, 120):
+        steps[a - 5 : a] = before
+        steps[a : a + stands] = 0.0
+        steps[a + stands] = jump
+    q = np.cumsum(steps)
+    return bool(channels._held(STEP * np.arange(len(q)), q).any())
+
+
+def test_readings_that_stand_while_a_joint_moves_are_old_ones():
+    assert not frozen(stands=5) and frozen(stands=8)
+    assert not frozen(jump=2.0) and frozen(jump=3.0)
+    assert not frozen(before=0.07) and frozen(before=0.15)
+
+
+def stretches(stands: float = 0.3, jump: float = 0.0, held: float = 0.0, span: float = 1.0) -> bool:
+    """Whether a joint's encoder is seen to freeze that stands for so many s while its target goes 1 rad, and then jumps
+    there; jump [rad]: another, without a rest; held [rad]: what its target goes while it rests and moves on slowly;
+    span [rad]: of the target in all."""
+    n = round(stands / STEP)
+    target = np.concatenate([np.zeros(100), np.linspace(0, 1, n), np.ones(100)])
+    q = np.concatenate([np.zeros(100), np.zeros(n), np.ones(100)])
+    q[:100] = 1e-3 * np.arange(-99, 1)
+    q[100 + n :] += 1e-3 * np.arange(100)
+    level = q[-1]
+    # at rest while the target goes on, then slowly after it
+    target = np.concatenate([target, np.linspace(1, 1 + held, 50), np.full(100, 1 + held)])
+    q = np.concatenate([q, np.full(50, level), level + 1e-3 * np.arange(1, 101)])
+    # a jump from motion, then to the far end of all
+    q = np.concatenate([q, q[-1] + jump + 1e-3 * np.arange(1, 101)])
+    target = np.concatenate([target, np.full(50, 0.0), np.full(50, span)])
+    return bool(channels.repeated_stretches([run(q, target)], "j")[0])
+
+
+def test_a_frozen_encoder_is_told_by_what_the_joint_does_elsewhere():
+    assert not stretches(stands=0.08) and stretches(stands=0.13)
+    assert stretches(jump=0.4) and not stretches(jump=0.6)
+    assert stretches(held=0.4) and not stretches(held=0.6)
+    assert stretches(span=8.0) and not stretches(span=12.0)
+
+
+def test_a_few_repeated_samples_say_nothing():
+    for samples, repeated, said in ((1000, 16, False), (1000, 24, True), (100, 6, False), (100, 10, True)):
+        again = np.arange(samples) < repeated
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(channels, "repeats", lambda *_, again=again: again)
+            assert bool(channels.repeated_samples(np.arange(samples), np.zeros(samples)).any()) is said, repeated
+
+
+def seldom(sizes: np.ndarray, period: int = 100, late: int = 0, early: float = 0.0) -> float:
+    """Period [samples] of an encoder's readings, of changes of these sizes every `period` samples, two of four later by
+    `late`; early: share of changes that come between, small ones."""
+    at = period * np.arange(1, len(sizes) + 1) + late * np.array([1, 1, -1, -1])[np.arange(len(sizes)) % 4]
+    step = np.zeros(period * (len(sizes) + 2))
+    step[at] = sizes
+    if early:
+        step[at[: round(early * len(sizes) / (1 - early))] - period // 2] = 1.0
+    return channels.rhythm(np.arange(float(len(step))), np.cumsum(step))
+
+
+def alike(count: int, size: float, small: int = 1) -> np.ndarray:
+    """Changes of one size, `small` of them of 1, spread evenly."""
+    sizes = np.full(count, size)
+    sizes[np.linspace(0, count - 1, small).astype(int)] = 1.0
+    return sizes
+
+
+def test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm():
+    assert seldom(alike(60, 2.5)) == 0.0 and seldom(alike(60, 4.0)) == pytest.approx(100, rel=0.01)
+    assert seldom(alike(100, 5.0, small=80)) == 0.0 and seldom(alike(100, 5.0, small=70)) > 0
+    assert seldom(alike(60, 5.0), period=3) == 0.0 and seldom(alike(60, 5.0), period=5) > 0
+    assert seldom(alike(100, 5.0), early=0.035) > 0 and seldom(alike(100, 5.0), early=0.075) == 0.0
+    assert seldom(alike(60, 5.0), late=12) == 0.0 and seldom(alike(60, 5.0), late=5) > 0
+    assert np.isnan(seldom(alike(8, 5.0))) and seldom(alike(14, 5.0)) > 0
+
+
+def end(error: float, usual: float = 0.05, meeting: int = 30, times: int = 3, hard: bool = True) -> bool:
+    """Whether an end is seen where a joint of 1 rad of motion meets it so often, each time for so many samples, its
+    target that far beyond it; usual: its error at rest elsewhere."""
+    q, target = [np.full(200, 0.0)], [np.full(200, usual)]
+    for _ in range(times):
+        q += [np.linspace(0, 1, 100), np.full(meeting, 1.0), np.linspace(1, 0, 100), np.zeros(100)]
+        target += [np.linspace(0, 1, 100), 1 + error * np.linspace(0.9, 1, meeting), np.linspace(1, 0, 100),
+                   np.full(100, usual)]  # fmt: skip
+    r = run(np.concatenate(q), np.concatenate(target))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inputs, "_hard", lambda *_: hard)
+        return inputs._end(SimpleNamespace(), SimpleNamespace(), [r], 0, 1) is not None
+
+
+def test_an_end_is_met_hard_long_and_again():
+    assert not end(0.2) and end(0.35)
+    assert not end(0.03, usual=0.0) and end(0.05, usual=0.0)
+    assert not end(1.0, meeting=8) and end(1.0, meeting=13)
+    assert not end(1.0, times=1) and end(1.0, times=3)
+
+
+def test_an_end_bears_more_than_a_load():
+    """Gravity pulls with 0.981 N.m; the loop asks for 1 N.m/rad."""
+    m = model()
+    for error, bears in ((4.5, False), (5.5, True)):
+        r = run(np.zeros(10), np.full(10, error))
+        assert bool(inputs._hard(m, mujoco.MjData(m), r, 0, 5)) is bears, error
