@@ -275,7 +275,7 @@ class Plainly(Selecting):
     def plain(self):
         return [p for p, _ in self.values], np.array([x for _, x in self.values])
 
-    def _narrow(self, variant):
+    def _narrow(self, effect, variant):
         mode = "add" if variant.params[0].columns == ("delay",) else "set"
         return Variant((param("size", variant.params[0].columns[0], mode, -0.5, 1.0),), ((0.0,),))
 
@@ -701,7 +701,7 @@ def test_an_effect_must_plainly_tell_how_a_joint_rings():
     fit = SimpleNamespace(loss=100.0)
     search = SimpleNamespace(
         deadline=Deadline(), allowed=None, case=SimpleNamespace(scales=None), rng=np.random.default_rng(0),
-        _narrow=lambda v: v, _fix=lambda _: nullcontext(), fitter=SimpleNamespace(fit=lambda *_, **__: fit),
+        _narrow=lambda _, v: v, _fix=lambda _: nullcontext(), fitter=SimpleNamespace(fit=lambda *_, **__: fit),
     )  # fmt: skip
     nothing = SimpleNamespace(joint="j", none=Trial((), fit), best=Trial((), fit), scanned=[])
     try:

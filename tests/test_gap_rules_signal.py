@@ -72,6 +72,25 @@ def test_a_joint_that_moves_before_its_target_is_on_another_clock():
     assert wrong(r, 9.0, lead=0.012) == "" and wrong(r, 9.0, lead=0.02) == "clock_skew"
 
 
+def smooth(rng: np.random.Generator, n: int) -> np.ndarray:
+    """A motion [n] of no period, in steps of 5 ms."""
+    window = np.hanning(61)
+    return np.convolve(rng.normal(size=n), window / window.sum(), "same")
+
+
+def test_a_lead_is_told_by_a_clear_correlation():
+    """Of a joint that is 0.1 s ahead of its target: with as much, or twice as much, of another motion beside it; or
+    swinging, where a lag of almost a period fits nearly as well as the lead does."""
+    rng = np.random.default_rng(0)
+    target, other = smooth(rng, 4020), smooth(rng, 4000)
+    for beside, lead in ((1.0, 0.1), (2.0, 0.0)):
+        assert np.isclose(channels._lead(run(target[20:] + beside * other, target[:4000], 0.005), 0), lead), beside
+    t = 0.005 * np.arange(4000)
+    for period, lead in ((1.0, True), (1.3, False)):
+        ahead, now = (np.sin(2 * np.pi * (t + x) / period) for x in (0.1, 0.0))
+        assert (channels._lead(run(ahead, now, 0.005), 0) > 0.0) is lead, period
+
+
 def test_over_a_long_pause_the_motion_is_not_known():
     for pause, blind in ((0.4, 0), (0.6, 1)):
         r = run(np.zeros(400), np.zeros(400))

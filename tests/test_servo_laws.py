@@ -14,7 +14,7 @@ import warp as wp
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, kernel, laws
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.laws import LEAST_ROTOR
-from dexsim.actuator.reference import measured_position, torque_along, viscous
+from dexsim.actuator.reference import gear_load_friction, measured_position, torque_along, viscous
 from dexsim.actuator.reference import servo as servo_reference
 from dexsim.gap import demo
 from dexsim.gap.judge.full_model import World, free_runs
@@ -426,20 +426,22 @@ def test_what_the_encoder_is_off_by_is_marked_as_the_encoders():
 
 
 @wp.kernel
-def limited(asked: wp.array(dtype=float), v: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+def limited(slope: float, asked: wp.array(dtype=float), v: wp.array(dtype=float), out: wp.array2d(dtype=float)):
     i = wp.tid()
-    ends = laws.torque_limits(0.4, wp.abs(v[i]) / 10.0, v[i], 1.0)
+    ends = laws.torque_limits(0.4, wp.abs(v[i]) / 10.0, v[i], slope)
     out[i, 0] = wp.clamp(asked[i], -ends[0], ends[1])
     out[i, 1] = laws.voltage_torque(asked[i], 0.4, 1.2, 0.4 / 10.0, v[i])
 
 
-def test_the_torque_along_a_measured_motion_follows_the_kernels_laws():
+@pytest.mark.parametrize("slope", [1.0, 0.3, 0.0, -0.8])
+def test_the_torque_along_a_measured_motion_follows_the_kernels_laws(slope):
     rng = np.random.default_rng(0)
     asked, v = rng.uniform(-1.5, 1.5, 200), rng.uniform(-12.0, 12.0, 200)
     out = wp.zeros((200, 2), dtype=float, device="cpu")
     inputs = [wp.array(x, dtype=float, device="cpu") for x in (asked, v)]
-    wp.launch(limited, 200, inputs=[*inputs, out], device="cpu")
-    torque, duty = torque_along(asked, v, 0.4, 10.0, False), torque_along(asked, v, 0.4, 10.0, True, 1.2)
+    wp.launch(limited, 200, inputs=[slope, *inputs, out], device="cpu")
+    torque = torque_along(asked, v, 0.4, 10.0, False, braking_slope=slope)
+    duty = torque_along(asked, v, 0.4, 10.0, True, 1.2)
     assert np.allclose(out.numpy(), np.stack([torque, duty], 1), atol=1e-6) and np.abs(torque).max() > 0.35
     assert np.array_equal(torque_along(asked, v, np.inf, np.inf, False), asked)
     assert np.array_equal(torque_along(asked, v, 0.4, 10.0, False, limited=False), asked)
@@ -494,4 +496,5 @@ def test_laws_that_only_the_search_has():
     assert np.allclose(left, np.maximum(0.7 - 0.2 * size, 0.2)) and (left == 0.2).any() and (left > 0.2).any()
     assert np.allclose(friction, share * 2.0 * (size / 2.0) ** 1.5)
     assert np.allclose(linear, share * size)
+    assert np.allclose(friction, gear_load_friction(torque, v, 0.1, 0.4, 1.5, 2.0), rtol=1e-12)
     assert np.allclose(duty, 0.4 * (1.2 * torque) - 0.04 * v)

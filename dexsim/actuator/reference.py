@@ -258,19 +258,20 @@ def torque_along(
     voltage: bool,
     supply: Numbers = 1.0,
     limited: bool = True,
+    braking_slope: Numbers = 1.0,
 ) -> np.ndarray:
-    """Motor torque [S] N.m along a measured motion: `laws.torque_limit` with the same line for driving and braking, or
-    `laws.voltage_torque`.
+    """Motor torque [S] N.m along a measured motion: `laws.torque_limits`, or `laws.voltage_torque`.
 
     asked [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
     (inf: no limit); supply: of its nominal voltage, of a voltage drive alone; limited: False leaves what is asked as it
-    is."""
+    is; braking_slope: of the line while the drive brakes, of a torque drive (1: as it drives)."""
     if voltage:
         duty = np.clip(asked, -1, 1) if limited else asked
         return stall * duty * supply - (stall / no_load * v if np.all(np.isfinite(no_load)) else 0.0)
     if not limited or not np.all(np.isfinite(stall)):
         return asked
-    limit = stall * np.maximum(1 - np.abs(v) / no_load, 0.0)
+    slope = np.where(asked * v < 0, braking_slope, 1.0)
+    limit = stall * np.maximum(1 - slope * (np.abs(v) / no_load), 0.0)
     return np.clip(asked, -limit, limit)
 
 
@@ -312,6 +313,15 @@ def parasitic_torque(
         tilt = (1.0 - np.abs(form)) * tilt + form / np.pi
     torque, by_position = p["torque_ripple"] * wave, p["torque_ripple"] * p["ripple_per_turn"] * tilt
     return torque, by_position, np.zeros_like(v)
+
+
+def gear_load_friction(
+    torque: np.ndarray, v: Numbers, driving: Numbers, backdriven: Numbers, power: Numbers, unit: Numbers
+) -> np.ndarray:
+    """Dry friction [...] N.m of a gear by the torque [...] N.m that it hands to the joint: `laws.gear_load_friction`. v
+    [...]: the joint's speed, of which the sign counts."""
+    share = np.where(torque * v < 0.0, backdriven, driving)
+    return share * unit * (np.abs(torque) / unit) ** power
 
 
 def dry_friction(

@@ -7,7 +7,7 @@ import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -122,6 +122,14 @@ PLAN = 60.0  # s that must be left for a plan of the next recording: one call, o
 MUCH = 20.0  # s of all joints' recordings for each second of a limit: the model along less is not worth a look
 
 
+@dataclass(frozen=True)
+class JudgedAhead:
+    """Of a joint what was judged while others were still searched: its answer, and what a plain model of it leaves."""
+
+    answer: JointAnswer
+    plain: baseline.Baseline | None
+
+
 class Drives(Steps):
     """The drives of a mechanism. w: what is asked and has been read; felt: touch, which is judged before: a joint is
     judged where nothing is touched."""
@@ -142,7 +150,7 @@ class Drives(Steps):
         self.searched: list[SearchedJoint] = []
         self.answers: list[JointAnswer] = []
         # what of the judgement needs no other joint, by the search that it is of (`_judged_ahead`)
-        self.ahead: dict[int, tuple[JointAnswer, baseline.Baseline | None]] = {}
+        self.ahead: dict[int, JudgedAhead] = {}
         # judge
         self.plains: list[baseline.Baseline] = []
 
@@ -348,18 +356,18 @@ class Drives(Steps):
         something hidden takes longest, and leaves cores free. Not where time is limited: searches have it first."""
         limit = self.w.limit
         if limit.seconds is None and not limit.stopped and not _unsettled(found):
-            self.ahead[id(search)] = self._answer(search, found), self._plain(search)
+            self.ahead[id(search)] = JudgedAhead(self._answer(search, found), self._plain(search))
 
     def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
         """A joint on what was held out."""
         known = self.ahead.get(id(search))
-        return known[0] if known else JointAnswer.of(search.case, search, found, self.kept)
+        return known.answer if known else JointAnswer.of(search.case, search, found, self.kept)
 
     def _plain(self, search: JointSearch) -> baseline.Baseline | None:
         """What a plain model of a joint leaves of what was held out."""
         case, p, known = search.case, self.parts, self.ahead.get(id(search))
         if known or not case.moved:
-            return known[1] if known else None
+            return known.plain if known else None
         return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
 
     def _search_longer(self, answers: Answers) -> None:

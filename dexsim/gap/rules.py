@@ -1,10 +1,10 @@
 """The figures that decide: what each means, where its value came from, and which test fails if it is moved.
 
 What stays elsewhere decides no name, confidence or verdict by itself: sizes, bounds and starts of an effect (in its
-class), whether a reading is rounded (in `plant/case.py`), by what a lead is told from a correlation (in
-`read/channels.py`), figures of the numerics (steps, damping, ridges, filters' widths, grids, caps of a misfit, what a
-fit trims, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets, lengths of
-short lists, how many drafts are looked at closely, whose motion is refined: more of it takes longer).
+class), whether a reading is rounded (in `plant/case.py`: its noise then is its quantum's), figures of the numerics
+(steps, damping, ridges, filters' widths, grids, caps of a misfit, what a fit trims, bootstraps' draws and blocks, the
+rounding of 0), and how much is searched (windows, budgets, lengths of short lists, how many drafts are looked at
+closely, whose motion is refined: more of it takes longer).
 """
 
 from __future__ import annotations
@@ -716,6 +716,18 @@ class SignalRules:
         "x a joint's range (and more than a turn) beyond which a position or a target is not that joint's",
         "above 1, a zero that was set at the other end; degrees for radians are 57 times as far",
         "test_a_position_far_outside_its_range_is_not_that_joints",
+    )
+    leads: float = _rule(
+        0.6,
+        "correlation of the speeds of a joint and its target from which they are one motion at some shift in time",
+        "1 of a joint that follows; two motions of other frequencies stay below a half",
+        "test_a_lead_is_told_by_a_clear_correlation",
+    )
+    beyond: float = _rule(
+        0.15,
+        "more of it than at any shift at which the target comes first: only then does the joint lead",
+        "a periodic motion fits at many shifts nearly as well",
+        "test_a_lead_is_told_by_a_clear_correlation",
     )
     against: float = _rule(
         0.7,

@@ -216,6 +216,8 @@ class Effect:
     whole: ClassVar[bool] = False
     simulated: ClassVar[bool] = True  # the plant has a law of it
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
+    # what is left of it without its size, which is fitted anyway, is an effect too
+    parts_stand: ClassVar[bool] = False
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
     jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.actuator.reference import torque_along
 from dexsim.gap.effects import Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
@@ -49,11 +50,7 @@ def lost(s: Scales, m: dict[str, np.ndarray], limit: float, no_load_speed: float
     asked, v = m["_asked"], m["_speed"]
 
     def give(most: float, fastest: float) -> np.ndarray:
-        most = min(most, 1e9)
-        if s.voltage:
-            return most * (np.clip(asked, -1, 1) - v / fastest)
-        edge = most * np.maximum(1 - np.abs(v) / fastest, 0)
-        return np.clip(asked, -edge, edge)
+        return torque_along(asked, v, min(most, 1e9), fastest, s.voltage)
 
     return np.abs(give(s.nominal["torque_limit"], s.nominal["no_load_speed"]) - give(limit, no_load_speed))
 
@@ -131,12 +128,9 @@ class BrakingLimit(Effect):
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         m, s = case.regimes, case.scales
-        asked, v = m["_asked"], np.abs(m["_speed"]) / s.nominal["no_load_speed"]
-        limits = (
-            s.nominal["torque_limit"] * np.maximum(1 - x * v, 0) for x in (s.nominal["braking_slope"], values["slope"])
-        )
-        a, b = (np.clip(asked, -x, x) for x in limits)
-        return np.where(asked * m["_speed"] < 0, np.abs(a - b), 0.0)
+        limits = m["_asked"], m["_speed"], s.nominal["torque_limit"], s.nominal["no_load_speed"], False
+        a, b = (torque_along(*limits, braking_slope=x) for x in (s.nominal["braking_slope"], values["slope"]))
+        return np.abs(a - b)
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"slope": fit.entry("slope", "1")}
@@ -309,6 +303,7 @@ class GainMismatch(Effect):
 
     id = "gain_mismatch"
     words = "runs on other gains than believed"
+    parts_stand = True  # there are two
     shows = "with the size of the error"
     experiment = "steps of several sizes against a known load"
     plain = ("kp", "kd")

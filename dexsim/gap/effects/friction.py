@@ -29,6 +29,7 @@ class CoulombFriction(Effect):
     classes = ("friction or play", "friction and load", "friction or pull", "friction or dead zone")
     motions = ("triangles", "steps")
     fitted_anyway = {"coulomb_friction": "torque"}
+    parts_stand = True  # its directions may differ
     demo = {"coulomb_friction": 0.06}
 
     def variants(self, s: Scales) -> list[Variant]:

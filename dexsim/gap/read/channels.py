@@ -31,9 +31,6 @@ from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 PAUSE = 1.0  # s without a sample, over which no lag is measured
-# of the correlation of two clocks' motions: what it must be, and by how much more than without a lead, since a periodic
-# motion fits at many shifts (only a clear gain before the target counts)
-CLEAR, BEYOND = 0.6, 0.15
 TURN = 180 / np.pi
 
 Spans = list[tuple[float, float]]  # s
@@ -359,7 +356,7 @@ def _lead(run: Run, j: int) -> float:
     scores = signal.correlate(dc, dq, "valid", "fft") / norm
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
-    ahead = best > after and scores[best] > CLEAR and scores[best] > causal + BEYOND
+    ahead = best > after and scores[best] > SIGNAL.leads and scores[best] > causal + SIGNAL.beyond
     return step * (best - after) if ahead else 0.0
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX
+from dexsim.actuator.reference import loop_torque
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, TORQUE
 
@@ -118,7 +119,7 @@ class _Logged:
 def _logged(run: Run, j: int) -> _Logged | None:
     """What joint j's drive logged in a recording; None where it logged nothing that its law gives."""
     row = run.servo.nominal(run.joints)[j]
-    kp, kd, limit = (row[INDEX[n]] for n in ("kp", "kd", "torque_limit"))
+    gains, limit = {n: row[INDEX[n]] for n in ("kp", "kd")}, row[INDEX["torque_limit"]]
     if run.duty is not None and run.servo.drive == "voltage":
         logged, top, signal = run.duty[:, j], 1.0, "duty"
     elif run.torque is not None and run.servo.drive == "torque":
@@ -131,14 +132,8 @@ def _logged(run: Run, j: int) -> _Logged | None:
     law = []
     for d in SHIFTS + row[INDEX["delay"]]:
         cmd = run.command_at(run.t - d)[:, j]
-        law.append(
-            np.clip(
-                kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j]))
-                - kd * np.interp(run.t - d, run.t, run.vs[:, j]),
-                -top,
-                top,
-            )
-        )
+        q, v = (np.interp(run.t - d, run.t, x[:, j]) for x in (run.qs, run.vs))
+        law.append(np.clip(loop_torque(gains, cmd - q, v, 2.0), -top, top))
     return _Logged(signal, run.t[on], logged[on], np.array(law)[:, on])
 
 

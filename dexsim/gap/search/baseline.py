@@ -19,7 +19,7 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX as SERVO
-from dexsim.actuator.reference import dry_friction
+from dexsim.actuator.reference import dry_friction, gear_load_friction
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
@@ -355,9 +355,8 @@ def _beyond_coulomb(
     known the motor's share is left out."""
     motor = np.where(np.isfinite(drive), way * drive, 0.0)
     level = dry_friction(dict(dry) | {"coulomb_friction": 0.0}, q, np.full_like(q, way * 1e-9), motor, -pull)
-    unit = max(dry["gear_load_unit"], 1e-12)
-    share = np.where(way * pull < 0.0, dry["gear_load_friction_backdriven"], dry["gear_load_friction"])
-    level = level + share * unit * (np.abs(pull) / unit) ** dry["gear_load_power"]
+    shares = dry["gear_load_friction"], dry["gear_load_friction_backdriven"]
+    level = level + gear_load_friction(pull, way, *shares, dry["gear_load_power"], max(dry["gear_load_unit"], 1e-12))
     return level * (1 + 0.5 * way * dry["friction_asymmetry"])
 
 

@@ -216,7 +216,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
         if effect.id in found.best.ids:
             return found  # it is what was found by the motion itself
         for whole in effect.variants(search.case.scales):
-            variant = None if whole.refines or whole.approximate else search._narrow(whole)
+            variant = None if whole.refines or whole.approximate else search._narrow(effect, whole)
             for law in [] if variant is None else [variant, *variant.by_law()]:
                 if search.deadline.over():
                     continue

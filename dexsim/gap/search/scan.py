@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexsim import intervals
-from dexsim.gap.effects import Variant
+from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
@@ -232,7 +232,7 @@ class JointScan(JointLosses):
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for whole in effect.variants(case.scales):
-                variant = None if whole.refines or whole.approximate else self._narrow(whole)
+                variant = None if whole.refines or whole.approximate else self._narrow(effect, whole)
                 if variant is None:
                     continue
                 member = Member(effect, variant)
@@ -368,14 +368,13 @@ class JointScan(JointLosses):
             best.setdefault(member.id, (gain, member, start))
         return sorted(best.values(), key=lambda o: -o[0])
 
-    def _narrow(self, variant: Variant) -> Variant | None:
-        """The variant without parameters that are fitted anyway, because nothing in particular is believed of them."""
+    def _narrow(self, effect: Effect, variant: Variant) -> Variant | None:
+        """A variant of the effect without parameters that are fitted anyway, because nothing in particular is believed
+        of them."""
         keep = [i for i, p in enumerate(variant.params) if not set(p.columns) & self.wide]
         if len(keep) == len(variant.params):
             return variant
-        # without its size nothing is left of an effect, but for friction (its directions may differ) and gains (there
-        # are two)
-        if not keep or (keep[0] > 0 and variant.params[0].key not in ("torque", "kp_factor")):
+        if not keep or (keep[0] > 0 and not effect.parts_stand):
             return None
         starts = tuple(dict.fromkeys(tuple(s[i] for i in keep) for s in variant.starts))
         return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)

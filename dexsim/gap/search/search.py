@@ -319,7 +319,7 @@ class JointSelection(JointScan):
             if not moved or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.approximate]
-            variant = self._narrow(variants[0]) if variants else None
+            variant = self._narrow(effect, variants[0]) if variants else None
             if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
                 continue
             values = [
@@ -415,7 +415,7 @@ class JointSelection(JointScan):
         """Members with more parameters (an elasticity that hardens), where those earn their place."""
         for i, member in enumerate(current.members):
             for whole in member.effect.variants(self.case.scales):
-                variant = self._narrow(whole) if whole.refines else None
+                variant = self._narrow(member.effect, whole) if whole.refines else None
                 if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
                     continue
                 sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]

@@ -242,7 +242,7 @@ def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
             continue
         r = s.run
         p = readings(r, search.base)
-        on = p.max(1) > 5 * search.noise  # the pad is touched: elsewhere both errors are noise
+        on = p.max(1) > JUDGE.far * search.noise  # the pad is touched: elsewhere both errors are noise
         if s.train.any():
             on &= r.t > r.t[0] + 0.75 * (r.t[-1] - r.t[0])
         for k, value in search.silent.items():

@@ -546,7 +546,7 @@ class PadSearch(PadFit):
         K = self.runs[0].z.shape[1]
         z = np.concatenate([r.z for r in self.runs])
         p = np.concatenate([readings(r, values, None, None) for r in self.runs])
-        live = [k for k in range(K) if p[:, k].max() > 5 * self.noise and z[:, k].max() > 3 * self.noise]
+        live = [k for k in range(K) if p[:, k].max() > JUDGE.far * self.noise and z[:, k].max() > 3 * self.noise]
         if len(live) < 3:
             return None
         zz, pp = z[:, live], p[:, live]
