@@ -60,8 +60,10 @@ def test_an_unknown_column_is_fitted_with_every_hypothesis_and_handed_on(name, t
     assert none.fit.loss < 2.5, "the motions are followed without any effect"
     value = dict(zip([p.key for p in none.fit.params], none.fit.x, strict=True))[name]
     assert value == pytest.approx(true, rel=0.15)
-    labels = [v.label for v in EFFECTS[effect].variants(search.case.scales) if search._narrow(EFFECTS[effect], v) is not None]
-    mine = [v.label for v in EFFECTS[effect].variants(search.case.scales) if (name,) == v.params[0].columns]
+    named = EFFECTS[effect]
+    variants = named.variants(search.case.scales)
+    labels = [v.label for v in variants if search._narrow(named, v) is not None]
+    mine = [v.label for v in variants if (name,) == v.params[0].columns]
     assert mine and not set(mine) & set(labels), "what is fitted anyway is not named as well"
     table = ServoTable.from_dict({"joints": {"*": SERVO}})
     servo_changes(table, search.case, none, intervals(none.fit, search.blocks), ["joint"])
@@ -74,9 +76,9 @@ def test_a_column_that_says_nothing_alone_is_taken_as_absent_and_said():
     assert not {"torque_ripple", "sag"} & {c for p in search.all_nuisances for c in p.columns}
     said = conclude.not_fitted([search.case])
     assert len(said) == 2 and all("taken as absent" in x for x in said)
-    assert any(search._narrow(EFFECTS["torque_ripple"], v) is not None for v in EFFECTS["torque_ripple"].variants(search.case.scales)), (
-        "it is still looked for"
-    )
+    ripple = EFFECTS["torque_ripple"]
+    narrowed = [search._narrow(ripple, v) for v in ripple.variants(search.case.scales)]
+    assert any(v is not None for v in narrowed), "it is still looked for"
 
 
 def test_the_joint_that_drags_is_the_one_the_servo_names():
