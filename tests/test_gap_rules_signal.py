@@ -72,6 +72,22 @@ def test_a_joint_that_moves_before_its_target_is_on_another_clock():
     assert wrong(r, 9.0, lead=0.012) == "" and wrong(r, 9.0, lead=0.02) == "clock_skew"
 
 
+def stopped(at: float, moved: float, further: float) -> bool:
+    """Whether a position is said to have stopped for good that moves by `moved` until the share `at` of a recording,
+    its target by `further` of it more then."""
+    k = int(400 * at)
+    way = np.r_[np.linspace(0, moved, k), np.full(400 - k, moved)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(channels, "_holds", lambda *_: 0.0)
+        return wrong(run(way, way + np.r_[np.zeros(k), np.linspace(0, further * moved, 400 - k)]), 9.0) == "stuck"
+
+
+def test_a_position_stops_for_good_early_and_after_moving():
+    assert stopped(0.7, 1.0, 0.5) and not stopped(0.8, 1.0, 0.5)
+    assert stopped(0.5, 1.5e-3, 0.5) and not stopped(0.5, 0.8e-3, 0.5)
+    assert stopped(0.5, 1.0, 0.35) and not stopped(0.5, 1.0, 0.25)
+
+
 def smooth(rng: np.random.Generator, n: int) -> np.ndarray:
     """A motion [n] of no period, in steps of 5 ms."""
     window = np.hanning(61)

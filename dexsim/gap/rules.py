@@ -717,6 +717,24 @@ class SignalRules:
         "above 1, a zero that was set at the other end; degrees for radians are 57 times as far",
         "test_a_position_far_outside_its_range_is_not_that_joints",
     )
+    late: float = _rule(
+        0.75,
+        "of a recording: a position that stands still from later on has not stopped for good",
+        "the customary quarter, as of a recording's end that is held out",
+        "test_a_position_stops_for_good_early_and_after_moving",
+    )
+    stirred: float = _rule(
+        1e-3,
+        "rad or m that a position has moved before it stopped for good: less is an encoder's count",
+        "below a count of an encoder of 12 bits, 1.5 mrad",
+        "test_a_position_stops_for_good_early_and_after_moving",
+    )
+    further: float = _rule(
+        0.3,
+        "of the way that a joint and its target went before: by more its target goes on where its position has stopped",
+        "a third: less may be the end of one motion",
+        "test_a_position_stops_for_good_early_and_after_moving",
+    )
     leads: float = _rule(
         0.6,
         "correlation of the speeds of a joint and its target from which they are one motion at some shift in time",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.gap.plant.columns import Param, Scales
 from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.read import FRICTION, STIFFNESS
@@ -226,6 +227,8 @@ class Effect:
     named_by_torque: ClassVar[bool] = True
     # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
     approximated: ClassVar[tuple[str, ...]] = ()
+    by_warmth: ClassVar[tuple[str, ...]] = ()  # columns with which training is given the recorded temperatures
+    on_rotor: ClassVar[tuple[str, ...]] = ()  # columns with which it is given the rotor's inertia, if no model has one
 
     def variants(self, s: Scales) -> list[Variant]:
         """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
@@ -274,6 +277,18 @@ class Effect:
         """Why such a coefficient is told as a refusal where it is not possible; empty where it is not. The arguments:
         as of `possible_by_torque`."""
         return ""
+
+    def columns_beside(self, variant: Variant, joints: Sequence[str]) -> dict[str, float]:
+        """Servo columns that go with a kind of it beside its fitted ones: what that kind sets, and of one that another
+        joint has part in, the number of that joint among the mechanism's."""
+        out = {name: value for name, value in variant.fixed if name in SERVO_INDEX}
+        if "coupling_from" in out:
+            out["coupling_from"] = float(joints.index(variant.note["from_joint"]))
+        return out
+
+    def lacks(self, variant: Variant) -> tuple[str, str] | None:
+        """Of what training has no law as it was fitted, and what it is given in its place; None where it has all."""
+        return None
 
     def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
         """Servo columns in the place of those `approximated`. row: the plant's, as fitted."""

@@ -199,6 +199,7 @@ class Thermal(Effect):
 
     id = "thermal"
     words = "changes as it warms up"
+    by_warmth = ("thermal_torque", "thermal_friction", "thermal_resistance")
     shows = "with temperature"
     experiment = "the same motion cold and warm, in random order"
     classes = ("drive weakens",)

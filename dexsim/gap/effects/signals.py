@@ -55,6 +55,10 @@ class Lag(Effect):
     slows = True
     rings = True
 
+    def lacks(self, variant: Variant) -> tuple[str, str] | None:
+        second = ("lag_stages", 2.0) in variant.fixed
+        return ("second order of lag", "training has one of first order with the same mean delay") if second else None
+
     def variants(self, s: Scales) -> list[Variant]:
         out = [
             Variant(

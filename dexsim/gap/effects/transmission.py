@@ -21,6 +21,7 @@ class Backlash(Effect):
 
     id = "backlash"
     words = "has free play between motor and joint"
+    on_rotor = ("backlash",)
     shows = "when the load changes sign"
     experiment = "small steps about a pose without load, both encoders logged if there are two"
     classes = ("friction or play", "about a reversal")
@@ -71,6 +72,7 @@ class Compliance(Effect):
 
     id = "compliance"
     words = "has an elastic transmission"
+    on_rotor = ("softness",)
     shows = "at high load and at 5-30 Hz"
     experiment = "a chirp of 1-30 Hz"
     parts_motor = True

@@ -68,6 +68,8 @@ def undamped(trial: Trial, kp: float) -> float:
 
 
 APPROXIMATED = frozenset(name for e in CATALOGUE for name in e.approximated)
+ON_ROTOR = frozenset(name for e in CATALOGUE for name in e.on_rotor)
+BY_WARMTH = frozenset(name for e in CATALOGUE for name in e.by_warmth)
 
 
 def approximate_columns(case: Case, trial: Trial) -> dict[str, float]:
@@ -86,13 +88,12 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
     """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of
     the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it
     from."""
-    out, fitted = {}, {name for p in trial.fit.params for name in p.columns}
+    out: dict[str, float] = {}
+    fitted = {name for p in trial.fit.params for name in p.columns}
     for x in trial.members:
-        for name, value in x.variant.fixed:
-            if name in INDEX:
-                out[name] = float(joints.index(x.variant.note["from_joint"])) if name == "coupling_from" else value
+        out |= x.effect.columns_beside(x.variant, joints)
     out |= approximate_columns(case, trial)
-    if fitted & {"backlash", "softness"} and "rotor" not in fitted and case.constants.armature <= 0:
+    if fitted & ON_ROTOR and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out
 
@@ -144,8 +145,8 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
-    if any(("lag_stages", 2.0) in m.variant.fixed for m in trial.members):
-        left.append(f"second order of lag@{case.joint} (training has one of first order with the same mean delay)")
+    for what, instead in filter(None, (m.effect.lacks(m.variant) for m in trial.members)):
+        left.append(f"{what}@{case.joint} ({instead})")
     kp, kd = table.value(case.joint, "kp"), table.value(case.joint, "kd")
     assert kp.value is not None  # a table with an unknown one is refused
     lost = undamped(trial, kp.value)
@@ -158,7 +159,7 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
         if now.value is None:
             continue  # what is added to the unknown is unknown
         table.set(case.joint, name, *(round(x + more, 9) for x in (now.value, now.low, now.high)))
-    if any(name.startswith("thermal_") for p in trial.fit.params for name in p.columns):
+    if any(name in BY_WARMTH for p in trial.fit.params for name in p.columns):
         warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
         table.set(case.joint, "warmth", *(round(float(v), 2) for v in (np.median(warmth), warmth.min(), warmth.max())))
     return left

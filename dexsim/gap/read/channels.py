@@ -367,12 +367,12 @@ def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float 
     q = run.q[:, j]
     last = np.flatnonzero(q != q[-1])
     k = last[-1] + 1 if len(last) else 0
-    if k > 0.75 * len(q) or (len(last) and np.ptp(q[:k]) < 1e-3):
+    if k > SIGNAL.late * len(q) or (len(last) and np.ptp(q[:k]) < SIGNAL.stirred):
         return None
     if run.enabled is not None and (run.enabled[k:, j] < 0.5).any():
         return None
     moved = np.ptp(cmd[:k]) if k else 0.0
-    if np.ptp(cmd[k:]) <= max(0.3 * max(moved, np.ptp(q)), 0.0 if k else SIGNAL.still):
+    if np.ptp(cmd[k:]) <= max(SIGNAL.further * max(moved, np.ptp(q)), 0.0 if k else SIGNAL.still):
         return None
     held = [_holds(r, r.joints.index(joint), k if r is run else len(r.t)) for r in runs if joint in r.joints]
     return None if np.abs(cmd[k:] - q[-1]).max() < SIGNAL.holds * max(held) else float(run.t[k])
