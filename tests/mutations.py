@@ -336,6 +336,34 @@ MUTATIONS = (
         'if f["confidence"] < JUDGE.firm and f["effect"] != "current_sensor":',
         "tests/test_gap_verdict.py::test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half",
     ),
+    Mutation(
+        "what no fitted recording visits makes a verdict unknown",
+        "dexsim/gap/judge/conclude.py",
+        'if word == "unknown" and by.shown is not None:',
+        "if False:",
+        "tests/test_gap_verdict.py::test_what_no_fitted_recording_shows_makes_no_verdict_unknown",
+    ),
+    Mutation(
+        "a name that only harms stays on a joint that rings",
+        "dexsim/gap/judge/conclude.py",
+        "if a.case.joint in rings and a.best.members",
+        "if False and a.case.joint in rings and a.best.members",
+        "tests/test_gap_ringing.py::test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise",
+    ),
+    Mutation(
+        "friction by load may forbid a motion that was recorded",
+        "dexsim/gap/search/baseline.py",
+        "    level = level + gear_load_friction(",
+        "    level = level + 0.0 * gear_load_friction(",
+        "tests/test_gap_baseline.py::test_breakaway_and_friction_by_load_may_forbid_a_fall_too",
+    ),
+    Mutation(
+        "a joint swings ahead of its target where a lag fits nearly as well",
+        "dexsim/gap/read/channels.py",
+        " and scores[best] > causal + SIGNAL.beyond",
+        "",
+        "tests/test_gap_rules_signal.py::test_a_lead_is_told_by_a_clear_correlation",
+    ),
 )
 
 
