@@ -340,6 +340,7 @@ class TouchEffect:
     classes: ClassVar[tuple[str, ...]] = ()
     simulated: ClassVar[bool] = True  # the plant has a law of it
     by_taxel: ClassVar[bool] = False  # may be another on each taxel
+    rubber: ClassVar[tuple[str, ...]] = ()  # its figures of a rubber's law, which training has a linear contact for
     widens: ClassVar[bool] = False  # with a wider contact beside it one such follows much of the other: all are tried
     replaces: ClassVar[frozenset[str]] = frozenset()  # refitted figures that it takes the place of
     excludes: ClassVar[frozenset[str]] = frozenset()  # effects that it replaces: both at once mean nothing

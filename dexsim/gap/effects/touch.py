@@ -115,7 +115,7 @@ class TactileStiffening(TouchEffect):
     words = "has a rubber that stiffens as it is pressed in"
     shows = "at high force"
     experiment = "presses to several depths against a load cell"
-    fits = ("c10", "c01")
+    fits = rubber = ("c10", "c01")
     starts = ((4e4, 1e4), (1.2e5, 1e4), (2e4, 5e4))
     stage = "cell"
     report = (("c10", "c10"), ("c01", "c01"))

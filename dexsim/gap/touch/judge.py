@@ -141,11 +141,12 @@ class PadAnswer:
         """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are
         known; None without one."""
         t = self.best
-        if not any("c10" in TOUCH_EFFECTS[e].fits for e in t.ids):
+        rubber = [key for e in t.ids for key in TOUCH_EFFECTS[e].rubber]
+        if not rubber:
             return None
         fits = []
         for k in (None, 0, 1):
-            v = t.values if k is None else t.values | {key: self.bounds[key][k] for key in ("c10", "c01")}
+            v = t.values if k is None else t.values | {key: self.bounds[key][k] for key in rubber}
             pairs = [(contact(r, v)[0], r.depth + v["zero"]) for r in self.search.runs]
             fits.append(chord(*(np.concatenate(x) for x in zip(*pairs, strict=True))))
         found = [f for f in fits if f is not None]
