@@ -93,12 +93,21 @@ def test_what_the_torque_whispers_decides_nothing():
     assert both.data["held_out"]["error"] == "effort_rmse_Nm" and both.data["findings"][1]["hint"]
 
 
-@pytest.mark.parametrize(("low", "word"), [(0.01, "explained"), (-0.01, "unknown")])
+@pytest.mark.parametrize(("low", "word"), [(0.01, "explained"), (-0.03, "unknown")])
 def test_no_verdict_by_a_name_that_does_not_surely_lower_the_error(low, word):
     assert decided(told("backlash", 0.9, removed_low=low)).data["verdict"] == word
     assert decided(told("current_sensor", 0.9, removed_low=low), effort=EFFORT).data["verdict"] == word
-    quiet = decided(told("backlash", 0.9, removed_low=-0.01), before=1.2)
+    quiet = decided(told("backlash", 0.9, removed_low=-0.03), before=1.2)
     assert quiet.data["verdict"] == "none" and quiet.data["findings"][0]["hint"]
+
+
+@pytest.mark.parametrize(
+    ("low", "left", "word"), [(-0.01, 1.0, "explained"), (-0.03, 1.0, "unknown"), (-0.01, 1.97, "unknown")]
+)
+def test_what_acts_in_a_few_moments_surely_lowers_the_error_where_draws_without_them_show_no_loss(low, left, word):
+    """A limit that is reached for half a second takes most of the error away, and nothing in draws without it."""
+    limit = told("torque_limit", 0.9, before=2.0, after=left, removed_low=low, removed_high=2.8)
+    assert decided(limit).data["verdict"] == word
 
 
 def test_what_was_not_judged_is_kept_whatever_the_verdict_goes_by():

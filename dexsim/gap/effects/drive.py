@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.actuator.columns import DRY_FRICTION
 from dexsim.actuator.reference import torque_along
 from dexsim.gap.effects import Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
@@ -179,19 +180,7 @@ class SupplySag(Effect):
         return {k: fit.entry(k, f"1/({fit.force})") for k in keys}
 
 
-WARMED = (  # servo columns that `thermal_friction` scales
-    "coulomb_friction",
-    "viscous_friction",
-    "thinning_friction",
-    "stribeck_peak",
-    "load_friction",
-    "load_friction_backdriven",
-    "load_friction_external",
-    "load_stribeck",
-    "load_stribeck_external",
-    "load_quadratic",
-    "load_quadratic_external",
-)
+WARMED = (*DRY_FRICTION, "viscous_friction", "thinning_friction")  # columns that `thermal_friction` scales
 
 
 class Thermal(Effect):

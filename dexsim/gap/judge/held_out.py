@@ -320,9 +320,13 @@ def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def lowers(f: dict[str, Any]) -> bool:
-    """Whether a finding lowers the error on what was held out, by more than the interval of what it removes."""
+    """Whether a finding lowers the error on what was held out, by more than the interval of what it removes. What acts
+    in a few moments alone, as a limit does, removes nothing in draws without them: an interval that begins at nothing
+    (`SEARCH.tie`) is no loss then, and the part that it removes of the whole decides (`JUDGE.part`)."""
     h = f["held_out"]
-    return bool(h["removed_low"] > 0 if "removed_low" in h else h["after"] < h["before"])
+    if "removed_low" not in h or h["removed_low"] > 0:
+        return bool(h["after"] < h["before"] or "removed_low" in h)
+    return bool(h["removed_low"] >= -SEARCH.tie and h["after"] ** 2 <= (1 - JUDGE.part) * h["before"] ** 2)
 
 
 def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import intervals
+from dexsim.actuator.columns import DRY_FRICTION
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.reference import dry_friction, gear_load_friction
 from dexsim.actuator.table import ServoTable
@@ -304,19 +305,8 @@ def text(data: dict[str, Any], unit: str) -> str:
     return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
 
 
-HOLDING = (  # columns of dry friction that may hold a joint at rest
-    "coulomb_friction",
-    "stribeck_peak",
-    "load_friction",
-    "load_friction_backdriven",
-    "load_friction_external",
-    "load_stribeck",
-    "load_stribeck_external",
-    "load_quadratic",
-    "load_quadratic_external",
-    "gear_load_friction",
-    "gear_load_friction_backdriven",
-)
+# columns of dry friction that may hold a joint at rest
+HOLDING = (*DRY_FRICTION, "gear_load_friction", "gear_load_friction_backdriven")
 DRY = (*HOLDING, "friction_asymmetry", "stribeck_speed", "stribeck_exponent", "gear_load_power", "gear_load_unit")
 
 
