@@ -45,7 +45,7 @@ REPLAY = ("mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
-MOST = 8.0  # s of what was held out that is replayed: a step of the engine is a turn of Python
+MOST = 8.0  # s of what was held out that is replayed at most: a step of the engine is a turn of Python
 PILOT, LEAST = 0.1, 1.0  # s that are replayed to see how long it takes, and at least
 
 
@@ -465,10 +465,11 @@ def confirm(
     worlds = [[w for i, w in enumerate(worlds_of(m, runs, cases, h, windows[0])) if i in use] for h in hypotheses]
     plain = [i for i, (_, changed) in enumerate(parts) if not changed]
     groups = ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]
-    most = math.inf
+    most = MOST
+    worlds = [_until(x, most) for x in worlds]
     if room < math.inf:
         run = lambda s: free_runs(parts[0][0], m.joints, _until(worlds[0], s), device, timestep, replay)  # noqa: E731
-        most = _affordable(run, room, len(groups), len(parts) + timestep / TASKS)
+        most = min(most, _affordable(run, room, len(groups), len(parts) + timestep / TASKS))
         worlds = [_until(x, most) for x in worlds]
     found: dict[int, list[np.ndarray]] = {}
     for group in groups:
