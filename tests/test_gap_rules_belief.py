@@ -11,7 +11,7 @@ import numpy as np
 from dexsim.gap.effects import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
-from dexsim.gap.plant.case import quiet_noise, usual_noise
+from dexsim.gap.plant.case import misfit, quiet_noise, usual_noise
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.search import hypotheses
 from dexsim.gap.search.fit import disbelief
@@ -54,13 +54,18 @@ def test_sensors_have_zeros():
     assert by["zero"].low == -by["zero"].high and by["effort_zero"].low == -by["effort_zero"].high
 
 
+def _told(t: np.ndarray, q: np.ndarray) -> float | None:
+    """What `quiet_noise` says of one recording q [S] rad of an encoder without counts."""
+    return quiet_noise([(t, q, misfit(t, q[:, None])[:, 0])], 0.0)
+
+
 def restless(loud: float, share: float, speed: float = 0.0) -> float | None:
     """What `quiet_noise` says of 100 half seconds of a joint that swings slowly, with noise of 1 mrad: in a share of
     them, here and there, `loud` times as much, and while moving faster by `speed` rad/s."""
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = (np.arange(5000) // 50 * 37) % 100 < 100 * share
     way = 0.3 * np.sin(0.4 * t) + np.cumsum(0.01 * speed * on)
-    return quiet_noise([(t, way + noise * np.where(on, loud, 1.0))], 0.0)
+    return _told(t, way + noise * np.where(on, loud, 1.0))
 
 
 def test_a_joint_that_rings_is_not_noisy():
@@ -74,7 +79,7 @@ def with_quiet_parts(count: int) -> float | None:
     """What `quiet_noise` says of 100 half seconds with noise of 1 mrad, of which a few, the fastest, have a tenth."""
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = np.arange(5000) // 50 >= 100 - count
-    return quiet_noise([(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))], 0.0)
+    return _told(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))
 
 
 def test_a_few_quiet_moments_are_no_accident_only_from_three_on():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import mujoco
@@ -67,9 +68,10 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
     return sorted(out, key=lambda w: (w["recording"], w["start"]))
 
 
-def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
+def noise(t: np.ndarray, x: np.ndarray, miss: np.ndarray | None = None) -> tuple[float, float]:
     """(standard deviation of the measurement noise, quantum) of one signal, from each sample's misfit to a local
-    parabola through its neighbours without it. The quantum is 0 where the values are not on a grid."""
+    parabola through its neighbours without it (miss: `misfit`, where it is known). The quantum is 0 where the values
+    are not on a grid."""
     steps = np.unique(np.round(np.abs(np.diff(x)), 9))
     steps = steps[steps > 1e-7]
     quantum = 0.0
@@ -86,7 +88,7 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
         quantum = float(np.quantile(changes[changes > 1e-7], 0.1))
     if len(x) < 2 * BESIDE + 3:
         return max(quantum / np.sqrt(12), 1e-9), quantum
-    miss = _misfit(t, x)
+    miss = misfit(t, x[:, None])[:, 0] if miss is None else miss
     # a robust mean: what the parabola cannot follow is not noise
     cut = 4 * np.median(np.abs(miss)) + 1e-12
     rms = float(np.sqrt(np.mean(np.minimum(miss**2, cut**2))))
@@ -96,46 +98,57 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
 def noise_of(run: Run, j: int) -> tuple[float, float]:
     """`noise` of joint j's position in a run. Every joint's case asks for that of all others, each time anew that cases
     are built: it is kept with the run, for as long as the run has these positions."""
+    return _noises(run)[1][j]
+
+
+def _noises(run: Run) -> tuple[np.ndarray, list[tuple[float, float]], np.ndarray]:
+    """(positions [S, J], by joint the `noise` of them, what they miss local cubics by (`misfit`))."""
     if run.noises is None or run.noises[0] is not run.q:
-        run.noises = run.q, {}
-    kept = run.noises[1]
-    if j not in kept:
-        kept[j] = noise(run.t, run.q[:, j])
-    return kept[j]
+        miss = misfit(run.t, run.q)
+        run.noises = run.q, [noise(run.t, q, m) for q, m in zip(run.q.T, miss.T, strict=True)], miss
+    return run.noises
 
 
-def _misfit(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """[S - 2 BESIDE] by what each sample x [S] at t [S] s misses a local cubic through its neighbours without it, of
-    the noise's own size."""
+def misfit(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """[S - 2 BESIDE, J] by what each sample of signals x [S, J] at t [S] s misses a local cubic through its neighbours
+    without it, of the noise's own size; nothing where there are too few."""
     k = BESIDE
+    if len(x) < 2 * k + 3:
+        return np.empty((0, x.shape[1]))
     index = np.arange(k, len(x) - k)[:, None] + np.r_[-k:0, 1 : k + 1]
     dt = t[index] - t[k:-k, None]
     scale = max(float(np.median(np.diff(t))) * k, 1e-9)
     basis = np.stack([np.ones_like(dt), dt / scale, (dt / scale) ** 2, (dt / scale) ** 3], -1)
     normal = np.einsum("smd,sme->sde", basis, basis) + 1e-9 * np.eye(4)
-    c = np.linalg.solve(normal, np.einsum("smd,sm->sd", basis, x[index])[..., None])[..., 0]
-    lever = np.linalg.inv(normal)[:, 0, 0]
-    return (x[k:-k] - c[:, 0]) / np.sqrt(1 + lever)
+    size = np.sqrt(1 + np.linalg.inv(normal)[:, 0, 0])
+    out = np.empty((len(index), x.shape[1]))
+    for j, signal in enumerate(x.T):
+        c = np.linalg.solve(normal, np.einsum("smd,sm->sd", basis, signal[index])[..., None])
+        out[:, j] = (signal[k:-k] - c[:, 0, 0]) / size
+    return out
 
 
-def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray]], quantum: float) -> float | None:
+def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], quantum: float) -> float | None:
     """Standard deviation of the measurement noise of a joint that rings by itself, from half seconds in which it does
-    not; None where it does not ring. signals: times [S] s and positions [S], of recordings.
+    not; None where it does not ring. signals: times [S] s, positions [S] and what these miss local cubics by (`misfit`)
+    [S - 2 BESIDE], of recordings.
 
     A joint that rings faster than its readings misses any smooth curve as noise does, and sample by sample the two
     cannot be told apart. But a sensor is not noisier at one time than at another but by how fast it moves (readings'
     times vary): a joint rings where it is louder by far (`BELIEF.rings`) than where it moves as fast or faster, and
     does so often (`BELIEF.ringing`)."""
     levels, speeds = [], []
-    for t, x in signals:
-        if len(x) < 2 * BESIDE + 3:
+    for t, x, miss in signals:
+        if not len(miss):
             continue
-        miss, mid, q = np.abs(_misfit(t, x)), t[BESIDE:-BESIDE], x[BESIDE:-BESIDE]
+        mid, q = t[BESIDE:-BESIDE], x[BESIDE:-BESIDE]
         part = ((mid - mid[0]) / HALF_SECOND).astype(int)
-        for on in (part == k for k in range(part[-1] + 1)):
-            if on.sum() >= FEWEST_SAMPLES:
-                levels.append(max(float(np.median(miss[on])) / 0.6745, quantum / np.sqrt(12), 1e-9))
-                speeds.append(abs(float(np.polyfit(mid[on] - mid[on].mean(), q[on], 1)[0])))
+        ends = np.r_[0, np.flatnonzero(np.diff(part)) + 1, len(part)]  # times grow
+        for a, b in zip(ends[:-1], ends[1:], strict=True):
+            if b - a >= FEWEST_SAMPLES:
+                levels.append(max(float(np.median(np.abs(miss[a:b]))) / 0.6745, quantum / np.sqrt(12), 1e-9))
+                since = mid[a:b] - mid[a:b].mean()
+                speeds.append(abs(float(since @ q[a:b]) / float(since @ since)))  # the slope of a straight line
     level = np.array(levels)[np.argsort(speeds)]
     # of the parts as fast or faster a few are needed to say what is usual there
     few = BELIEF.quiet_parts
@@ -243,6 +256,7 @@ def build(
     m = moved(model, runs, lambda j, plant: plant, device, dt, only)
     torques = []
     for run, row in zip(runs, m.rows, strict=True):
+        _noises(run)  # once, before every joint asks for it
         cmd = run.command_at(run.t)
         each = zip(row, cmd.T, run.q.T, run.vs.T, strict=True)
         torques.append(np.stack([demand(p, voltage, c, q, v) for p, c, q, v in each], 1))
@@ -266,9 +280,11 @@ def moved(
     dt: float = 1e-3,
     only: set[str] | None = None,
     added: bool = True,
+    rooms: SimpleQueue[np.ndarray] | None = None,
 ) -> Motion:
     """The joints (of `only`) along all runs. use(j, plant): what is made of each one's plant, which is not kept here;
-    added: also what a mass that is added, or a tilt, would do to them."""
+    added: also what a mass that is added, or a tilt, would do to them. rooms: memory for the series of plants that
+    nobody keeps, taken from there and given back after `use`: fresh memory costs as much as what is written to it."""
     joints = runs[0].joints
     J = len(joints)
     servo = runs[0].servo
@@ -311,11 +327,22 @@ def moved(
                 exact,
             )
         out.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
-        out.finish()
-        return use(j, out)
+        out.finish(_taken(rooms))
+        made = use(j, out)
+        if rooms is not None:
+            rooms.put(out.series)
+        return made
 
     used = dict(zip(wanted, compute.each(len(wanted), one), strict=True))
     return Motion(mech, constants, rows, others, used)
+
+
+def _taken(rooms: SimpleQueue[np.ndarray] | None) -> np.ndarray | None:
+    """One of `rooms`; None where there is none."""
+    try:
+        return None if rooms is None else rooms.get_nowait()
+    except Empty:
+        return None
 
 
 def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
@@ -389,7 +416,7 @@ def _case(
     estimates = [noise_of(run, j) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
-    quiet = quiet_noise([(runs[i].t, runs[i].q[:, j]) for i in told], quantum)
+    quiet = quiet_noise([(runs[i].t, runs[i].q[:, j], _noises(runs[i])[2][:, j]) for i in told], quantum)
     sigma = min(sigma, quiet) if quiet is not None else sigma
     usual = usual_noise([runs[i] for i in told], j, sigma, rows[0][:, SERVO_INDEX["torque_limit"]])
     sigma = min(sigma, usual) if usual is not None else sigma
@@ -402,7 +429,8 @@ def _case(
     spring = max(float(np.median([r[j][SERVO_INDEX["kp"]] for r in rows])) * (limit if voltage else 1.0), 1e-9)
     load = gravity + series("rest") + inertia * a
     tau_scale = max(
-        min(_big(tau), 3 * _big(load) + 1e-12) if _big(tau) > 0 else _big(load), 1e-3 * spring * max(np.ptp(q), 1e-6),
+        min(_big(tau), 3 * _big(load) + 1e-12) if _big(tau) > 0 else _big(load),
+        1e-3 * spring * max(np.ptp(q), 1e-6),
         1e-9,
     )
     effort_noise = _effort_noise(plant, runs, j)
@@ -678,8 +706,11 @@ def refined_cases(
     """A case a joint (of `only`), built along refined motions (`Run.fine`) where there are several joints."""
     if len(runs[0].joints) < 2:
         return build(model, runs, device, dt)
+    rooms: SimpleQueue[np.ndarray] = SimpleQueue()
     for _ in range(PASSES):
-        by_joint = moved(model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False).used
+        by_joint = moved(
+            model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False, rooms=rooms
+        ).used
         _refine(runs, [by_joint[j] for j in range(len(by_joint))])
     return build(model, runs, device, dt, only)
 
@@ -688,7 +719,7 @@ def _motions(
     runs: Sequence[Run], j: int, plant: JointPlant, at: np.ndarray | None = None
 ) -> list[tuple[np.ndarray, ...]]:
     """By run what `_one` makes of joint j."""
-    return [_one(plant, i, run.t, run.q[:, j], at) for i, run in enumerate(runs)]
+    return [_one(plant, i, run, run.q[:, j], at) for i, run in enumerate(runs)]
 
 
 def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]) -> None:
@@ -748,12 +779,12 @@ def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndar
 
 
 def _one(
-    plant: JointPlant, run: int, t: np.ndarray, q: np.ndarray, at: np.ndarray | None = None
+    plant: JointPlant, number: int, run: Run, q: np.ndarray, at: np.ndarray | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Times [n] s, and position, speed and acceleration [n] of one joint in one run; at [1, R, C]: plant parameters
-    (None: believed)."""
-    every = max(int(round(EVERY / plant.dt)), 1)
-    times, windows = fine_windows(plant, run, every)
+    """Times [n] s, and position, speed and acceleration [n] of one joint, measured at q [S], in the run of this number;
+    at [1, R, C]: plant parameters (None: believed)."""
+    every, t = max(int(round(EVERY / plant.dt)), 1), run.t
+    times, windows = fine_windows(plant, number, every)
     x = plant.simulate(plant.base()[None] if at is None else at, windows)[0][0]
     step = every * plant.dt
     if not np.isfinite(x).all() or np.abs(x - np.interp(times, t, q)).max() > 1.0:  # the belief does not follow at all
@@ -761,7 +792,7 @@ def _one(
     v = np.gradient(x, step)
     v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     a = np.gradient(v, step)
-    miss, dv, da = (c[:, 0] for c in local_polynomial(t, (q - np.interp(t, times, x))[:, None], WIDTH))
+    miss, dv, da = (c[:, 0] for c in run.local(WIDTH)((q - np.interp(t, times, x))[:, None]))
     fine = lambda y: np.interp(times, t, y)  # noqa: E731
     return times, x + fine(miss), v + fine(dv), a + fine(da)
 
