@@ -21,7 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy import signal
+from scipy import fft
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.read import WRONG_SIGNAL, Run
@@ -200,8 +200,12 @@ class _Wrong:
     confidence: float | None = None
 
 
-def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel, targets: Targets) -> _Wrong | None:
-    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is."""
+def _wrong(
+    runs: list[Run], run: Run, j: int, model: mujoco.MjModel, targets: Targets | None = None
+) -> _Wrong | None:
+    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is. targets:
+    the run's, where they are found already."""
+    targets = targets or Targets(run)
     joint, q, cmd = run.joints[j], run.q[:, j], targets.before()[:, j]
     limits = _range(model, joint)
     if limits is not None and _degrees(q, cmd, limits):
@@ -232,7 +236,7 @@ def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel, targets: Ta
             f"{joint} follows the negative of its target: another direction of its position or its commands",
             [STATES, COMMANDS],
         )
-    lead = _lead(targets, j)
+    lead = _lead(run, j, targets)
     if lead > SIGNAL.early:
         return _Wrong(
             "clock_skew",
@@ -362,25 +366,36 @@ def _sign(targets: Targets, q: np.ndarray, j: int) -> float:
     for delay in (0.0, 0.03, 0.08, 0.15):
         c = targets.before(delay)[:, j]
         if c.std() > 0:
-            r = float(np.corrcoef(c, q)[0, 1])
+            r = correlation(c, q)
             best = r if abs(r) > abs(best) else best
     return best
 
 
-def _lead(targets: Targets, j: int) -> float:
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """That of two series [n], neither of them constant: the steps of `np.corrcoef`, without its checks of shapes."""
+    x = np.array([a, b])
+    x -= x.mean(1)[:, None]
+    products = np.dot(x, x.T) * np.true_divide(1, len(a) - 1)
+    size = np.sqrt(np.diag(products))
+    return float(np.clip(products[0, 1] / size[0] / size[1], -1, 1))
+
+
+def _lead(run: Run, j: int, targets: Targets | None = None) -> float:
     """Time [s] by which the joint moves before its target: 0 where it does not.
 
     Correlation of the speed with the target's, shifted by -0.6 to 0.4 s, over the longest stretch without a pause."""
-    grid, command, part = targets.even()
+    grid, command, part = (targets or Targets(run)).even()
     if len(grid) < 200:
         return 0.0
     step, after = STEP, AFTER
-    dq = np.gradient(np.interp(grid, targets.run.t[part], targets.run.q[part, j]))
+    dq = np.gradient(np.interp(grid, run.t[part], run.q[part, j]))
     dc = np.convolve(np.gradient(command[:, j]), np.ones(9) / 9, "same")
     power = np.concatenate([[0.0], np.cumsum(dc**2)])
     norm = np.sqrt(np.maximum(power[len(grid) :] - power[: -len(grid)], 0.0)) * np.linalg.norm(dq) + 1e-12
     # by the sample at which the target's stretch begins: shift = 80 - sample
-    scores = signal.correlate(dc, dq, "valid", "fft") / norm
+    size = fft.next_fast_len(len(dc) + len(dq) - 1, real=True)
+    product = fft.irfft(fft.rfft(dc, size) * fft.rfft(dq[::-1], size), size)
+    scores = product[len(dq) - 1 : len(dc)] / norm  # those at which all of dq lies within dc
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
     ahead = best > after and scores[best] > SIGNAL.leads and scores[best] > causal + SIGNAL.beyond
@@ -420,13 +435,14 @@ def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     step = np.abs(np.diff(q))
     out = np.zeros(len(q), bool)
     edge = np.flatnonzero(np.diff(np.concatenate([[False, False], step == 0, [False]]).astype(np.int8)))
-    stood = [(a, b) for a, b in zip(edge[::2].tolist(), edge[1::2].tolist(), strict=True)
-             if b < len(q) and t[b - 1] - t[a - 1] >= SIGNAL.held]  # fmt: skip
+    first, end = edge[::2], edge[1::2]
+    long = (end < len(q)) & (t[end - 1] - t[first - 1] >= SIGNAL.held)
     moving = step[step > 0]
-    if not stood or len(moving) < 20:
+    if not long.any() or len(moving) < 20:
         return out
     usual = float(np.percentile(moving, 90))
-    jumps = [(a, b) for a, b in stood if abs(q[b] - q[b - 1]) > SIGNAL.jump * usual]
+    stood = zip(first[long].tolist(), end[long].tolist(), strict=True)
+    jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual]
     # a joint at rest may start with a jump: at least two must have been moving when they froze
     if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > SIGNAL.moving * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
