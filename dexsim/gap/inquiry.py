@@ -339,10 +339,11 @@ def to_runs(w: Inquiry) -> None:
             f"in the model but in no recording: {', '.join(absent)}; nothing can be said of "
             f"{'it' if len(absent) == 1 else 'them'}, taken to stand at rest"
         )
-    wrong, out, blind = channels.inspect(w.runs, w.m.spec.compile(), channels.spoiled(readable))
+    model = w.m.spec.compile()
+    wrong, out, blind = channels.inspect(w.runs, model, channels.spoiled(readable))
     w.channel = channels.secondary(w.channel + wrong)
     before = {id(r): k for k, r in enumerate(w.runs)}
-    w.runs = channels.drop(w.runs, out, w.notes, w.m.spec.compile(), w.held)
+    w.runs = channels.drop(w.runs, out, w.notes, model, w.held)
     w.held = [k for k, r in enumerate(w.runs) if before[id(r)] in w.held]
     if blind:
         w.runs, w.held = inputs.free_air(

@@ -235,13 +235,15 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
         if command is None or position is None:
             continue
         half = len(grid) // 2
-        found = [
-            _lead(command[part], position[part], int(reach / step))
-            for part in (slice(None), slice(0, half), slice(half, None))
-        ]
-        parts = [p for p in found if p is not None]
-        if len(parts) == len(found) and max(parts) - min(parts) <= 3:
-            leads.append(parts[0] * step)
+        found: list[int] = []
+        for part in (slice(None), slice(0, half), slice(half, None)):
+            one = _lead(command[part], position[part], int(reach / step))
+            if one is None:
+                break
+            found.append(one)
+        else:
+            if max(found) - min(found) <= 3:
+                leads.append(found[0] * step)
     return float(np.median(leads)) if leads else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -158,6 +159,8 @@ def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
     if len(v) < 10 or np.ptp(v) == 0:
         return None
     steps = np.abs(np.diff(v))
+    if steps.max() < 0.5 * np.ptp(v):  # shorter than 0.6 of any modulus that the values lie within
+        return None
     step = quantum(v)
     for m in dict.fromkeys((*(bits * step for bits in (256, 4096, 65536) if step), *MODULI)):
         angle = m in (2 * np.pi, 360.0)
@@ -207,7 +210,7 @@ def held(r: Recording) -> Iterator[Finding]:
     alone: dict[int, np.ndarray] = {}
     for j in range(len(r.joints)):
         late = repeats(s.t, s.value[:, j])
-        if effort is not None and np.isfinite(effort[:, j]).any() and np.nanstd(effort[:, j]) > 0:
+        if late.any() and effort is not None and np.isfinite(effort[:, j]).any() and np.nanstd(effort[:, j]) > 0:
             late &= np.append(False, np.diff(effort[:, j]) == 0)  # a current that moves on means a joint that sticks
         stale |= late & same_row
         alone[j] = late & ~same_row
@@ -256,27 +259,31 @@ def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """[T] bool: samples equal to the one before within a steady motion, followed by a jump that makes up for them."""
     out = np.zeros(len(x), bool)
     dx = np.diff(x)
-    step = max(quantum(x), 1e-9)
-    starts = np.flatnonzero((dx == 0) & (np.append(1.0, dx[:-1]) != 0))  # x[a] == x[a + 1], and x[a - 1] differs
-    for a in starts:
-        b = a + 1
-        while b < len(dx) and dx[b] == 0:
-            b += 1
-        if a < 2 or b + 3 >= len(x) or not np.isfinite(x[a - 2 : b + 4]).all():
-            continue
-        before = (x[a] - x[a - 2]) / max(t[a] - t[a - 2], 1e-9)
-        after = (x[b + 3] - x[b + 1]) / max(t[b + 3] - t[b + 1], 1e-9)
-        # what shakes faster than it is read turns back between two readings, and stands now and then by chance
-        if np.any(np.array([dx[a - 2], dx[a - 1], dx[b + 1], dx[b + 2]]) * dx[b] < 0):
-            continue
-        slow = min(abs(before), abs(after))
-        # of neighbours equally fast: the missed way shows as a jump of its size, in one sample
-        if before * after <= 0 or max(abs(before), abs(after)) > 2 * slow or slow * (t[b] - t[a]) < 3 * step:
-            continue
-        jump = (x[b + 1] - x[b]) * np.sign(before)
-        way = 0.5 * (abs(before) + abs(after)) * (t[b + 1] - t[a])
-        if 0.7 * way < jump < 1.4 * way:
-            out[a + 1 : b + 1] = True
+    edge = np.flatnonzero(np.diff(np.concatenate([[False], dx == 0, [False]]).astype(np.int8)))
+    a, b = edge[::2], edge[1::2]  # x[a] == ... == x[b], which are finite then; x[a - 1] and x[b + 1] differ
+
+    def those(on: Any) -> None:
+        nonlocal a, b
+        a, b = a[on], b[on]
+
+    those((a >= 2) & (b + 3 < len(x)))
+    those(np.isfinite(x[a - 2]) & np.isfinite(x[a - 1]) & np.isfinite(x[b[:, None] + (1, 2, 3)]).all(1))
+    # what shakes faster than it is read turns back between two readings, and stands now and then by chance
+    those(~(np.stack([dx[a - 2], dx[a - 1], dx[b + 1], dx[b + 2]]) * dx[b] < 0).any(0))
+    if not len(a):
+        return out
+    before = (x[a] - x[a - 2]) / np.maximum(t[a] - t[a - 2], 1e-9)
+    after = (x[b + 3] - x[b + 1]) / np.maximum(t[b + 3] - t[b + 1], 1e-9)
+    fast, slow = np.maximum(np.abs(before), np.abs(after)), np.minimum(np.abs(before), np.abs(after))
+    # of neighbours equally fast: the missed way shows as a jump of its size, in one sample
+    jump = (x[b + 1] - x[b]) * np.sign(before)
+    way = 0.5 * (np.abs(before) + np.abs(after)) * (t[b + 1] - t[a])
+    found = ~(before * after <= 0) & ~(fast > 2 * slow) & (0.7 * way < jump) & (jump < 1.4 * way)
+    if found.any():
+        step = max(quantum(x), 1e-9)
+        found &= ~(slow * (t[b] - t[a]) < 3 * step)
+    for first, last in zip(a[found], b[found], strict=True):
+        out[first + 1 : last + 1] = True
     return out
 
 
@@ -326,10 +333,13 @@ def saturation(r: Recording) -> Iterator[Finding]:
         if name not in ("effort", "duty"):
             continue
         x = np.where(np.isfinite(x), x, 0.0)
-        step = quantum(x)
+        step: float | None = None
         for limit, side in ((x.max(), "highest"), (x.min(), "lowest")):
             at = np.flatnonzero(x == limit)
-            if abs(limit) <= 10 * step or len(at) < 10 or np.ptp(x) == 0:
+            if len(at) < 10 or np.ptp(x) == 0:
+                continue
+            step = quantum(x) if step is None else step
+            if abs(limit) <= 10 * step:
                 continue
             runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
             long = [run for run in runs if len(run) >= 3]

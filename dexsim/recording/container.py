@@ -31,7 +31,8 @@ MAX_UNPACKED = 4 << 30
 MAX_PACKED = 200
 MAX_MESSAGES = 5_000_000
 MAGIC = b"\x89MCAP0\r\n"
-_HEAD = 9  # opcode and length
+_HEAD = struct.Struct("<BQ")  # opcode and length of a record
+_MESSAGE = struct.Struct("<HIQQ")  # how a message's record begins: channel, sequence, log and publish time
 _BROKEN = (
     McapError,
     CRCValidationError,
@@ -105,11 +106,11 @@ def open_container(path: Path) -> Container:
 def _records(data: mmap.mmap | bytes, out: Container) -> Iterator[tuple[int, int, int]]:
     """(opcode, offset of the body, length) of each record; the last may reach beyond the end of a truncated file."""
     at, size = len(MAGIC), len(data)
-    while at + _HEAD <= size:
+    while at + _HEAD.size <= size:
         if data[at : at + len(MAGIC)] == MAGIC and size - at == len(MAGIC):
             return
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        beyond = at + _HEAD + length > size
+        opcode, length = _HEAD.unpack_from(data, at)
+        beyond = at + _HEAD.size + length > size
         if not _plausible(opcode) or (beyond and not _cut_chunk(data, at)):
             found = _resync(data, at + 1)
             lost = (found or size) - at
@@ -119,8 +120,8 @@ def _records(data: mmap.mmap | bytes, out: Container) -> Iterator[tuple[int, int
                 return
             at = found
             continue
-        yield opcode, at + _HEAD, length
-        at += _HEAD + length
+        yield opcode, at + _HEAD.size, length
+        at += _HEAD.size + length
 
 
 def _plausible(opcode: int) -> bool:
@@ -137,10 +138,10 @@ def _resync(data: mmap.mmap | bytes, start: int) -> int | None:
     size = len(data)
     raw = np.frombuffer(data, dtype=np.uint8)
     for at in (np.flatnonzero(raw[start:] == int(Opcode.CHUNK)) + start).tolist():
-        if at + _HEAD + 32 > size:
+        if at + _HEAD.size + 32 > size:
             return None
         length, first, last, _, _, name = struct.unpack_from("<QQQQII", data, at + 1)
-        after = at + _HEAD + length
+        after = at + _HEAD.size + length
         if length < 40 or after > size or first > last or name > 4:
             continue
         if data[at + 41 : at + 41 + name] in (b"", b"zstd", b"lz4") and (after == size or _plausible(data[after])):
@@ -167,6 +168,11 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
             out.attachments[record.name] = record.data
     except _BROKEN as error:
         out.damage.append((None, 1, f"a record (opcode {opcode}) cannot be read: {error or type(error).__name__}"))
+    _limit(out)
+
+
+def _limit(out: Container) -> None:
+    """Raises TooMuch where there are more messages than are read."""
     if out.unpacked > out.most or len(out.messages) > MAX_MESSAGES:
         raise TooMuch(
             f"recording {out.path}: its messages come to more than {out.most / 2**20:.0f} MiB or {MAX_MESSAGES} of "
@@ -219,13 +225,20 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
                 raise ValueError(f"its compression '{chunk.compression[:20]}' is not read; zstd, lz4 and none are")
             if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
                 raise ValueError("its checksum does not fit")
-        at = 0
-        while at + _HEAD <= len(data):
-            opcode, length = struct.unpack_from("<BQ", data, at)
-            if at + _HEAD + length > len(data):
+        at, message = 0, int(Opcode.MESSAGE)
+        while at + _HEAD.size <= len(data):
+            opcode, length = _HEAD.unpack_from(data, at)
+            if at + _HEAD.size + length > len(data):
                 break
-            _plain(opcode, data[at + _HEAD : at + _HEAD + length], length, out)
-            at += _HEAD + length
+            if opcode == message and length >= _MESSAGE.size:  # nearly all records are messages
+                channel, sequence, logged, published = _MESSAGE.unpack_from(data, at + _HEAD.size)
+                content = data[at + _HEAD.size + _MESSAGE.size : at + _HEAD.size + length]
+                out.messages.append(Message(channel, logged, content, published, sequence))
+                out.unpacked += length
+                _limit(out)
+            else:
+                _plain(opcode, data[at + _HEAD.size : at + _HEAD.size + length], length, out)
+            at += _HEAD.size + length
     except TooMuch:
         raise
     except _BROKEN as error:

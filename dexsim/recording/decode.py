@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
 
-from dexsim.recording import ros2
+from dexsim.recording import ros2, stacked
+from dexsim.recording.samples import Array, JointSample, Reader, Vector
 from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
 
 
 class Unreadable(Exception):
     """No way to read this channel; the text says why and what to do."""
-
-
-class JointSample:
-    """names (or []), position, velocity, effort (each an array, empty where not given), stamp [ns] or None."""
-
-    __slots__ = ("names", "position", "velocity", "effort", "stamp")
-
-    def __init__(
-        self, names: Sequence[str], position: Any, velocity: Any, effort: Any, stamp: int | None
-    ):
-        self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
 
 
 def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
@@ -53,7 +43,7 @@ def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
     return schema.encoding != "ros2msg" or not text.strip() or lines(text) == lines(DEFINITIONS[kind])
 
 
-def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], JointSample]:
+def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[JointSample]:
     """Reads joint states. part: dotted path of the sub-message that holds them ("" the message itself)."""
     decode = decoder(channel, schema)
     if not part and _usual(channel, schema, JOINT_STATE):
@@ -65,7 +55,7 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable
                 m.name, m.position, m.velocity, m.effort, stamp.sec * 1_000_000_000 + stamp.nanosec or None
             )
 
-        return standard
+        return Reader(standard, stacked.joint_rows)
 
     def read(data: bytes) -> JointSample:
         whole = decode(data)
@@ -93,23 +83,21 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable
             stamp,
         )
 
-    return read
+    return Reader(read)
 
 
-def array_reader(
-    channel: Channel, schema: Schema | None, part: str
-) -> Callable[[bytes], tuple[tuple[int, ...], np.ndarray]]:
+def array_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[Array]:
     """Reads arrays: (dimensions or (), flat values)."""
     decode = decoder(channel, schema)
     if not part and _usual(channel, schema, MULTI_ARRAY):
 
-        def standard(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
+        def standard(data: bytes) -> Array:
             m = decode(data)
             return tuple([d.size for d in m.layout.dim]), m.data.astype(float)
 
-        return standard
+        return Reader(standard, stacked.array_rows)
 
-    def read(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
+    def read(data: bytes) -> Array:
         m = walk(decode(data), part)
         if isinstance(m, (int, float, list, tuple, bytes, np.ndarray)):
             array = floats(m)
@@ -122,17 +110,15 @@ def array_reader(
         array = floats(values)
         return dims or (array.shape if array.ndim > 1 else ()), array.ravel()
 
-    return read
+    return Reader(read)
 
 
-def vector_reader(
-    channel: Channel, schema: Schema | None, part: str, kind: str
-) -> Callable[[bytes], tuple[np.ndarray, int | None, str]]:
+def vector_reader(channel: Channel, schema: Schema | None, part: str, kind: str) -> Reader[Vector]:
     """Reads a wrench [6], a pose [7] or an IMU [10] (see `schema.Recording`): (values, stamp, frame)."""
     decode = decoder(channel, schema)
     pick = {"wrench": _wrench, "pose": _pose, "imu": _imu}[kind]
 
-    def read(data: bytes) -> tuple[np.ndarray, int | None, str]:
+    def read(data: bytes) -> Vector:
         whole = decode(data)
         header = get(whole, "header")
         return (
@@ -141,7 +127,8 @@ def vector_reader(
             str((get(header, "frame_id") if header is not None else "") or ""),
         )
 
-    return read
+    usual = not part and _usual(channel, schema, stacked.VECTORS[kind].type)
+    return Reader(read, stacked.VECTORS[kind].rows if usual else None)
 
 
 def get(m: Any, name: str) -> Any:

@@ -15,10 +15,13 @@ from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
 from dexsim.recording.container import Container, open_container
+from dexsim.recording.samples import JointRows, JointSample, Reader
 from dexsim.recording.schema import Finding, Recording, Series, States
 
 NAN = float("nan")
 MAX_JOINTS = 1000
+MAX_START = 1 << 62
+"""ns: a start up to which a stamp less it fits 64 bits."""
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
@@ -114,8 +117,7 @@ class _Reading:
         )
         self.sources = self._topics({_slash(k): v for k, v in remap.items() if _is_topic(k)})
         self.joint_remap = {k: v for k, v in remap.items() if not _is_topic(k)}
-        used = [m.log_time for theirs, _ in self.sources.values() for s in self.streams[theirs] for m in s.messages]
-        if not used:
+        if not any(s.messages for theirs, _ in self.sources.values() for s in self.streams[theirs]):
             raise UserError(
                 f"recording {path}: no message that can be read; topics: {self._describe_topics()}" + self._losses()
             )
@@ -219,14 +221,16 @@ class _Reading:
         return ", ".join(rows) or "none"
 
     def _decode(
-        self, ours: str, make: Callable[[Channel, McapSchema | None, str], Callable[[bytes], Any]]
-    ) -> tuple[np.ndarray, list[Any]]:
+        self, ours: str, make: Callable[[Channel, McapSchema | None, str], Reader[Any]]
+    ) -> tuple[np.ndarray, Sequence[Any]]:
         """Host times [T] s and decoded messages of one of our topics, in order of time."""
         if ours not in self.sources:
             return np.zeros(0), []
         theirs, part = self.sources[ours]
         times: list[float] = []
-        out, bad, why, when, written = [], 0, "", NAN, []
+        out: Sequence[Any] = []
+        parts: list[Sequence[Any]] = []
+        bad, why, when, written = 0, "", NAN, []
         for stream in self.streams[theirs]:
             try:
                 reader = make(stream.channel, stream.schema, part)
@@ -238,6 +242,13 @@ class _Reading:
                 )
                 continue
             first = len(times)
+            rows = reader.together([m.data for m in stream.messages])
+            if rows is not None:
+                times += [(m.log_time - self.start_ns) * 1e-9 for m in stream.messages]
+                parts.append(rows)
+                written.append(slice(first, len(times)))
+                continue
+            values: list[Any] = []
             for m in stream.messages:
                 t = (m.log_time - self.start_ns) * 1e-9
                 try:
@@ -250,8 +261,11 @@ class _Reading:
                     )
                     continue
                 times.append(t)
-                out.append(value)
+                values.append(value)
+            parts.append(values)
             written.append(slice(first, len(times)))
+        parts = [p for p in parts if len(p)]
+        out = parts[0] if len(parts) == 1 else [x for p in parts for x in p]
         if bad:
             self.findings.append(
                 Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error")
@@ -261,8 +275,8 @@ class _Reading:
         return self._in_order(ours, np.array(times), out, written)
 
     def _in_order(
-        self, ours: str, t: np.ndarray, out: list[Any], written: Sequence[slice] | None = None
-    ) -> tuple[np.ndarray, list[Any]]:
+        self, ours: str, t: np.ndarray, out: Sequence[Any], written: Sequence[slice] | None = None
+    ) -> tuple[np.ndarray, Sequence[Any]]:
         """Samples in order of time, without those whose time cannot be theirs; `written`: which were written one after
         another."""
         keep = np.zeros(len(t), bool)
@@ -286,7 +300,7 @@ class _Reading:
                     end=float(around[near[1]]),
                 )
             )
-            t, out = t[keep], [out[i] for i in np.flatnonzero(keep)]
+            t, out = t[keep], _taken(out, np.flatnonzero(keep))
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
             if not len(lost) and (written is None or len(written) == 1):
@@ -296,7 +310,7 @@ class _Reading:
                             " samples are returned in order of time", "error", end=float(t[back[-1] + 1]))
                 )  # fmt: skip
             order = np.argsort(t, kind="stable")
-            t, out = t[order], [out[i] for i in order]
+            t, out = t[order], _taken(out, order)
         return t, out
 
     # -- values -------------------------------------------------------------------
@@ -316,7 +330,7 @@ class _Reading:
         place_of = {j: k for k, j in enumerate(ours)}
         column = np.array([place_of[mapping[n]] if n in mapping else -1 for n in theirs])
         scale = self._units(stated)
-        has_effort = any(len(s.effort) for s in states)
+        has_effort = any(len(s.effort) for s in _unlike(states))
         has_tactile = schema.TACTILE in self.sources
         self.findings += metadata.complete(stated, has_effort, has_tactile)
         if "joint_names" not in stated:
@@ -377,7 +391,7 @@ class _Reading:
         return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
 
     def _their_joints(
-        self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
+        self, stated: dict[str, str], commands: Sequence, states: Sequence, joints: Sequence[str] | None
     ) -> list[str]:
         """The recording's own joint names: `joint_names` first, then as they appear in messages."""
         listed = list(schema.joint_names(stated.get("joint_names", "")))
@@ -385,7 +399,7 @@ class _Reading:
         unnamed = 0
         for group in (states, commands):
             last = None
-            for s in group:
+            for s in _unlike(group):
                 if s.names != last:
                     last = s.names
                     seen.update(dict.fromkeys(s.names))
@@ -462,22 +476,12 @@ class _Reading:
         return out
 
     def _joint_series(
-        self, topic: str, t: np.ndarray, samples: list, name: str, place: _Placer, scale: float
+        self, topic: str, t: np.ndarray, samples: Sequence, name: str, place: _Placer, scale: float
     ) -> Series | None:
-        if not samples or (name != "position" and not any(len(getattr(s, name)) for s in samples)):
+        if not len(samples) or (name != "position" and not any(len(getattr(s, name)) for s in _unlike(samples))):
             return None
         value = np.full((len(t), place.count), np.nan)
-        bad: list[int] = []
-        for i, s in enumerate(samples):
-            values = getattr(s, name)
-            if not len(values):
-                continue
-            to = place(s.names, len(values))
-            if to is None:
-                bad.append(i)
-            else:
-                keep, columns = to
-                value[i, columns] = values[keep]
+        bad = _placed(value, samples, name, place)
         if bad:
             self.findings.append(
                 Finding(
@@ -490,8 +494,14 @@ class _Reading:
                     end=float(t[bad[-1]]),
                 )
             )
-        stamp = np.array([np.nan if s.stamp is None else (s.stamp - self.start_ns) * 1e-9 for s in samples])
+        stamp = self._stamps(samples)
         return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp)
+
+    def _stamps(self, samples: Sequence[JointSample]) -> np.ndarray:
+        """[T] `header.stamp` in s from the recording's start, NaN where there is none."""
+        if isinstance(samples, JointRows) and 0 <= self.start_ns < MAX_START:
+            return np.where(samples.stamp == 0, np.nan, (samples.stamp - self.start_ns) * 1e-9)
+        return np.array([np.nan if s.stamp is None else (s.stamp - self.start_ns) * 1e-9 for s in samples])
 
     def _joint_array(self, topic: str, place: _Placer) -> Series | None:
         def fit(dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
@@ -569,29 +579,27 @@ class _TableReading(_Reading):
                 )
         return self.table.meta | {k: v for k, v in stated.items() if k not in schema.UNIT_KEYS}
 
-    def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, list[Any]]:
+    def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, Sequence[Any]]:
         table, empty = self.table, np.zeros(0)
         if ours == schema.STATES:
             have = [q for q in ("position", "velocity", "effort") if q in table.value]
             if "position" not in have:
                 return empty, []
             t, rows = table.samples("position")
-            rest, absent = {}, [empty] * len(rows)
+            rest, absent = {}, np.zeros((len(rows), 0))
             for q in have[1:]:
                 own, value = table.samples(q)
                 same = len(own) == len(t) and np.array_equal(own, t)
                 rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
-            out: list[Any] = [
-                decode.JointSample(table.joints, x, velocity, effort, None)
-                for x, velocity, effort in zip(
-                    rows, rest.get("velocity", absent), rest.get("effort", absent), strict=True
-                )
-            ]
+            out: Sequence[Any] = JointRows(
+                table.joints, rows, rest.get("velocity", absent), rest.get("effort", absent), np.zeros(len(t), np.int64)
+            )
         elif ours == schema.COMMANDS:
             if "command" not in table.value:
                 return empty, []
             t, rows = table.samples("command")
-            out = [decode.JointSample(table.joints, x, empty, empty, None) for x in rows]
+            absent = np.zeros((len(rows), 0))
+            out = JointRows(table.joints, rows, absent, absent, np.zeros(len(t), np.int64))
         else:
             quantity = {
                 schema.TEMPERATURES: "temperature",
@@ -617,7 +625,7 @@ class _TableReading(_Reading):
         return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
 
     def _their_joints(
-        self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
+        self, stated: dict[str, str], commands: Sequence, states: Sequence, joints: Sequence[str] | None
     ) -> list[str]:
         return list(self.table.joints)
 
@@ -632,6 +640,39 @@ class _TableReading(_Reading):
 def _line(t: np.ndarray, own: np.ndarray, x: np.ndarray) -> np.ndarray:
     ok = np.isfinite(x) & np.isfinite(own)
     return np.interp(t, own[ok], x[ok]) if ok.any() else np.full(len(t), np.nan)
+
+
+def _taken(samples: Sequence[Any], which: np.ndarray) -> Sequence[Any]:
+    return samples.take(which) if isinstance(samples, JointRows) else [samples[i] for i in which]
+
+
+def _unlike(samples: Sequence[JointSample]) -> Sequence[JointSample]:
+    """Those of the samples whose names or numbers of values differ: of rows, the first tells of all."""
+    return samples[:1] if isinstance(samples, JointRows) else samples
+
+
+def _placed(value: np.ndarray, samples: Sequence[JointSample], name: str, place: _Placer) -> list[int]:
+    """Fills value [T, J] with a quantity of T samples; returns those whose names and values do not fit."""
+    if isinstance(samples, JointRows):
+        rows = getattr(samples, name)
+        to = place(samples.names, rows.shape[1]) if rows.shape[1] else (np.zeros(0, int),) * 2
+        if to is None:
+            return list(range(len(samples)))
+        for source, column in zip(*to, strict=True):  # in order: of a name that comes twice, the last counts
+            value[:, column] = rows[:, source]
+        return []
+    bad = []
+    for i, s in enumerate(samples):
+        values = getattr(s, name)
+        if not len(values):
+            continue
+        to = place(s.names, len(values))
+        if to is None:
+            bad.append(i)
+        else:
+            keep, columns = to
+            value[i, columns] = values[keep]
+    return bad
 
 
 class _Placer:

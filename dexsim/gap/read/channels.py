@@ -21,7 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy import signal
+from scipy import fft
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.read import WRONG_SIGNAL, Run
@@ -31,6 +31,7 @@ from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 PAUSE = 1.0  # s without a sample, over which no lag is measured
+STEP, BEFORE, AFTER = 0.005, 120, 80  # s of the grid on which a lag is measured, and steps of it on either side
 TURN = 180 / np.pi
 
 Spans = list[tuple[float, float]]  # s
@@ -91,7 +92,8 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     taken out of the runs, which can then be used, but for those stretches."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     out = dict(known)
-    long = {joint: repeated_stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
+    targets = [Targets(run) for run in runs]
+    long = {joint: repeated_stretches(runs, joint, targets) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
     beat = {joint: common_rhythm(runs, joint) for joint in long}
 
@@ -109,7 +111,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             if (run.name, joint) in out:
                 continue
             q, whole = run.q[:, j], [(run.t[0], run.t[-1])]
-            wrong = _wrong(runs, run, j, model)
+            wrong = _wrong(runs, run, j, model, targets[i])
             if wrong is not None:
                 add(wrong.kind, wrong.text, run, joint, wrong.topics, wrong.spans or whole, wrong.confidence)
                 out[run.name, joint] = f"{wrong.kind}: {wrong.text}"
@@ -158,6 +160,34 @@ def _repeated(
     return held | single, said, lost
 
 
+class Targets:
+    """The targets in force at a run's samples, found once for all of its joints."""
+
+    def __init__(self, run: Run):
+        self.run = run
+        self._at: dict[float, np.ndarray] = {}
+        self._even: tuple[np.ndarray, np.ndarray, slice] | None = None
+
+    def before(self, delay: float = 0.0) -> np.ndarray:
+        """[S, J] `delay` s before each sample."""
+        if delay not in self._at:
+            self._at[delay] = self.run.command_at(self.run.t - delay if delay else self.run.t)
+        return self._at[delay]
+
+    def even(self) -> tuple[np.ndarray, np.ndarray, slice]:
+        """(even grid [n] s over the longest stretch without a pause, targets [n + BEFORE + AFTER, J] from AFTER steps
+        before it to BEFORE steps behind it, samples of the stretch); no targets where it is too short."""
+        if self._even is None:
+            t = self.run.t
+            edges = np.r_[0, np.flatnonzero(np.diff(t) > PAUSE) + 1, len(t)]
+            k = int(np.argmax(np.diff(edges)))
+            part = slice(int(edges[k]), int(edges[k + 1]))
+            grid = np.arange(t[part][0], t[part][-1], STEP)
+            wide = t[part][0] + STEP * np.arange(-AFTER, len(grid) + BEFORE)
+            self._even = grid, self.run.command_at(wide if len(grid) >= 200 else wide[:0]), part
+        return self._even
+
+
 @dataclass
 class _Wrong:
     """Why a joint's position or target is of no use in a recording. spans: when, in s; all the time where there are
@@ -170,9 +200,13 @@ class _Wrong:
     confidence: float | None = None
 
 
-def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong | None:
-    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is."""
-    joint, q, cmd = run.joints[j], run.q[:, j], run.command_at(run.t)[:, j]
+def _wrong(
+    runs: list[Run], run: Run, j: int, model: mujoco.MjModel, targets: Targets | None = None
+) -> _Wrong | None:
+    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is. targets:
+    the run's, where they are found already."""
+    targets = targets or Targets(run)
+    joint, q, cmd = run.joints[j], run.q[:, j], targets.before()[:, j]
     limits = _range(model, joint)
     if limits is not None and _degrees(q, cmd, limits):
         return _Wrong(
@@ -196,13 +230,13 @@ def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong |
             f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
             [topic for _, topic, _ in far],
         )
-    if np.ptp(cmd) > 1e-3 and np.ptp(q) > SIGNAL.follows * np.ptp(cmd) and _sign(run, q, j) < -SIGNAL.against:
+    if np.ptp(cmd) > 1e-3 and np.ptp(q) > SIGNAL.follows * np.ptp(cmd) and _sign(targets, q, j) < -SIGNAL.against:
         return _Wrong(
             "sign",
             f"{joint} follows the negative of its target: another direction of its position or its commands",
             [STATES, COMMANDS],
         )
-    lead = _lead(run, j)
+    lead = _lead(run, j, targets)
     if lead > SIGNAL.early:
         return _Wrong(
             "clock_skew",
@@ -324,36 +358,44 @@ def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
     return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
 
 
-def _sign(run: Run, q: np.ndarray, j: int) -> float:
+def _sign(targets: Targets, q: np.ndarray, j: int) -> float:
     """Correlation of the position with its target of a little before, the most of a few delays in size."""
     best = 0.0
+    if not q.std() > 0:
+        return best
     for delay in (0.0, 0.03, 0.08, 0.15):
-        c = run.command_at(run.t - delay)[:, j]
-        if c.std() > 0 and q.std() > 0:
-            r = float(np.corrcoef(c, q)[0, 1])
+        c = targets.before(delay)[:, j]
+        if c.std() > 0:
+            r = correlation(c, q)
             best = r if abs(r) > abs(best) else best
     return best
 
 
-def _lead(run: Run, j: int) -> float:
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """That of two series [n], neither of them constant: the steps of `np.corrcoef`, without its checks of shapes."""
+    x = np.array([a, b])
+    x -= x.mean(1)[:, None]
+    products = np.dot(x, x.T) * np.true_divide(1, len(a) - 1)
+    size = np.sqrt(np.diag(products))
+    return float(np.clip(products[0, 1] / size[0] / size[1], -1, 1))
+
+
+def _lead(run: Run, j: int, targets: Targets | None = None) -> float:
     """Time [s] by which the joint moves before its target: 0 where it does not.
 
     Correlation of the speed with the target's, shifted by -0.6 to 0.4 s, over the longest stretch without a pause."""
-    pause = np.flatnonzero(np.diff(run.t) > PAUSE)
-    edges = np.r_[0, pause + 1, len(run.t)]
-    k = int(np.argmax(np.diff(edges)))
-    t, q = run.t[edges[k] : edges[k + 1]], run.q[edges[k] : edges[k + 1], j]
-    step, before, after = 0.005, 120, 80
-    grid = np.arange(t[0], t[-1], step)
+    grid, command, part = (targets or Targets(run)).even()
     if len(grid) < 200:
         return 0.0
-    dq = np.gradient(np.interp(grid, t, q))
-    wide = t[0] + step * np.arange(-after, len(grid) + before)
-    dc = np.convolve(np.gradient(run.command_at(wide)[:, j]), np.ones(9) / 9, "same")
+    step, after = STEP, AFTER
+    dq = np.gradient(np.interp(grid, run.t[part], run.q[part, j]))
+    dc = np.convolve(np.gradient(command[:, j]), np.ones(9) / 9, "same")
     power = np.concatenate([[0.0], np.cumsum(dc**2)])
     norm = np.sqrt(np.maximum(power[len(grid) :] - power[: -len(grid)], 0.0)) * np.linalg.norm(dq) + 1e-12
     # by the sample at which the target's stretch begins: shift = 80 - sample
-    scores = signal.correlate(dc, dq, "valid", "fft") / norm
+    size = fft.next_fast_len(len(dc) + len(dq) - 1, real=True)
+    product = fft.irfft(fft.rfft(dc, size) * fft.rfft(dq[::-1], size), size)
+    scores = product[len(dq) - 1 : len(dc)] / norm  # those at which all of dq lies within dc
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
     ahead = best > after and scores[best] > SIGNAL.leads and scores[best] > causal + SIGNAL.beyond
@@ -390,19 +432,17 @@ def _holds(run: Run, j: int, end: int) -> float:
 def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """[S] readings that repeat the one before and end in a jump that a joint of this speed cannot make in one
     sample."""
-    same = np.r_[False, np.diff(q) == 0]
     step = np.abs(np.diff(q))
-    moving = step[step > 0]
     out = np.zeros(len(q), bool)
-    if len(moving) < 20:
+    edge = np.flatnonzero(np.diff(np.concatenate([[False, False], step == 0, [False]]).astype(np.int8)))
+    first, end = edge[::2], edge[1::2]
+    long = (end < len(q)) & (t[end - 1] - t[first - 1] >= SIGNAL.held)
+    moving = step[step > 0]
+    if not long.any() or len(moving) < 20:
         return out
     usual = float(np.percentile(moving, 90))
-    edge = np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0]))
-    jumps = [
-        (a, b)
-        for a, b in zip(edge[::2], edge[1::2], strict=True)
-        if b < len(q) and t[b - 1] - t[a - 1] >= SIGNAL.held and abs(q[b] - q[b - 1]) > SIGNAL.jump * usual
-    ]
+    stood = zip(first[long].tolist(), end[long].tolist(), strict=True)
+    jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual]
     # a joint at rest may start with a jump: at least two must have been moving when they froze
     if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > SIGNAL.moving * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
@@ -435,26 +475,30 @@ def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.where(back, 0.0, np.maximum(np.abs(speed) - beside, 0.0) * np.minimum(dt, 2 * np.median(dt)))
 
 
-def repeated_stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, int]]]:
+def repeated_stretches(
+    runs: Sequence[Run], joint: str, targets: Sequence[Targets] | None = None
+) -> list[list[tuple[int, int]]]:
     """Of each run, (first, last) sample of the stretches in which the joint's readings are old ones; `last` is the last
-    old one. Runs without the joint have none."""
+    old one. Runs without the joint have none. targets: of each run, where they are found already."""
+    out: list[list[tuple[int, int]]] = [[] for _ in runs]
+    stood: dict[int, list[tuple[int, int]]] = {}
+    for k, run in enumerate(runs):
+        if joint in run.joints and len(run.t) >= 20:
+            q = run.q[:, run.joints.index(joint)]
+            stood[k] = [(a, b) for a, b in rests(q) if b + 1 < len(q) and run.t[b] - run.t[a] >= SIGNAL.long]
+    if not any(stood.values()):
+        return out
     seen: list[tuple[int, int, int, float, float]] = []  # run, first, last, pulse at its end, way of the target
     pulse, spans = [], []
-    for k, run in enumerate(runs):
-        if joint not in run.joints or len(run.t) < 20:
-            continue
-        j = run.joints.index(joint)
-        q, cmd = run.q[:, j], run.command_at(run.t)[:, j]
-        size = pulses(run.t, q)
+    for k, long in stood.items():
+        run, j = runs[k], runs[k].joints.index(joint)
+        cmd = (Targets(run) if targets is None else targets[k]).before()[:, j]
+        size = pulses(run.t, run.q[:, j])
         spans.append(float(np.ptp(cmd)))
-        for a, b in rests(q):
-            if b + 1 < len(q) and run.t[b] - run.t[a] >= SIGNAL.long:
-                seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
-                size[b] = 0.0
+        for a, b in long:
+            seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
+            size[b] = 0.0
         pulse.append(size)
-    out: list[list[tuple[int, int]]] = [[] for _ in runs]
-    if not seen:
-        return out
     usual = float(max(x.max() for x in pulse))
     jump = [s for s in seen if s[3] > SIGNAL.pulse * usual]
     passed = max((s[4] for s in seen if s not in jump), default=0.0)

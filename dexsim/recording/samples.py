@@ -1,0 +1,77 @@
+"""What the messages of a topic hold, one by one or as rows, and what reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Generic, TypeVar, overload
+
+import numpy as np
+
+T = TypeVar("T")
+Array = tuple[tuple[int, ...], np.ndarray]
+"""Dimensions (or ()) and flat values."""
+Vector = tuple[np.ndarray, "int | None", str]
+"""Values, stamp [ns], frame."""
+
+
+class JointSample:
+    """names (or []), position, velocity, effort (each an array, empty where not given), stamp [ns] or None."""
+
+    __slots__ = ("names", "position", "velocity", "effort", "stamp")
+
+    def __init__(self, names: Sequence[str], position: Any, velocity: Any, effort: Any, stamp: int | None):
+        self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
+
+
+class JointRows(Sequence[JointSample]):
+    """Joint samples of the same names and numbers of values: position, velocity, effort [T, n], each with n = 0 where
+    not given, stamp [T] int64 ns, 0 for None."""
+
+    def __init__(
+        self, names: Sequence[str], position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, stamp: np.ndarray
+    ):
+        self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
+
+    def __len__(self) -> int:
+        return len(self.stamp)
+
+    @overload
+    def __getitem__(self, i: int) -> JointSample: ...
+    @overload
+    def __getitem__(self, i: slice) -> JointRows: ...
+    def __getitem__(self, i: int | slice) -> JointSample | JointRows:
+        if isinstance(i, slice):
+            return self.take(i)
+        stamp = int(self.stamp[i]) or None
+        return JointSample(self.names, self.position[i], self.velocity[i], self.effort[i], stamp)
+
+    def __iter__(self) -> Iterator[JointSample]:
+        rows = zip(self.position, self.velocity, self.effort, self.stamp.tolist(), strict=True)
+        return (JointSample(self.names, q, v, e, stamp or None) for q, v, e, stamp in rows)
+
+    def take(self, which: np.ndarray | slice) -> JointRows:
+        """These samples, in this order."""
+        return JointRows(self.names, self.position[which], self.velocity[which], self.effort[which], self.stamp[which])
+
+
+class Reader(Generic[T]):
+    """Reads the messages of a channel: one (called with its bytes), or all at once (`together`)."""
+
+    def __init__(
+        self, one: Callable[[bytes], T], stack: Callable[[Sequence[bytes], T], Sequence[T] | None] | None = None
+    ):
+        self._one, self._stack = one, stack
+
+    def __call__(self, data: bytes) -> T:
+        """One message; raises what a damaged one leads to."""
+        return self._one(data)
+
+    def together(self, messages: Sequence[bytes]) -> Sequence[T] | None:
+        """All messages, as one after another would be read; None where they are not of one layout."""
+        if self._stack is None or len(messages) < 2:
+            return None
+        try:
+            first = self._one(messages[0])
+        except Exception:  # read one after another, which says what is wrong
+            return None
+        return self._stack(messages, first)
