@@ -139,7 +139,7 @@ class Fitter:
         """res [H, m] after the best initial state of each window (with its prior) is taken out."""
         if s is None:
             return res
-        a11, a22, a12 = self._sums(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
+        a11, a22, a12 = self.by_window(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
         a11, a22 = a11 + 1.0, a22 + 1.0
         det = a11 * a22 - a12**2
         out = np.empty_like(res)
@@ -148,14 +148,14 @@ class Fitter:
         for a in range(0, len(res), some):  # some at a time: what is made in between stays in a core's cache
             rows, left = res[a : a + some], out[a : a + some]
             part = room[: len(rows)]
-            b1, b2 = (self._sums(np.multiply(rows, one, out=part)) for one in s)
+            b1, b2 = (self.by_window(np.multiply(rows, one, out=part)) for one in s)
             for k, (c, one) in enumerate((((a22 * b1 - a12 * b2) / det, s[0]), ((a11 * b2 - a12 * b1) / det, s[1]))):
                 np.take(c, self.window, axis=1, out=part, mode="clip")
                 part *= one
                 np.subtract(left if k else rows, part, out=left)
         return out
 
-    def _sums(self, x: np.ndarray) -> np.ndarray:
+    def by_window(self, x: np.ndarray) -> np.ndarray:
         """[H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
         interpreter."""
         out, some = np.empty((len(x), self.count)), max(SUMMED // max(x.shape[1], 1), 1)
