@@ -68,8 +68,11 @@ def weights(units: int, seed: Seed, count: int = 1000) -> np.ndarray:
     one matrix product, for statistics of many sums over the same resamples."""
 
     def times(index: np.ndarray, axis: int = -1) -> np.ndarray:
-        drawn = np.apply_along_axis(np.bincount, axis, index.astype(int), minlength=units)
-        return np.moveaxis(drawn, axis, 0).astype(float)
+        drawn = np.moveaxis(index.astype(int), axis, -1)
+        rows = drawn.reshape(-1, units)  # a resample each, counted in bins of its own
+        at = (rows + units * np.arange(len(rows))[:, None]).ravel()
+        counted = np.bincount(at, minlength=units * len(rows)).reshape(drawn.shape)
+        return np.moveaxis(counted, -1, 0).astype(float)
 
     return np.ascontiguousarray(draws((np.arange(units),), times, seed, count).T)
 

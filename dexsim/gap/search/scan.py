@@ -16,7 +16,7 @@ from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.fit import Fitter, Residuals, disbelief, prior_weight, slopes_of
+from dexsim.gap.search.fit import Fitter, Residuals, disbelief, huber_square, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
@@ -92,8 +92,7 @@ class JointLosses(JointHypotheses):
         with self._fix(trial.members):
             _, s = fitter.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
             res = fitter.eliminated(fitter.residuals(f.params, np.array(guesses)), s)
-        a = np.abs(res)
-        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+        a = huber_square(res, k)
         for n, number in enumerate(folds):
             test = fold == number
             on = ~test if len(folds) > 1 else test
@@ -119,9 +118,7 @@ class JointLosses(JointHypotheses):
                 rows = on[self.fitter.window]
                 known = {key: v[rows] for key, v in slopes_of(f).items()}
                 x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
-                r = self.fitter.evaluate(f.params, x)
-                a, k = np.abs(r), self.r.huber
-                a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+                a = huber_square(self.fitter.evaluate(f.params, x), self.r.huber)
                 test = ~on[self.fitter.window]
                 out += np.bincount(self.blocks[test], a[test], len(out))
                 parts.append(x)
