@@ -16,6 +16,7 @@ from dexsim.gap.rules import BELIEF
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+ACTIVE_SETS = 20  # that a bounded least squares tries
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
@@ -254,13 +255,9 @@ class Fitter:
                 for rest, pull in ((np.flatnonzero(~back), 1.0), (np.flatnonzero(~back & ~nuisance), 0.0)):
                     z = (centre - f.x) / span * back
                     if len(rest):
-                        root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
-                        right = np.linalg.solve(
-                            root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back]
-                        )
-                        z[rest] = lsq_linear(
-                            root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
-                        ).x
+                        right = pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back]
+                        room = ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
+                        z[rest] = bounded(A[np.ix_(rest, rest)], right, *room)
                     guesses.append(np.clip(f.x + z * span, low, high))
             moved = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
@@ -442,6 +439,26 @@ def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray)
         for i, one in enumerate(M):
             steps[i, free] = _solved(one, b[free])
     return np.clip(steps, -0.5, 0.5)
+
+
+def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which bounds hold
+    (a primal-dual active set, M. Hintermueller et al., SIAM J. Optim. 13, 2002), a solution or two where SciPy's
+    interior steps take a dozen; by those where the bounds that hold do not settle."""
+    below = above = np.zeros(len(b), bool)
+    for _ in range(ACTIVE_SETS):
+        x = np.where(below, low, np.where(above, high, 0.0))
+        free = np.flatnonzero(~(below | above))
+        if len(free):
+            x[free] = np.linalg.solve(A[np.ix_(free, free)], b[free] - A[free] @ x)
+        pull = b - A @ x
+        pull[free] = 0.0
+        now_below, now_above = (x < low) | (below & (pull < 0)), (x > high) | (above & (pull > 0))
+        if (now_below == below).all() and (now_above == above).all():
+            return x
+        below, above = now_below, now_above
+    root = np.linalg.cholesky(A).T
+    return lsq_linear(root, np.linalg.solve(root.T, b), (low, high)).x
 
 
 def _solved(M: np.ndarray, b: np.ndarray) -> np.ndarray:
