@@ -2,7 +2,8 @@
 
 SciPy's are `share`, `draws`, and what is made of them: `bootstrap`. Drawn here, by NumPy's generator, are index arrays:
 `stretches`, since SciPy draws no blocks of neighbours; `singles`, which are stretches of one, since several samples are
-looked up by the same index; `weights`, of which SciPy would make intervals that nobody asked for; and `nested_means`, since SciPy knows no bootstrap in two stages."""
+looked up by the same index; `weights`, of which SciPy would make intervals that nobody asked for; and `nested_means`,
+since SciPy knows no bootstrap in two stages."""
 
 from __future__ import annotations
 

@@ -326,7 +326,9 @@ class Fitter:
                 delta = _differences(params, x, step)
                 res, columns, s = self._slopes(params, x, delta, np.flatnonzero(~known))
                 if known.any() and moved is not None:
-                    jac = jac + np.outer((res - last) - jac @ moved, moved) / max(float(moved @ moved), 1e-30)
+                    rise = np.outer((res - last) - jac @ moved, moved)
+                    rise /= max(float(moved @ moved), 1e-30)
+                    jac += rise
                 jac[:, ~known] = columns / (delta / span)[~known]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             if it >= iterations or P == 0 or self.passed():

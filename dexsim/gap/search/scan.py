@@ -298,14 +298,8 @@ class JointScan(JointLosses):
                 dots.append(_dots(raw_d, np.broadcast_to(rw, raw_d.shape)))
                 squares.append(_dots(raw_d, raw_d))
                 cross.append(_times(all_J.T, raw_d))
-        self.saved = self._saved(
-            [(m, st) for _, m, st in rows],
-            *(np.concatenate(parts) if parts else np.zeros(0) for parts in (dots, squares, cross)),
-            all_J,
-            rw,
-            params,
-            x,
-        )
+        sums = [np.concatenate(parts) if parts else np.zeros(0) for parts in (dots, squares, cross)]
+        self.saved = self._saved([(m, st) for _, m, st in rows], sums[0], sums[1], sums[2], all_J, rw, params, x)
         best: dict[tuple, tuple] = {}
         self.other_start: dict[str, np.ndarray] = {}
         for gain, member, start in sorted(rows, key=lambda r: -r[0]):
