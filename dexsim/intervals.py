@@ -1,8 +1,9 @@
 """Intervals of what was counted or averaged: Wilson's of a share, the bootstrap's percentiles of anything else.
 
-SciPy's are `share`, `draws`, and what is made of them: `bootstrap` and `weights`. Drawn here, by NumPy's generator, are
-index arrays: `stretches`, since SciPy draws no blocks of neighbours; `singles`, which are stretches of one, since
-several samples are looked up by the same index; and `nested_means`, since SciPy knows no bootstrap in two stages."""
+SciPy's are `share`, `draws`, and what is made of them: `bootstrap`. Drawn here, by NumPy's generator, are index arrays:
+`stretches`, since SciPy draws no blocks of neighbours; `singles`, which are stretches of one, since several samples are
+looked up by the same index; `weights`, of which SciPy would make intervals that nobody asked for; and `nested_means`,
+since SciPy knows no bootstrap in two stages."""
 
 from __future__ import annotations
 
@@ -67,11 +68,9 @@ def weights(units: int, seed: Seed, count: int = 1000) -> np.ndarray:
     """[count, units] how often each unit is in each resample. Times sums by unit they give the sums of all resamples in
     one matrix product, for statistics of many sums over the same resamples."""
 
-    def times(index: np.ndarray, axis: int = -1) -> np.ndarray:
-        drawn = np.apply_along_axis(np.bincount, axis, index.astype(int), minlength=units)
-        return np.moveaxis(drawn, axis, 0).astype(float)
-
-    return np.ascontiguousarray(draws((np.arange(units),), times, seed, count).T)
+    index = singles(units, seed, count) if units > 1 else np.zeros((count, 1), int)
+    at = (index + units * np.arange(count)[:, None]).ravel()  # each resample counted in bins of its own
+    return np.bincount(at, minlength=units * count).reshape(count, units).astype(float)
 
 
 def stretches(units: int, length: int, seed: Seed, count: int = 1000) -> np.ndarray:

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.judge.joint_answer import stretched, traded
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
-from dexsim.gap.search.fit import Fitted
+from dexsim.gap.search.fit import Fitted, bounded
 from dexsim.gap.search.search import JointSearch, Member, Trial
 from tests.test_gap import model, plant_run
 
@@ -118,3 +119,18 @@ def test_a_recording_that_begins_after_a_change_of_command_begins_with_what_the_
     error = simulated(part) - part.q[:, 0]
     soon = part.t < step + ago + 0.2  # a loop with a lag may swing up what is left
     assert np.sqrt(np.mean(error[soon] ** 2)) < 0.05 * size
+
+
+def test_a_bounded_least_squares_is_the_least_of_what_its_bounds_allow():
+    """Whatever bounds hold: as low as SciPy's, whose interior steps end a little before them, and inside."""
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        n = int(rng.integers(1, 9))
+        J = rng.standard_normal((40, n)) * np.exp(rng.standard_normal(n))
+        A, low, high = J.T @ J, -rng.random(n), rng.random(n)
+        b = A @ (1.5 * rng.standard_normal(n))
+        x = bounded(A, b, low, high)
+        root = np.linalg.cholesky(A).T
+        scipys = lsq_linear(root, np.linalg.solve(root.T, b), (low, high)).x
+        mine, theirs = (0.5 * z @ A @ z - b @ z for z in (x, scipys))
+        assert ((low <= x) & (x <= high)).all() and mine <= theirs + 1e-9 * abs(theirs)

@@ -69,47 +69,64 @@ def spots(
 ) -> list[Spot]:
     """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name
     -> [n]."""
-    out: list[Spot] = []
-    drawn: list[np.ndarray] = []
     _, block = np.unique(block, return_inverse=True)
     count = int(block.max()) + 1
     if count < 6:
-        return out
+        return []
     square = residual**2
     total_s, total_n = np.bincount(block, square, count), np.bincount(block, minlength=count).astype(float)
     weight = intervals.weights(count, rng, DRAWS)
     all_s, all_n = weight @ total_s, weight @ total_n
+    out: list[Spot] = []
+    parts = [np.zeros((2, 0, count))]
     for name, x in regimes.items():
         if name.startswith("_") or np.ptp(x) < 1e-12:
             continue
         edges = _edges(name, x)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
-            inside = (x >= low) & ((x < high) if high != edges[-1] else (x <= high))
-            if not 0.02 < inside.mean() < 0.98:
-                continue
-            s, n = (
-                np.bincount(block[inside], square[inside], count),
-                np.bincount(block[inside], minlength=count).astype(float),
-            )
-            bs, bn = weight @ s, weight @ n
-            ok = (bn > 0) & (all_n > bn)
-            if ok.mean() < 0.9:
-                continue
-            ratio = np.sqrt((bs[ok] / bn[ok]) / np.maximum((all_s[ok] - bs[ok]) / (all_n[ok] - bn[ok]), 1e-300))
-            inner, outer = s.sum() / n.sum(), (total_s.sum() - s.sum()) / (total_n.sum() - n.sum())
-            log = np.log(np.maximum(ratio, 1e-9))
-            z = np.log(max(np.sqrt(inner / max(outer, 1e-300)), 1e-9)) / max(log.std(), 1e-6)
-            p = 2 * _tail(abs(z))
-            top = float(np.max(x)) if not np.isfinite(high) else float(high)
-            rms, size = float(np.sqrt(inner)), float(np.sqrt(inner / max(outer, 1e-300)))
-            out.append(Spot(joint, name, float(low), top, size, 0.0, 0.0, rms, float(inside.mean()), p, of=of))
-            drawn.append(ratio)
-    for count in {len(r) for r in drawn}:  # together: one at a time they are most of what this takes
-        mine = [k for k, r in enumerate(drawn) if len(r) == count]
-        bounds = np.quantile(np.stack([drawn[k] for k in mine]), (0.05, 0.95), axis=1)
-        for k, low, high in zip(mine, *bounds, strict=True):
-            out[k].ratio_low, out[k].ratio_high = float(low), float(high)
-    return out
+        bins, shares, sums = _binned(x, edges, block, square, count)
+        parts.append(sums)
+        for k, share in zip(bins, shares, strict=True):
+            high = float(edges[k + 1]) if np.isfinite(edges[k + 1]) else float(np.max(x))
+            out.append(Spot(joint, name, float(edges[k]), high, 0.0, 0.0, 0.0, 0.0, float(share), 1.0, of=of))
+    s, n = np.concatenate(parts, 1)
+    bs, bn = (np.matmul(weight, y[..., None])[..., 0] for y in (s, n))  # of each bin a product of its own
+    ok = (bn > 0) & (all_n > bn)
+    often = np.flatnonzero(ok.mean(1) >= 0.9)
+    whole, kept = ok.all(1), np.zeros(len(out), bool)
+    kept[often] = True
+    inner = s.sum(1) / np.maximum(n.sum(1), 1)
+    outer = (total_s.sum() - s.sum(1)) / np.maximum(total_n.sum() - n.sum(1), 1)
+    # together, as far as the draws are the same: one at a time they are most of what this takes
+    for rows in [np.flatnonzero(kept & whole), *np.flatnonzero(kept & ~whole)[:, None]]:
+        if not len(rows):
+            continue
+        on = ok[rows[0]]
+        (mine_s, mine_n), rest_s, rest_n = (y[rows].compress(on, 1) for y in (bs, bn)), all_s[on], all_n[on]
+        ratio = np.sqrt((mine_s / mine_n) / np.maximum((rest_s - mine_s) / (rest_n - mine_n), 1e-300))
+        spread = np.log(np.maximum(ratio, 1e-9)).std(1)
+        for k, deviation, low, high in zip(rows, spread, *np.quantile(ratio, (0.05, 0.95), axis=1), strict=True):
+            spot, size = out[k], float(np.sqrt(inner[k] / max(outer[k], 1e-300)))
+            spot.ratio, spot.ratio_low, spot.ratio_high = size, float(low), float(high)
+            spot.rms = float(np.sqrt(inner[k]))
+            spot.p = 2 * _tail(abs(np.log(max(size, 1e-9)) / max(deviation, 1e-6)))
+    return [out[k] for k in often]
+
+
+def _binned(
+    x: np.ndarray, edges: Sequence[float] | np.ndarray, block: np.ndarray, square: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(numbers [K] of the bins of a regime variable x [n] that are neither nearly empty nor nearly all, the share of
+    the samples in each [K], and [2, K, count] by block [n] the sum of the squares [n] in each and their number).
+    edges: of the bins; the last bin has its upper one too."""
+    B = len(edges) - 1
+    of = np.searchsorted(edges, x, side="right") - 1
+    of[x == edges[-1]] = B - 1
+    of[(of < 0) | (x > edges[-1])] = B  # in none of them
+    share = np.bincount(of, minlength=B + 1)[:B] / len(x)
+    kept = np.flatnonzero((share > 0.02) & (share < 0.98))
+    at = of * count + block
+    sums = [np.bincount(at, y, (B + 1) * count).reshape(B + 1, count)[kept] for y in (square, None)]
+    return kept, share[kept], np.stack(sums).astype(float)
 
 
 def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:

@@ -165,7 +165,7 @@ def _withheld(worse: dict[str, str], answers: Sequence[JointAnswer], rings: Coll
 def _rings(a: JointAnswer) -> float:
     """Share of what is missed of how a joint rings by itself in what was held out that what was found takes away; 0
     where the error there is lower with it anyway."""
-    if _less(a.numbers["after"], a.numbers["before"]):
+    if _less(rms(a.after), rms(a.before)):
         return 0.0
     return ringing.shown(a.search, a.outcome, a.kept.test, a.kept.span_test)
 

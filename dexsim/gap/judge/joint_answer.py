@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ class JointAnswer:
             "mae_before": float(np.abs(self.measured - self.q_before).mean()),
             "mae_after": float(np.abs(self.measured - self.q_after).mean()),
             "sigma": self.case.sigma,
-            "fitted": self._followed(),
+            "fitted": self._followed,
             "left": 0.0,
             "told_before": self.told[0],
             "told_after": self.told[1],
@@ -393,21 +394,13 @@ class JointAnswer:
             else None
         )
 
+    @cached_property
     def _followed(self) -> float:
-        """Error (rms) of a free run over what was fitted, without any effect."""
+        """Error (rms) of a free run over what was fitted, without any effect; simulated once."""
         case, fit = self.case, self.none.fit
-        windows = case.plant.windows(None, self.kept.train, span=self.kept.span_train)
-        return float(
-            np.sqrt(
-                np.mean(
-                    (
-                        case.plant.q[windows.sample_row]
-                        - free_run(case, fit.params, fit.x, windows, underway=True)[0]
-                    )
-                    ** 2
-                )
-            )
-        )
+        windows = self.search.fitted_whole
+        q = free_run(case, fit.params, fit.x, windows, underway=True)[0]
+        return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - q) ** 2)))
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:

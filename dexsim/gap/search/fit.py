@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.sparse import csr_array
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX, Param, expand
@@ -16,9 +17,11 @@ from dexsim.gap.rules import BELIEF
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+ACTIVE_SETS = 20  # that a bounded least squares tries
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
+MOST = 1e6  # sigmas of a residual
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
 
 
@@ -35,6 +38,17 @@ def prior_weight(params: list[Param]) -> np.ndarray:
 def disbelief(params: list[Param], x: np.ndarray) -> float:
     """How far x [P] is from what is believed, on the scale of a sum of squared residuals."""
     return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
+
+
+def huber_square(res: np.ndarray, k: float) -> np.ndarray:
+    """Huber's square of residuals of any shape, from `k` on linear; plain squares where k is 0."""
+    size = np.abs(res)
+    far, out = size > k, size * size
+    if k > 0 and far.any():
+        size *= 2 * k
+        size -= k * k
+        np.copyto(out, size, where=far)
+    return out
 
 
 @dataclass
@@ -90,6 +104,10 @@ class Fitter:
         order = np.flatnonzero(np.r_[True, np.diff(windows.sample_window) != 0])
         self.starts = np.concatenate([order, order + n]) if self.use_torque else order
         self.eliminate = residuals.sigma_q0 > 0
+        # samples of each window, one signal's after the other's; of `_adds`, by number of rows
+        self._signals = 2 if self.use_torque else 1
+        self._sizes = np.tile(np.bincount(windows.sample_window, minlength=self.count), self._signals)
+        self._sparse: dict[int, csr_array] = {}
 
     def residuals(self, params: list[Param], x: np.ndarray, inits: np.ndarray | None = None) -> np.ndarray:
         """[H, m] measured minus simulated, in sigmas."""
@@ -100,13 +118,20 @@ class Fitter:
     def compare(self, q: np.ndarray, tau: np.ndarray, plants: np.ndarray) -> np.ndarray:
         """[H, m] measured minus simulated position [H, n] and effort [H, n], in sigmas; plants [H, R, C] for what the
         effort's sensor makes of it."""
+        n = q.shape[1]
+        out = np.empty((len(q), 2 * n if self.use_torque else n))
         with np.errstate(invalid="ignore", over="ignore"):
-            out = (self.q - q) / self.r.sigma_q
+            position = np.subtract(self.q, q, out=out[:, :n])
+            position /= self.r.sigma_q
             if self.use_torque:
                 gain, offset = plants[:, 0, EFFORT_GAIN, None], plants[:, 0, EFFORT_OFFSET, None]
-                rt = np.where(self.tau_on, (self.tau - gain * tau - offset) / self.r.sigma_torque, 0.0)
-                out = np.concatenate([out, rt], 1)
-        return np.clip(np.nan_to_num(out, nan=1e6), -1e6, 1e6)
+                effort = np.subtract(self.tau, gain * tau, out=out[:, n:])
+                effort -= offset
+                effort /= self.r.sigma_torque
+                effort[:, ~self.tau_on] = 0.0
+            # what is no number counts as the most: `fmin` takes the other
+            np.fmin(out, MOST, out=out)
+            return np.maximum(out, -MOST, out=out)
 
     def init_directions(self, params: list[Param], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals at x [m], and their change [2, m] per sigma of the initial position and speed."""
@@ -119,39 +144,56 @@ class Fitter:
         """res [H, m] after the best initial state of each window (with its prior) is taken out."""
         if s is None:
             return res
-        a11, a22, a12 = self._sums(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
+        a11, a22, a12 = self.by_window(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
         a11, a22 = a11 + 1.0, a22 + 1.0
         det = a11 * a22 - a12**2
-        b1, b2 = self._sums(res * s[0]), self._sums(res * s[1])
-        c1, c2 = (a22 * b1 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
-        return res - c1[:, self.window] * s[0] - c2[:, self.window] * s[1]
+        out = np.empty_like(res)
+        some = max(SUMMED // max(res.shape[1], 1), 1)
+        room = np.empty((min(some, len(res)), res.shape[1]))
+        for a in range(0, len(res), some):  # some at a time: what is made in between stays in a core's cache
+            rows, left = res[a : a + some], out[a : a + some]
+            part = room[: len(rows)]
+            b1, b2 = (self.by_window(np.multiply(rows, one, out=part)) for one in s)
+            for k, (c, one) in enumerate((((a22 * b1 - a12 * b2) / det, s[0]), ((a11 * b2 - a12 * b1) / det, s[1]))):
+                taken = np.repeat(np.tile(c, self._signals), self._sizes, axis=1)
+                taken *= one
+                np.subtract(left if k else rows, taken, out=left)
+        return out
 
-    def _sums(self, x: np.ndarray) -> np.ndarray:
+    def by_window(self, x: np.ndarray) -> np.ndarray:
         """[H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
         interpreter."""
         out, some = np.empty((len(x), self.count)), max(SUMMED // max(x.shape[1], 1), 1)
         for a in range(0, len(x), some):
             rows = x[a : a + some]
-            at = self.window + self.count * np.arange(len(rows))[:, None]
-            out[a : a + some] = np.bincount(at.ravel(), rows.ravel(), rows.shape[0] * self.count).reshape(len(rows), -1)
+            out[a : a + some] = (self._adds(len(rows)) @ rows.ravel()).reshape(len(rows), -1)
         return out
+
+    def _adds(self, rows: int) -> csr_array:
+        """[rows * W, rows * m] what adds up so many rows of residuals by window, in their order: a sparse matrix of
+        ones, four times as fast as counting into bins, each of which waits for the one before. Made once for the
+        most."""
+        m, W = len(self.window), self.count
+        if rows not in self._sparse:
+            most = max([rows, *self._sparse])  # a list: hypotheses are fitted side by side
+            if most == rows:
+                order = np.argsort(self.window, kind="stable")
+                at = (order + m * np.arange(rows)[:, None]).ravel().astype(np.int32)
+                ends = np.cumsum(np.tile(np.bincount(self.window, minlength=W), rows))
+                parts = np.ones(rows * m), at, np.r_[0, ends].astype(np.int32)
+            else:  # the first rows of those
+                known = self._sparse[most]
+                parts = known.data[: rows * m], known.indices[: rows * m], known.indptr[: rows * W + 1]
+            self._sparse[rows] = csr_array(parts, shape=(rows * W, rows * m))
+        return self._sparse[rows]
 
     def loss(self, res: np.ndarray) -> np.ndarray:
         """[H] mean of Huber's square."""
-        k = self.r.huber
-        a = np.abs(res)
-        if k > 0:
-            a = np.where(a <= k, a * a, 2 * k * a - k * k)
-        else:
-            a = a * a
-        return a.mean(-1)
+        return huber_square(res, self.r.huber).mean(-1)
 
     def window_loss(self, res: np.ndarray) -> np.ndarray:
         """[W] sum of Huber's square by window."""
-        k = self.r.huber
-        a = np.abs(res)
-        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
-        return np.bincount(self.window, a, self.count)
+        return np.bincount(self.window, huber_square(res, self.r.huber), self.count)
 
     def evaluate(self, params: list[Param], x: np.ndarray) -> np.ndarray:
         """[m] residuals at x, initial states taken out."""
@@ -213,9 +255,10 @@ class Fitter:
             k = self.r.huber
             w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
             J = f.jacobian * span
-            A = (J * w[:, None]).T @ J
+            weighed = J * w[:, None]
+            A = weighed.T @ J
             A[np.diag_indices(P)] += believed * span**2 + 1e-3 * np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
-            b = -(J * w[:, None]).T @ f.residual - believed * (f.x - centre) * span
+            b = -weighed.T @ f.residual - believed * (f.x - centre) * span
             away = nuisance & (np.abs(f.x - centre) > AWAY * span)
             guesses = []
             if not away.any():
@@ -226,13 +269,9 @@ class Fitter:
                 for rest, pull in ((np.flatnonzero(~back), 1.0), (np.flatnonzero(~back & ~nuisance), 0.0)):
                     z = (centre - f.x) / span * back
                     if len(rest):
-                        root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
-                        right = np.linalg.solve(
-                            root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back]
-                        )
-                        z[rest] = lsq_linear(
-                            root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
-                        ).x
+                        right = pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back]
+                        room = ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
+                        z[rest] = bounded(A[np.ix_(rest, rest)], right, *room)
                     guesses.append(np.clip(f.x + z * span, low, high))
             moved = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
@@ -301,15 +340,18 @@ class Fitter:
                 delta = _differences(params, x, step)
                 res, columns, s = self._slopes(params, x, delta, np.flatnonzero(~known))
                 if known.any() and moved is not None:
-                    jac = jac + np.outer((res - last) - jac @ moved, moved) / max(float(moved @ moved), 1e-30)
+                    rise = np.outer((res - last) - jac @ moved, moved)
+                    rise /= max(float(moved @ moved), 1e-30)
+                    jac += rise
                 jac[:, ~known] = columns / (delta / span)[~known]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             if it >= iterations or P == 0 or self.passed():
                 break
             k = self.r.huber
             weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
-            A = (jac * weight[:, None]).T @ jac
-            b = -(jac * weight[:, None]).T @ res - believed * (x - centre) * span
+            weighed = jac * weight[:, None]
+            A = weighed.T @ jac
+            b = -weighed.T @ res - believed * (x - centre) * span
             A[np.diag_indices(P)] += believed * span**2
             at_low, at_high = x <= low + 1e-12, x >= high - 1e-12
             free = np.flatnonzero(~((at_low & (b < 0)) | (at_high & (b > 0))))
@@ -406,13 +448,41 @@ def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray)
     damped by one of lambdas [K]."""
     scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
     steps = np.zeros((len(lambdas), len(b)))
-    for i, lam in enumerate(lambdas):
-        M = A[np.ix_(free, free)] + lam * np.diag(scale[free])
-        try:
-            steps[i, free] = np.linalg.solve(M, b[free])
-        except np.linalg.LinAlgError:
-            steps[i, free] = np.linalg.lstsq(M, b[free], rcond=None)[0]
+    M = A[np.ix_(free, free)] + lambdas[:, None, None] * np.diag(scale[free])
+    try:
+        steps[:, free] = np.linalg.solve(M, np.repeat(b[None, free, None], len(lambdas), 0))[..., 0]
+    except np.linalg.LinAlgError:  # one of them at least: each by itself
+        for i, one in enumerate(M):
+            steps[i, free] = _solved(one, b[free])
     return np.clip(steps, -0.5, 0.5)
+
+
+def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which bounds hold
+    (a primal-dual active set, M. Hintermueller et al., SIAM J. Optim. 13, 2002), a solution or two where SciPy's
+    interior steps take a dozen; by those where the bounds that hold do not settle."""
+    below = above = np.zeros(len(b), bool)
+    for _ in range(ACTIVE_SETS):
+        x = np.where(below, low, np.where(above, high, 0.0))
+        free = np.flatnonzero(~(below | above))
+        if len(free):
+            x[free] = np.linalg.solve(A[np.ix_(free, free)], b[free] - A[free] @ x)
+        pull = b - A @ x
+        pull[free] = 0.0
+        now_below, now_above = (x < low) | (below & (pull < 0)), (x > high) | (above & (pull > 0))
+        if (now_below == below).all() and (now_above == above).all():
+            return x
+        below, above = now_below, now_above
+    root = np.linalg.cholesky(A).T
+    return lsq_linear(root, np.linalg.solve(root.T, b), (low, high)).x
+
+
+def _solved(M: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[F] x of M x = b, the shortest of them where there are many."""
+    try:
+        return np.linalg.solve(M, b)
+    except np.linalg.LinAlgError:
+        return np.linalg.lstsq(M, b, rcond=None)[0]
 
 
 def slopes_of(f: Fitted) -> dict[str, np.ndarray]:

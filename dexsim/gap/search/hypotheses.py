@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import SimpleNamespace
 from typing import Self
 
@@ -338,6 +339,11 @@ class JointHypotheses:
             if p.key not in case.unknown and p.key not in MAYBE and not (p.mode == "factor" and p.span > 0.3)
         ]
         self.wide = {c for p in self.all_nuisances if p not in believed for c in p.columns}
+
+    @cached_property
+    def fitted_whole(self) -> Windows:
+        """What is fitted, whole recordings: made once, with what is known of them."""
+        return self.case.plant.windows(None, self.train, span=self.span)
 
     def _on(self, share: float) -> None:
         """Tells that about this share of the work that was left is done: how many effects there are to look for is not

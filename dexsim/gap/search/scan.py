@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.fit import Fitter, Residuals, disbelief, prior_weight, slopes_of
+from dexsim.gap.search.fit import Fitter, Residuals, disbelief, huber_square, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
@@ -91,8 +92,7 @@ class JointLosses(JointHypotheses):
         with self._fix(trial.members):
             _, s = fitter.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
             res = fitter.eliminated(fitter.residuals(f.params, np.array(guesses)), s)
-        a = np.abs(res)
-        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+        a = huber_square(res, k)
         for n, number in enumerate(folds):
             test = fold == number
             on = ~test if len(folds) > 1 else test
@@ -118,9 +118,7 @@ class JointLosses(JointHypotheses):
                 rows = on[self.fitter.window]
                 known = {key: v[rows] for key, v in slopes_of(f).items()}
                 x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
-                r = self.fitter.evaluate(f.params, x)
-                a, k = np.abs(r), self.r.huber
-                a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+                a = huber_square(self.fitter.evaluate(f.params, x), self.r.huber)
                 test = ~on[self.fitter.window]
                 out += np.bincount(self.blocks[test], a[test], len(out))
                 parts.append(x)
@@ -210,6 +208,7 @@ class JointLosses(JointHypotheses):
 
 
 SWEEPS = 60  # over the beliefs, by which the scan moves them
+PROJECTED = 16  # guesses of the scan that are projected in one call: they stay in a core's cache
 
 
 Scanned = tuple[float, float, Member, np.ndarray]
@@ -236,15 +235,14 @@ class JointScan(JointLosses):
                 if variant is None:
                     continue
                 member = Member(effect, variant)
-                for begun in variant.starts:
-                    g = base.copy()
-                    for name, value in variant.fixed:
-                        g[:, INDEX[name]] = value
-                    for p, value in zip(variant.params, begun, strict=True):
-                        value = float(np.clip(value, p.low, p.high))
-                        p.apply(g[None], np.array([value]), believed)
-                    guesses.append(legal(g))
-                    owners.append((member, np.array(begun)))
+                begun = np.array(variant.starts, float).reshape(len(variant.starts), len(variant.params))
+                g = np.repeat(base[None], len(begun), 0)
+                for name, value in variant.fixed:
+                    g[:, :, INDEX[name]] = value
+                for p, values in zip(variant.params, begun.T, strict=True):
+                    p.apply(g, np.clip(values, p.low, p.high), believed)
+                guesses += list(legal(g))
+                owners += [(member, start) for start in begun]
         return guesses, owners
 
     def scan(self, current: Trial) -> list[Scanned]:
@@ -271,10 +269,9 @@ class JointScan(JointLosses):
         inside = (x > low + 0.02 * (high - low)) & (x < high - 0.02 * (high - low)) if params else np.zeros(0, bool)
         Jw = Jw[:, inside]  # one at its bound has nothing left to give
         gram = Jw.T @ Jw + 16.0 * float(np.mean(rw**2)) * np.eye(Jw.shape[1])
-        project = lambda y: y - Jw @ np.linalg.solve(gram, Jw.T @ y) if Jw.shape[1] else y  # noqa: E731
+        project = partial(_projected, Jw, gram)
         total = float(rw @ rw)
-        clean = project(rw)
-        block = fitter.window
+        clean = project(rw[None])[0]
         count = fitter.count
         flips = self.rng.choice([-1.0, 1.0], size=(BOOTSTRAPS, count))
         null = np.zeros(BOOTSTRAPS)
@@ -282,26 +279,27 @@ class JointScan(JointLosses):
         for a in range(0, len(guesses), size):
             with self._fix(()):
                 q = self._simulate(fitter, np.stack(guesses[a : a + size]), s)
-            changes = r0 - q
+            changes = np.subtract(r0, q, out=q)
             changes *= sw
-            for i, raw_d in enumerate(changes):
+            for b in range(0, len(changes), PROJECTED):
+                raw_d = changes[b : b + PROJECTED]
                 d = project(raw_d)
-                dd = float(d @ d)
-                if not np.isfinite(dd) or dd < 1e-6 * total * 1e-3 + 1e-12:
-                    continue
-                part = np.bincount(block, d * clean, count)
-                dot = float(part.sum())
+                dd = _dots(d, d)
+                on = np.isfinite(dd) & ~(dd < 1e-6 * total * 1e-3 + 1e-12)
+                raw_d, d, dd = (raw_d, d, dd) if on.all() else (raw_d[on], d[on], dd[on])
+                d *= clean
+                part = fitter.by_window(d)
+                dot = part.sum(1)
                 c = np.clip(dot / dd, 0.0, 2.0)
                 gain = (2 * c * dot - c * c * dd) / total
-                null = np.maximum(null, np.maximum(flips @ part, 0.0) ** 2 / dd / total)
-                member, start = owners[a + i]
-                rows.append((gain, member, start))
-                dots.append(float(raw_d @ rw))
-                squares.append(float(raw_d @ raw_d))
-                cross.append(all_J.T @ raw_d)
-        self.saved = self._saved(
-            [(m, st) for _, m, st in rows], np.array(dots), np.array(squares), np.array(cross), all_J, rw, params, x
-        )
+                chance = np.maximum(_times(flips, part), 0.0) ** 2 / dd[:, None] / total
+                null = np.maximum(null, chance.max(0, initial=0.0))
+                rows += [(float(g), *owners[a + b + i]) for g, i in zip(gain, np.flatnonzero(on), strict=True)]
+                dots.append(_dots(raw_d, np.broadcast_to(rw, raw_d.shape)))
+                squares.append(_dots(raw_d, raw_d))
+                cross.append(_times(all_J.T, raw_d))
+        sums = [np.concatenate(parts) if parts else np.zeros(0) for parts in (dots, squares, cross)]
+        self.saved = self._saved([(m, st) for _, m, st in rows], sums[0], sums[1], sums[2], all_J, rw, params, x)
         best: dict[tuple, tuple] = {}
         self.other_start: dict[str, np.ndarray] = {}
         for gain, member, start in sorted(rows, key=lambda r: -r[0]):
@@ -354,11 +352,20 @@ class JointScan(JointLosses):
         H = len(owners)
         z, c = np.zeros((H + 1, P)), np.zeros(H + 1)  # the last: without any guess
         d_r, d_d, d_J = np.r_[dots, 0.0], np.r_[squares, 1.0], np.vstack([cross, np.zeros((1, P))])
+        columns = np.ascontiguousarray(d_J.T)
         for _ in range(SWEEPS):
+            before = c.copy(), z.copy()
             for i in range(P):
-                push = b[i] + c * d_J[:, i] - z @ A[:, i] + A[i, i] * z[:, i]
-                z[:, i] = np.clip(push / A[i, i], low[i], high[i])
+                push = c * columns[i]
+                push += b[i]
+                push -= z @ A[:, i]
+                push += A[i, i] * z[:, i]
+                push /= A[i, i]
+                np.maximum(push, low[i], out=push)
+                np.minimum(push, high[i], out=z[:, i])
             c[:-1] = np.clip((d_r + (z * d_J).sum(1)) / d_d, 0.0, 2.0)[:-1]
+            if np.array_equal(c, before[0]) and np.array_equal(z, before[1]):
+                break  # no sweep moves them any more
         left = (
             total - 2 * c * d_r + c * c * d_d - 2 * c * (z * d_J).sum(1) - 2 * z @ b + np.einsum("hi,ij,hj->h", z, A, z)
         )
@@ -417,12 +424,31 @@ class JointScan(JointLosses):
         return listed + [(gain, 1.0, member, start) for gain, member, start in more[:4]]
 
 
+def _times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """[H, K] A [K, m] times each of x [H, m]: each as one product of its own, so that no sum hangs on how many there
+    are."""
+    return np.matmul(A, x[..., None])[..., 0]
+
+
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[H] products of the rows of a and b [H, m]."""
+    return np.matmul(a[:, None, :], b[..., None])[:, 0, 0]
+
+
+def _projected(J: np.ndarray, gram: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """[H, m] y [H, m] without what the columns of J [m, P] may absorb of each, gram [P, P] being J' J and a prior."""
+    if not J.shape[1]:
+        return y.copy()
+    taken = _times(J, np.linalg.solve(gram, _times(J.T, y)[..., None])[..., 0])
+    return np.subtract(y, taken, out=taken)
+
+
 def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
     """[R, C] plant parameters at one guess."""
     return expand(case.plant, params, x[None])[0]
 
 
 def legal(g: np.ndarray) -> np.ndarray:
-    for c in NOT_NEGATIVE:
-        g[:, c] = np.maximum(g[:, c], 0.0)
+    """Plant parameters [.., C] in place, those that cannot be negative at 0 at least."""
+    g[..., NOT_NEGATIVE] = np.maximum(g[..., NOT_NEGATIVE], 0.0)
     return g

@@ -18,7 +18,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, huber_square, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
@@ -667,7 +667,8 @@ class JointSearch(JointSelection):
         if self.deadline.over():
             return trial
         plant = self.whole
-        whole = plant.windows(None, self.train, span=self.span)
+        coarse = self.fitted_whole  # in the steps of the windows' fit
+        whole = coarse if plant is self.case.plant else plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, huber=max(self.r.huber, 3.0))
         fitter = Fitter(plant, whole, r, self.deadline.passed)
         params = trial.fit.params
@@ -675,11 +676,7 @@ class JointSearch(JointSelection):
             here = fitter.residuals(params, trial.fit.x[None])[0]
             fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
             # slopes in the windows' own steps serve for shorter ones
-            slopes = slopes_of(
-                Fitter(self.case.plant, self.case.plant.windows(None, self.train, span=self.span), r).fit(
-                    params, x0=trial.fit.x, iterations=0
-                )
-            )
+            slopes = slopes_of(Fitter(self.case.plant, coarse, r).fit(params, x0=trial.fit.x, iterations=0))
             f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
         # a fit that is no better than rounding, or that long windows speak against, is left as it was
         if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
@@ -693,9 +690,7 @@ class JointSearch(JointSelection):
     def by_run(self, trial: Trial) -> np.ndarray:
         """[R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
         with self._fix(trial.members):
-            r = self.fitter.evaluate(trial.fit.params, trial.fit.x)
-        a, k = np.abs(r), self.r.huber
-        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+            a = huber_square(self.fitter.evaluate(trial.fit.params, trial.fit.x), self.r.huber)
         run, count = self.long.run[self.fitter.window], self.case.plant.runs
         return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
