@@ -122,7 +122,7 @@ def test_a_recording_that_begins_after_a_change_of_command_begins_with_what_the_
 
 
 def test_a_bounded_least_squares_is_the_least_of_what_its_bounds_allow():
-    """Whatever bounds hold: as low as SciPy's, whose interior steps end a little before them, and inside."""
+    """Whatever bounds hold: as low as by interior steps, which end a little before them, and inside to a rounding."""
     rng = np.random.default_rng(0)
     for _ in range(30):
         n = int(rng.integers(1, 9))
@@ -133,4 +133,30 @@ def test_a_bounded_least_squares_is_the_least_of_what_its_bounds_allow():
         root = np.linalg.cholesky(A).T
         scipys = lsq_linear(root, np.linalg.solve(root.T, b), (low, high)).x
         mine, theirs = (0.5 * z @ A @ z - b @ z for z in (x, scipys))
-        assert ((low <= x) & (x <= high)).all() and mine <= theirs + 1e-9 * abs(theirs)
+        assert ((low - 1e-12 <= x) & (x <= high + 1e-12)).all() and mine <= theirs + 1e-9 * abs(theirs)
+
+
+def test_windows_may_begin_each_from_its_own_place_and_end_early():
+    """Each window from where it begins is what all of them from there give of it, and a begin is that of the whole."""
+    plant = build(model(), [plant_run("a", 0, 6.0, {}, 1)])[0].plant
+    windows = plant.windows(1.5)
+    count = len(windows.window)
+    starts = np.random.default_rng(1).normal(size=(count, 2)) * (0.02, 0.3)
+    own = plant.simulate(plant.base()[None], windows, starts[None])
+    for k, start in enumerate(starts):
+        mine = windows.sample_window == k
+        for got, expected in zip(own, plant.simulate(plant.base()[None], windows, start[None]), strict=True):
+            np.testing.assert_array_equal(got[0, mine], expected[0, mine])
+    counts = np.arange(5, 5 + 7 * count, 7)
+    head = windows.heads(counts)
+    assert np.bincount(head.sample_window).tolist() == counts.tolist()
+    keep = np.concatenate([np.flatnonzero(windows.sample_window == k)[: counts[k]] for k in range(count)])
+    for got, expected in zip(plant.simulate(plant.base()[None], head, starts[None]), own, strict=True):
+        np.testing.assert_array_equal(got[0], expected[0, keep])
+
+
+def test_finer_steps_lie_on_the_lines_between():
+    plant = build(model(), [plant_run("a", 0, 2.0, {}, 1)])[0].plant
+    fine = plant.refined(3)
+    np.testing.assert_array_equal(fine.series[::3], plant.series)
+    np.testing.assert_allclose(fine.series[1::3], plant.series[:-1] + np.diff(plant.series, axis=0) / 3, atol=1e-12)

@@ -25,7 +25,7 @@ KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 # guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
 # (two inertias 0.33) and a GPU 5 us (14), whose thousands of threads are no use to a fit that asks for a hundred
-FEW = 32
+FEW = 16
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
 _VERSIONS = itertools.count()  # of plants: what one simulated is not what another would
@@ -148,6 +148,25 @@ class Windows:
     def n(self) -> int:
         return len(self.sample_row)
 
+    def heads(self, counts: np.ndarray) -> Windows:
+        """Of each window the begin, up to its sample of this number [W], 1 at least."""
+        place = np.arange(self.n) - self.window[self.sample_window, 3]
+        keep = place < counts[self.sample_window]
+        window = self.window.copy()
+        window[:, 4] = np.bincount(self.sample_window[keep], minlength=len(window))
+        window[:, 3] = np.r_[0, np.cumsum(window[:-1, 4])]
+        step = self.sample_step[keep]
+        window[:, 1] = step[window[:, 3] + window[:, 4] - 1] + 1
+        return Windows(
+            window,
+            self.window_t,
+            step,
+            self.sample_part[keep],
+            self.sample_window[keep],
+            self.sample_row[keep],
+            self.run,
+        )
+
 
 class JointPlant:
     """One joint over all runs: measurements in a row, series on the integration grid, and the simulation.
@@ -241,14 +260,16 @@ class JointPlant:
         """The same joint in steps `times` as short, the series between their samples on straight lines."""
         out = copy.copy(self)
         out.dt, out._d, out._version = self.dt / times, {}, next(_VERSIONS)
-        parts, out._grid = [], [0]
-        for a, b in zip(self._grid[:-1], self._grid[1:], strict=True):
-            at = np.arange((b - a - 1) * times + 1)
-            low = np.minimum(at // times, b - a - 2)
-            share = (at / times - low)[:, None]
-            parts.append((1 - share) * self.series[a + low] + share * self.series[a + low + 1])
-            out._grid.append(out._grid[-1] + len(at))
-        out.series = np.concatenate(parts)
+        sizes = [(b - a - 1) * times + 1 for a, b in zip(self._grid[:-1], self._grid[1:], strict=True)]
+        out._grid = [0, *(int(end) for end in np.cumsum(sizes))]
+        out.series = np.empty((out._grid[-1], len(SERIES)))
+        for run in range(len(sizes)):
+            coarse, fine = self.series[self.grid(run)], out.series[out.grid(run)]
+            fine[::times] = coarse
+            for k in range(1, times):
+                between = fine[k::times]
+                np.multiply(coarse[:-1], 1 - k / times, out=between)
+                between += k / times * coarse[1:]
         return out
 
     def grid(self, run: int) -> slice:
@@ -331,14 +352,14 @@ class JointPlant:
                  open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
 
-        params [H, R, C]: plant parameters by run; inits [H, 2]: added to the initial position and velocity.
+        params [H, R, C]: plant parameters by run; inits [H, 2], or [H, W, 2] by window: added to the initial position
+        and velocity.
         """
-        if inits is None:
-            inits = np.zeros((len(params), 2))
+        inits = np.zeros((len(params), 1, 2)) if inits is None else np.asarray(inits, float).reshape(len(params), -1, 2)
         # what an answer depends on beside the windows and what does not change of a plant
         common = f"{self._version} {open_stage}".encode()
         told = params[:, np.unique(windows.run)]
-        keys = [common + p.tobytes() + i.tobytes() for p, i in zip(told, np.asarray(inits, float), strict=True)]
+        keys = [common + p.tobytes() + i.tobytes() for p, i in zip(told, inits, strict=True)]
         return windows.known.answers(
             keys, lambda which: self._simulated(params[which], windows, inits[which], open_stage)
         )
@@ -346,7 +367,7 @@ class JointPlant:
     def _simulated(
         self, params: np.ndarray, windows: Windows, inits: np.ndarray, open_stage: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`simulate`, whatever is known."""
+        """`simulate`, whatever is known; inits [H, 1 or W, 2]."""
         H, n = len(params), windows.n
         q, torque = np.empty((H, n)), np.empty((H, n))
         # one launch a set of runs that shares its parameters: a guess is a row, so rows are (guess, distinct run)
@@ -357,22 +378,24 @@ class JointPlant:
         consts[pk.C_OPEN] = open_stage
         if self._on_cpu(H * len(windows.window)):
             for group in groups.values():
-                keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
+                pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
                 shared = (_up(oq, copy=False), _up(ot, copy=False))
-                self._split(H, steps, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *shared))
+                guesses = (_up(params[:, group[0]]), _up(_of(inits, pick)), _up(consts))
+                self._split(H, steps, recorded(*guesses, *rest, *shared))
                 q[:, keep], torque[:, keep] = oq, ot
             return q, torque
         with _GPU:
             mine = lane(self.device)
             with wp.ScopedStream(mine.stream, sync_enter=False):
                 host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
-                moves, constants, *guesses = mine.up(
-                    [inits, consts, *(params[:, group[0]] for group in groups.values())]
-                )
+                inputs = [self._inputs(windows, tuple(group), self.device) for group in groups.values()]
+                rows = [params[:, group[0]] for group in groups.values()]
+                constants, *sent = mine.up([consts, *rows, *(_of(inits, pick) for pick, *_ in inputs)])
                 at, parts = 0, []
-                for group, guess in zip(groups.values(), guesses, strict=True):
-                    keep, steps, rest = self._inputs(windows, tuple(group), self.device)
+                for guess, moves, (_, keep, steps, rest) in zip(
+                    sent[: len(rows)], sent[len(rows) :], inputs, strict=True
+                ):
                     size = H * len(keep)
                     mine_q, mine_t = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
                     given = recorded(guess, moves, constants, *rest, mine_q, mine_t)
@@ -399,9 +422,9 @@ class JointPlant:
 
     def _inputs(
         self, windows: Windows, group: tuple[int, ...], device: str
-    ) -> tuple[np.ndarray, np.ndarray, list[wp.array]]:
-        """(samples of the windows that are of these runs, steps of each window, the kernel's arrays of them), made once
-        a device."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[wp.array]]:
+        """(the windows that are of these runs, their samples, steps of each, the kernel's arrays of them), made once a
+        device."""
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
@@ -416,6 +439,7 @@ class JointPlant:
             w = windows.window[pick].copy()
             w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
             windows.device[key] = (
+                pick,
                 np.flatnonzero(keep),
                 w[:, 1],
                 [
@@ -425,8 +449,8 @@ class JointPlant:
                     _up(windows.sample_part[keep], device=device),
                 ],
             )
-        keep, steps, arrays = windows.device[key]
-        return keep, steps, [*self._d[device], *arrays]
+        pick, keep, steps, arrays = windows.device[key]
+        return pick, keep, steps, [*self._d[device], *arrays]
 
     def _split(self, H: int, steps: np.ndarray, given: pk.Recorded) -> None:
         """H guesses in windows of `steps` [W] on the CPU, in parts side by side."""
@@ -446,6 +470,11 @@ class JointPlant:
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""
         return np.stack(self.nominal)
+
+
+def _of(inits: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """[H, 1 or W', 2] of where each guess begins [H, 1 or W, 2], that of these windows [W']."""
+    return inits if inits.shape[1] == 1 else inits[:, windows]
 
 
 def _up(x: np.ndarray, dtype: Any = wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:

@@ -43,17 +43,12 @@ def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray
     if not moving.any():
         return case.plant.simulate(plants, windows)
     size = np.array([START_NOISE * sigma, START_SPEED * case.scales.speed])
-    q, tau = case.plant.simulate(
-        np.repeat(plants, 3, 0), windows, np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]]])
-    )
-    slope, measured, which = q[1:] - q[0], case.plant.q[windows.sample_row], np.flatnonzero(moving)
-    starts = []
-    for k in which:
-        early = (window == window[first[k]]) & (t < t[first[k]] + FIRST)
+    head = windows.heads(np.bincount(window[t < t[first][window] + FIRST], minlength=len(first)))
+    q, _ = case.plant.simulate(np.repeat(plants, 3, 0), head, np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]]]))
+    slope, measured = q[1:] - q[0], case.plant.q[head.sample_row]
+    starts = np.zeros((1, len(first), 2))
+    for k in np.flatnonzero(moving):
+        early = head.sample_window == k
         A = np.concatenate([slope[:, early].T / sigma, np.eye(2)])
-        starts.append(size * np.linalg.lstsq(A, np.r_[(measured - q[0])[early] / sigma, 0.0, 0.0], rcond=None)[0])
-    again = case.plant.simulate(np.repeat(plants, len(which), 0), windows, np.array(starts))
-    for i, k in enumerate(which):
-        mine = window == window[first[k]]
-        q[0, mine], tau[0, mine] = again[0][i, mine], again[1][i, mine]
-    return q[:1], tau[:1]
+        starts[0, k] = size * np.linalg.lstsq(A, np.r_[(measured - q[0])[early] / sigma, 0.0, 0.0], rcond=None)[0]
+    return case.plant.simulate(plants, windows, starts)

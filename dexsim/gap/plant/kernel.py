@@ -125,7 +125,7 @@ class Recorded:
     """What the kernel takes: G grid points, W windows, H guesses, n samples. Units as in `columns.py`."""
 
     params: wp.array2d(dtype=f64)  # [H, C]
-    inits: wp.array2d(dtype=f64)  # [H, 2] added to the initial position and velocity
+    inits: wp.array3d(dtype=f64)  # [H, 1 or W, 2] added to the initial position and velocity
     consts: wp.array(dtype=f64)
     series: wp.array2d(dtype=f64)  # [G, E]
     cmd_t: wp.array(dtype=f64)
@@ -836,30 +836,37 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
 
 
 @wp.func
-def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
-    """The joint at the begin of a window: where it was measured."""
+def moved(c: Recorded, h: int, w: int, x: State):
+    """The joint from where this guess begins in window w: all windows from the same, or each from its own."""
+    of = wp.min(w, c.inits.shape[1] - 1)
+    x.q += c.inits[h, of, 0]
+    x.v += c.inits[h, of, 1]
+    return x
+
+
+@wp.func
+def begun(c: Recorded, h: int, w: int, g: int, warm: int, p: Guess):
+    """The joint at the begin of window w: where it was measured."""
     x = State()
     x.fresh = f64(1.0)
     x.q = position(c.params[h], c.series[g, XQ], x, p)
     x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
     if warm == 0:
-        x.q += c.inits[h, 0]
-        x.v += c.inits[h, 1]
+        x = moved(c, h, w, x)
     x.qm = x.q
     x.vm = x.v
     return x
 
 
 @wp.func
-def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
-    """The joint on its recorded motion, while the drive's own state settles; last: it is let go now."""
+def held(c: Recorded, h: int, w: int, g: int, last: bool, x: State, p: Guess):
+    """The joint on its recorded motion in window w, while the drive's own state settles; last: it is let go now."""
     error = encoder(c.params[h], x.q, x.memory, x.fresh != f64(0.0))
     m = unread(c.series[g, XQ], p) - error[0] - error[1]
     x.q = (m - p.offset) / p.scale
     x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
     if last:
-        x.q += c.inits[h, 0]
-        x.v += c.inits[h, 1]
+        x = moved(c, h, w, x)
     if not p.two:
         x.qm = x.q
         x.vm = x.v
@@ -902,7 +909,7 @@ def plant_kernel() -> wp.Kernel:
         k = c.window[w, 7]
         t = c.window_t[w]
         p = guess(c, h, dt)
-        x = begun(c, h, g0, warm, p)
+        x = begun(c, h, w, g0, warm, p)
         lead = int(0)
         if warm == 0:
             lead = asked_before(c, h, k, c_end, t, dt, x, p)
@@ -915,14 +922,14 @@ def plant_kernel() -> wp.Kernel:
             if i <= 0 and lead > 0:  # where it is measured first, only the drive's torque goes on
                 torque = x.last
                 stage = x.stage
-                x = begun(c, h, g0, warm, p)
+                x = begun(c, h, w, g0, warm, p)
                 if j > 0:
                     x.last = torque
                     x.stage = stage
                     x.fresh = f64(2.0)
                 after = shown(c.params[h], x.q, x, p)[0]
             if i >= 0 and i <= warm and warm > 0:
-                x = held(c, h, g, i == warm, x, p)
+                x = held(c, h, w, g, i == warm, x, p)
                 if i == 0:
                     x.qm = x.q
                     x.vm = x.v

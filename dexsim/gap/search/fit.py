@@ -17,7 +17,6 @@ from dexsim.gap.rules import BELIEF
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
-ACTIVE_SETS = 20  # that a bounded least squares tries
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
@@ -458,23 +457,10 @@ def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray)
 
 
 def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """[F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which bounds hold
-    (a primal-dual active set, M. Hintermueller et al., SIAM J. Optim. 13, 2002), a solution or two where SciPy's
-    interior steps take a dozen; by those where the bounds that hold do not settle."""
-    below = above = np.zeros(len(b), bool)
-    for _ in range(ACTIVE_SETS):
-        x = np.where(below, low, np.where(above, high, 0.0))
-        free = np.flatnonzero(~(below | above))
-        if len(free):
-            x[free] = np.linalg.solve(A[np.ix_(free, free)], b[free] - A[free] @ x)
-        pull = b - A @ x
-        pull[free] = 0.0
-        now_below, now_above = (x < low) | (below & (pull < 0)), (x > high) | (above & (pull > 0))
-        if (now_below == below).all() and (now_above == above).all():
-            return x
-        below, above = now_below, now_above
+    """[F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which bounds hold,
+    in a tenth of the time of SciPy's interior steps."""
     root = np.linalg.cholesky(A).T
-    return lsq_linear(root, np.linalg.solve(root.T, b), (low, high)).x
+    return lsq_linear(root, np.linalg.solve(root.T, b), (low, high), method="bvls").x
 
 
 def _solved(M: np.ndarray, b: np.ndarray) -> np.ndarray:
