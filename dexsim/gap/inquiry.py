@@ -320,7 +320,8 @@ def to_runs(w: Inquiry) -> None:
         w.runs.append(run)
     readable = w.readable
     sensors = {e.id: e.experiment for e in CATALOGUE if e.effort_only}
-    w.channel = inputs.channel_findings(readable, w.m.joints, sensors)
+    openly = channels.driven_openly(w.runs)
+    w.channel = inputs.channel_findings(readable, w.m.joints, sensors, openly)
     w.notes += [
         f"{r.path.name}: {f.text}"
         for r in readable
@@ -339,7 +340,7 @@ def to_runs(w: Inquiry) -> None:
             f"in the model but in no recording: {', '.join(absent)}; nothing can be said of "
             f"{'it' if len(absent) == 1 else 'them'}, taken to stand at rest"
         )
-    wrong, out, blind = channels.inspect(w.runs, w.m.spec.compile(), channels.spoiled(readable))
+    wrong, out, blind = channels.inspect(w.runs, w.m.spec.compile(), channels.spoiled(readable, openly))
     w.channel = channels.secondary(w.channel + wrong)
     before = {id(r): k for k, r in enumerate(w.runs)}
     w.runs = channels.drop(w.runs, out, w.notes, w.m.spec.compile(), w.held)
