@@ -3,6 +3,8 @@ nobody is said to push it, and its readings are not called stale."""
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +16,7 @@ from dexsim.gap.judge import conclude, confidence
 from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
+from dexsim.gap.rules import SEARCH
 from dexsim.gap.search import logged_torque, ringing
 from dexsim.gap.search.search import JointSearch
 from dexsim.recording.audit_values import repeats
@@ -44,6 +47,19 @@ def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
     assert at["compliance.softness"] == pytest.approx(SOFT["softness"], rel=0.3)
     assert rung.of(found.best).sum() < 0.5 * rung.of(nothing.none).sum()
     assert ringing.shown(soft, found, [2], None) and not ringing.shown(soft, nothing, [2], None)
+
+
+def test_nothing_makes_a_joint_ring_that_has_no_loop(soft):
+    """What is fed back makes a joint ring: of one whose loop gives hardly any torque nothing is asked."""
+    nothing = soft.without_search()
+    s = soft.case.scales
+    for share, asked in ((0.5, False), (2.0, True)):
+        bare = copy.copy(soft)
+        bare.case = replace(soft.case, scales=replace(s, stiffness=share * SEARCH.doubt * s.tau / s.span))
+        assert ringing.without_loop(bare.case) != asked
+        if not asked:
+            assert ringing.answered(bare, nothing) is nothing
+    assert not ringing.without_loop(soft.case)
 
 
 def test_play_rings_on_where_it_was_struck():

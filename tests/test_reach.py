@@ -8,7 +8,7 @@ import pytest
 import recordings
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.read import Run, channels
+from dexsim.gap.read import Run, channels, inputs
 from dexsim.recording.audit import audit as audited
 from dexsim.recording.schema import COMMANDS, STATES
 
@@ -115,3 +115,19 @@ def test_what_lies_far_outside_the_models_range_is_left_out(change, topics):
     far = [f for f in found if "the model allows" in f["regime"]]
     assert [f["where"]["topics"] for f in far] == ([topics] if topics else [])
     assert (("x.mcap", "a") in out) == bool(topics)
+
+
+@pytest.mark.parametrize("kp, is_spoiled", [(3e-4, False), (2.0, True)])
+def test_far_targets_of_a_drive_without_a_loop_spoil_nothing(kp, is_spoiled):
+    """The audit knows no gains: through a small one targets far off are a torque that the drive can give."""
+    r = recordings.signal()
+    r.commands.value = 800.0 * np.sign(r.commands.value)
+    with_findings(r, said(r, COMMANDS))
+    assert {f.joint for f in r.findings} == {"a", "b"}
+    servo = ServoTable.from_dict({"joints": {"*": {"kp": kp, "kd": 0.0, "torque_limit": 1.0}}})
+    run = Run(r.path.name, r.joints, r.commands.t, r.commands.value, r.states.position.t, r.states.position.value,
+              servo, r.gravity)  # fmt: skip
+    openly = channels.driven_openly([run])
+    assert bool(channels.spoiled([r], openly)) == is_spoiled
+    assert bool(inputs.channel_findings([r], r.joints, {}, openly)) == is_spoiled
+    assert channels.spoiled([r])  # where nothing is known of the drive

@@ -59,6 +59,18 @@ def test_a_fingers_run_becomes_clips_of_whole_cycles_with_the_duty_as_command(tm
         convert_ergocub.convert(tmp_path, tmp_path / "out2")
 
 
+def test_a_finger_is_driven_by_the_duty_that_was_read_back(tmp_path):
+    finger(tmp_path, "late")
+    raw = dict(np.load(tmp_path / "late.npz"))
+    raw["pwm_read"] = np.where(raw["theta_deg"] <= 0, 0.0, raw["pwm_set"])  # cut at the open stop
+    np.savez(tmp_path / "late.npz", **raw)
+    _, duty, _, clips = convert_ergocub.cycles(tmp_path / "late.npz")
+    assert np.array_equal(duty, -raw["pwm_read"] / 100) and (duty == 0).any() and len(clips) >= 2
+    raw["pwm_read"] = np.zeros_like(duty)  # nothing is read back: what was set is all there is
+    np.savez(tmp_path / "late.npz", **raw)
+    assert np.array_equal(convert_ergocub.cycles(tmp_path / "late.npz")[1], -raw["pwm_set"] / 100)
+
+
 def test_stretches_in_which_a_fingers_motor_was_off_are_left_out():
     t = np.arange(0.0, 10.0, 0.001)
     set_ = np.where(t % 1 < 0.5, 30.0, -30.0)

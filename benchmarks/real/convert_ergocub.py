@@ -13,6 +13,10 @@ of the clips; of the first run that was tried, middle1, that was one clip at a d
 For 10 to 34 s at the begin of four of the middle finger's runs the motor was off: nothing was read back of the duty
 that was set, and the controller gave none. Those stretches are left out before clips are cut and counted; that was seen
 in the duties alone, when the four runs could not be explained.
+
+What drives the finger is the duty that was read back, not the one that was set: they agree within 10 ms but where the
+drive gave none though one was set (at the open stop, 43 % of `output`; about reversals) or got a reversal up to 0.5 s
+after the host logged it (`middle1`, `rinky`, `rinky3`). One of those was met in a clip of `rinky` that is kept out.
 """
 
 from __future__ import annotations
@@ -85,8 +89,8 @@ def held_out(finger: str) -> tuple[str, ...]:
 
 
 def convert(data: Path, out: Path) -> Ergocub:
-    """Converts all runs. The duty that was set is a command (as a target far off, through a gain that makes a duty of
-    it); what was read back is the duty topic."""
+    """Converts all runs. The duty that was given is a command (as a target far off, through a gain that makes a duty of
+    it), and the duty topic."""
     names = [n for runs in FINGERS.values() for n in runs]
     absent = [n for n in names if not (data / f"{n}.npz").is_file()]
     if absent:
@@ -98,24 +102,22 @@ def convert(data: Path, out: Path) -> Ergocub:
     model.write_text(MODEL, encoding="utf-8")
     made = {}
     for name in names:
-        raw = np.load(data / f"{name}.npz")
-        read = CLOSES * raw["pwm_read"] / 100.0
-        t, set_, q, clips = cycles(data / f"{name}.npz")
+        t, duty, q, clips = cycles(data / f"{name}.npz")
         made[name] = []
         for k, (a, b) in enumerate(clips):
             # what was asked for before still acts when the clip begins
             early = int(np.searchsorted(t, t[a] - BEFORE))
-            changed = early + np.flatnonzero(np.r_[True, np.diff(set_[early:b]) != 0])
+            changed = early + np.flatnonzero(np.r_[True, np.diff(duty[early:b]) != 0])
             keep = slice(a, b, EVERY)
             made[name].append(
                 save(
                     out / f"{name}_{k:02d}.mcap",
                     ("joint",),
                     t[changed],
-                    (set_ / PER_DUTY)[changed, None],
+                    (duty / PER_DUTY)[changed, None],
                     t[keep],
                     q[keep, None],
-                    duty=read[keep, None] if np.ptp(read) > 0 else None,
+                    duty=duty[keep, None] if np.ptp(duty) > 0 else None,
                     robot="ergocub_finger",
                     gravity="0 0 0",
                 )
@@ -124,17 +126,19 @@ def convert(data: Path, out: Path) -> Ergocub:
 
 
 def cycles(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Times [s], duty (positive towards larger angles, 0 where the motor was off), angles [rad] [n] of a run, and the
-    first and last samples (exclusive) of its clips."""
+    """Times [s], duty as given (positive towards larger angles, 0 where the motor was off), angles [rad] [n] of a run,
+    and the first and last samples (exclusive) of its clips."""
     raw = np.load(path)
     t, q = raw["t"].astype(float), np.radians(raw["theta_deg"].astype(float))
-    duty = CLOSES * raw["pwm_set"].astype(float) / 100.0
+    duty, given = (CLOSES * raw[k].astype(float) / 100.0 for k in ("pwm_set", "pwm_read"))
+    if np.ptp(given) == 0:  # nothing was read back
+        given = duty
     on = driven(t, raw["pwm_set"], raw["pwm_read"], raw["pid_out"])
     clips = [(a + i, a + k) for a, b in on for i, k in _clips(t[a:b], duty[a:b], q[a:b])]
     ran = np.zeros(len(t), bool)
     for a, b in on:
         ran[a:b] = True
-    return t, np.where(ran, duty, 0.0), q, [(a, b) for a, b in clips if t[b - 1] - t[a] >= 0.9 * CLIP]
+    return t, np.where(ran, given, 0.0), q, [(a, b) for a, b in clips if t[b - 1] - t[a] >= 0.9 * CLIP]
 
 
 def driven(t: np.ndarray, set_: np.ndarray, read: np.ndarray, given: np.ndarray) -> list[tuple[int, int]]:

@@ -320,7 +320,8 @@ def to_runs(w: Inquiry) -> None:
         w.runs.append(run)
     readable = w.readable
     sensors = {e.id: e.experiment for e in CATALOGUE if e.effort_only}
-    w.channel = inputs.channel_findings(readable, w.m.joints, sensors)
+    openly = channels.driven_openly(w.runs)
+    w.channel = inputs.channel_findings(readable, w.m.joints, sensors, openly)
     w.notes += [
         f"{r.path.name}: {f.text}"
         for r in readable
@@ -340,7 +341,7 @@ def to_runs(w: Inquiry) -> None:
             f"{'it' if len(absent) == 1 else 'them'}, taken to stand at rest"
         )
     model = w.m.spec.compile()
-    wrong, out, blind = channels.inspect(w.runs, model, channels.spoiled(readable))
+    wrong, out, blind = channels.inspect(w.runs, model, channels.spoiled(readable, openly))
     w.channel = channels.secondary(w.channel + wrong)
     before = {id(r): k for k, r in enumerate(w.runs)}
     w.runs = channels.drop(w.runs, out, w.notes, model, w.held)

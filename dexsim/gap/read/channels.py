@@ -15,7 +15,7 @@ before.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +27,7 @@ from dexsim.actuator.columns import INDEX
 from dexsim.gap.read import WRONG_SIGNAL, Run
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording.audit_values import repeats
-from dexsim.recording.schema import COMMANDS, STATES, Recording
+from dexsim.recording.schema import COMMANDS, STATES, Finding, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 PAUSE = 1.0  # s without a sample, over which no lag is measured
@@ -55,8 +55,19 @@ def finding(
     }
 
 
-def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
-    """(recording, joint) whose position or target the audit found wrong -> why."""
+def driven_openly(runs: list[Run]) -> set[tuple[str, str]]:
+    """(run, joint) whose drive can give what its gain makes of every target, which may lie anywhere for that."""
+    return {(run.name, joint) for run in runs for j, joint in enumerate(run.joints) if _within_drive(run, j)}
+
+
+def far_target(f: Finding, name: str, openly: Set[tuple[str, str]]) -> bool:
+    """Whether what the audit found in the recording `name` is that targets lie far off on a joint that is driven so:
+    it knows no gains."""
+    return f.kind == "unit" and f.topic == COMMANDS and (name, f.joint) in openly
+
+
+def spoiled(recordings: list[Recording], openly: Set[tuple[str, str]] = frozenset()) -> dict[tuple[str, str], str]:
+    """(recording, joint) whose position or target the audit found wrong -> why. openly: of `driven_openly`."""
     out: dict[tuple[str, str], str] = {}
     for r in recordings:
         for f in r.findings:
@@ -65,6 +76,7 @@ def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
                 and f.kind in SPOILS
                 and f.joint
                 and f.text.split(" ")[0] in ("position", "command")
+                and not far_target(f, r.path.name, openly)
             ):
                 out.setdefault((r.path.name, f.joint), f"{f.kind}: {f.text}")
     return out

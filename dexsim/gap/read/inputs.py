@@ -3,7 +3,7 @@ not in free air found."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap.read import WRONG_SIGNAL, Run
+from dexsim.gap.read import WRONG_SIGNAL, Run, channels
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
@@ -317,14 +317,17 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
 
 
 def channel_findings(
-    recordings: list[Recording], joints: Sequence[str], sensors: dict[str, str]
+    recordings: list[Recording],
+    joints: Sequence[str],
+    sensors: dict[str, str],
+    openly: Set[tuple[str, str]] = frozenset(),
 ) -> list[dict[str, Any]]:
     """Findings of signals that are not what they say, as `diagnosis.json` has them. sensors: ids of the effects that
-    make the same of an effort's sign, each with the experiment that shows it."""
+    make the same of an effort's sign, each with the experiment that shows it; openly: of `channels.driven_openly`."""
     out: dict[tuple, dict[str, Any]] = {}
     for r in recordings:
         for f in r.findings:
-            if f.kind not in WRONG or f.severity != "error":
+            if f.kind not in WRONG or f.severity != "error" or channels.far_target(f, r.path.name, openly):
                 continue
             # dry friction may hold it: `channels.inspect` tells beside the others
             if f.kind == "stuck" and f.text.startswith("position"):

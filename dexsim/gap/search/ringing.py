@@ -23,6 +23,7 @@ import numpy as np
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.plant.batch import Windows
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param, expand, neutral_of
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, subset, thin
@@ -200,11 +201,18 @@ def _starts(member: Member) -> list[tuple[float, ...]]:
     return list(dict.fromkeys((*s[:i], ring, *s[i + 1 :]) for s in starts for ring in RINGS))
 
 
+def without_loop(case: Case) -> bool:
+    """Whether a joint's loop gives next to nothing of the torque that moves it (a duty or a torque is commanded,
+    through a gain that stands for none): only what is fed back makes a joint ring by itself."""
+    s = case.scales
+    return s.stiffness * s.span < SEARCH.doubt * s.tau
+
+
 def answered(search: JointSearch, found: Outcome) -> Outcome:
     """What the search of a joint found; where it rings by itself and that is hardly followed, the effect that makes it
     ring as measured in the place of what was found, if any does by at least `SEARCH.plainly` more."""
     followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
-    if followed or search.deadline.over():
+    if followed or without_loop(search.case) or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by
     swings = Ringing(search, found.none)
     if swings.loud.sum() < SEARCH.shaking:
