@@ -59,16 +59,22 @@ def test_a_fingers_run_becomes_clips_of_whole_cycles_with_the_duty_as_command(tm
         convert_ergocub.convert(tmp_path, tmp_path / "out2")
 
 
-def test_a_finger_is_driven_by_the_duty_that_was_read_back(tmp_path):
-    finger(tmp_path, "late")
-    raw = dict(np.load(tmp_path / "late.npz"))
-    raw["pwm_read"] = np.where(raw["theta_deg"] <= 0, 0.0, raw["pwm_set"])  # cut at the open stop
-    np.savez(tmp_path / "late.npz", **raw)
-    _, duty, _, clips = convert_ergocub.cycles(tmp_path / "late.npz")
-    assert np.array_equal(duty, -raw["pwm_read"] / 100) and (duty == 0).any() and len(clips) >= 2
-    raw["pwm_read"] = np.zeros_like(duty)  # nothing is read back: what was set is all there is
-    np.savez(tmp_path / "late.npz", **raw)
-    assert np.array_equal(convert_ergocub.cycles(tmp_path / "late.npz")[1], -raw["pwm_set"] / 100)
+def test_a_finger_is_driven_by_what_was_read_back_where_that_is_not_what_was_set(tmp_path):
+    t = np.arange(0.0, 8.0, 1e-3)
+    set_ = np.where(t % 1 < 0.5, 0.5, -0.5)
+    read = np.r_[np.full(10, 0.5), set_[:-10]]  # within 10 ms
+    assert not convert_ergocub.refused(t, set_, read).any()
+    assert not convert_ergocub.refused(t, set_, np.zeros_like(t)).any()  # nothing is read back: what was set is all
+    late, none = (t >= 2.5) & (t < 2.7), (t >= 5.0) & (t < 6.2)
+    read = np.where(none, 0.0, np.where(late, 0.5, read))
+    refused = convert_ergocub.refused(t, set_, read)
+    assert refused[late].all() and refused[none].mean() > 0.99 and refused[~late & ~none].mean() < 0.01
+    finger(tmp_path, "stopped")
+    raw = dict(np.load(tmp_path / "stopped.npz"))
+    raw["pwm_read"][1000:1300] = 0.0
+    np.savez(tmp_path / "stopped.npz", **raw)
+    duty = convert_ergocub.cycles(tmp_path / "stopped.npz")[1]
+    assert (duty[1000:1300] == 0).all() and (duty[1300:] == -raw["pwm_set"][1300:] / 100).all()
 
 
 def test_stretches_in_which_a_fingers_motor_was_off_are_left_out():
