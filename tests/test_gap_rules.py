@@ -700,7 +700,8 @@ def test_an_effect_must_plainly_tell_how_a_joint_rings():
     gives = SimpleNamespace(id="gives", rings=True, variants=lambda _: [Variant((p,), ((0.1,),))])
     fit = SimpleNamespace(loss=100.0)
     search = SimpleNamespace(
-        deadline=Deadline(), allowed=None, case=SimpleNamespace(scales=None), rng=np.random.default_rng(0),
+        deadline=Deadline(), allowed=None, rng=np.random.default_rng(0),
+        case=SimpleNamespace(scales=SimpleNamespace(stiffness=1.0, span=1.0, tau=1.0)),
         _narrow=lambda _, v: v, _fix=lambda _: nullcontext(), fitter=SimpleNamespace(fit=lambda *_, **__: fit),
     )  # fmt: skip
     nothing = SimpleNamespace(joint="j", none=Trial((), fit), best=Trial((), fit), scanned=[])

@@ -16,8 +16,8 @@ in the duties alone, when the four runs could not be explained.
 
 What drives the finger is the duty that was set. It is read back within 10 ms, but not everywhere: at the open stop the
 drive gave none though one was set (42 % of `output`), and one reversal each of `rinky` and `middle1` reached it 0.06 to
-0.2 s after the host had logged it. There, where the two differ for `SETTLES` s, what was read back is what drove it. The
-rule is one of the duties alone; that there was something to look for was seen in a clip of `rinky` that is kept out.
+0.2 s after the host had logged it. There, where the two differ for `SETTLES` s, what was read back drove it. The rule
+is one of the duties alone; that there was something to look for was seen in a clip of `rinky` that is kept out.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ EVERY = 4  # of some 930 samples a second: the finger turns by less than half a 
 CLIP = 2.0  # s
 BEFORE = 1.0  # s of duty before a clip
 OFF = 0.1  # s without duty where one was set: longer than any that was read late
-UNLIKE, SETTLES = 0.05, 0.06  # of the full duty, s: what is read back differs by that for so long where it was not given
+UNLIKE, SETTLES = 0.05, 0.06  # of the full duty, s: by so much, for so long, what is read back is not what was set
 KEPT = 4  # every so many of a run's clips is kept out
 CLOSES = -1.0  # sign of the duty that turns the joint to larger angles (0 is the open stop)
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
