@@ -197,8 +197,9 @@ def model_xml(b: dict, true: dict | None = None) -> str:
 
 
 def servo(b: dict) -> dict:
-    """The believed servo table."""
-    return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO}},
+    """The believed servo table. How the simulator's drives brake is not left to be guessed: nothing of it is hidden."""
+    brakes = {} if b["voltage"] else {"braking_slope": 1.0}
+    return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO} | brakes},
             "loop_rate": RATE,
             "loop_encoder": "motor" if b["motor_loop"] else "joint", "position_encoder": "joint"}  # fmt: skip
 

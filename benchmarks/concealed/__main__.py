@@ -1,7 +1,7 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
     python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [laws=two] [out=out/concealed] [jobs=1]
-    [limit=900] [budget=0] [until=0] [first=0] [hand=xhand] [mirror=false]
+    [limit=900] [budget=0] [until=0] [first=0] [hand=xhand] [mirror=false] [braking=unsaid]
     python -m benchmarks.concealed ci=true                    # six cases of one to three joints
     python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight
 
@@ -11,9 +11,10 @@ and large are (a folder, or a hand that comes with dexsim; its mirror image); la
 follows where it has two (`laws.py`), `one` takes the first; limit: seconds a diagnosis may take, handed to it as
 `limit=` (half as much again ends it); budget: seconds after which no further diagnosis is begun, until: after which
 those under way are stopped and left out too (0: none); first: only so many cases of the drawn order, by which a part of
-a set is a fair sample of it (0: all). Resumable: what is finished is not run again. Writes hashes.txt
-before any diagnosis, results.json and table.txt to out=/seed_N (seed_N_one with laws=one, seed_N_NAME of another hand);
-prints the table and one JSON line.
+a set is a fair sample of it (0: all); braking: `said` states in each rig's servo.yaml how its drives brake
+(`braking_slope: 1`), which a tool that knew no other law took for granted; `unsaid` leaves it open. Resumable: what is
+finished is not run again. Writes hashes.txt before any diagnosis, results.json and table.txt to out=/seed_N (seed_N_one
+with laws=one, seed_N_NAME of another hand, seed_N_said with braking=said); prints the table and one JSON line.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_compl
 from multiprocessing import get_context
 from pathlib import Path
 
+import yaml
+
 from benchmarks.concealed import baselines, generate, laws, score
 from benchmarks.foreign import seed_of_sources
 from dexsim.console.ending import guard
@@ -37,7 +40,7 @@ from dexsim.hand import load_hand
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
             "budget": 0, "until": 0, "first": 0, "baselines": 0, "ci": False, "one_joint": False,
-            "hand": "xhand", "mirror": False}
+            "hand": "xhand", "mirror": False, "braking": "unsaid"}
 CI = {"effect": 2, "none": 1, "pair": 1, "outside": 1, "decoy": 1}
 
 
@@ -58,6 +61,10 @@ def parse(argv: list[str]) -> dict:
         elif key == "laws":
             if text not in laws.LAWS:
                 raise UserError(f"laws={text}: must be {' or '.join(laws.LAWS)}")
+            given[key] = text
+        elif key == "braking":
+            if text not in ("said", "unsaid"):
+                raise UserError(f"braking={text}: must be said or unsaid")
             given[key] = text
         elif key == "seed" and text == "source":
             given[key] = seed_of_sources()
@@ -101,7 +108,8 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     start = time.perf_counter()
     files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
     fit, held = files[: -generate.HELD], files[-generate.HELD :]
-    own = [f"model={case / 'rig.xml'}", f"servo={case / 'servo.yaml'}"] if (case / "rig.xml").is_file() else []
+    servo = _with_braking(case, out) if s["braking"] == "said" else case / "servo.yaml"
+    own = [f"model={case / 'rig.xml'}", f"servo={servo}"] if (case / "rig.xml").is_file() else []
     argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]",
             *own, f"out={out}", "next=false", f"limit={s['limit']}"]
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -119,6 +127,19 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
         failed = {"verdict": "failed", "findings": [], "held_out": None, "status": status}
         (out / "diagnosis.json").write_text(json.dumps(failed), encoding="utf-8")
     (out / "seconds").write_text(f"{spent:.1f}", encoding="utf-8")
+
+
+def _with_braking(case: Path, out: Path) -> Path:
+    """A case's servo.yaml that says how its drives brake, beside its answer; the case's own where there is none."""
+    path = case / "servo.yaml"
+    if not path.is_file():
+        return path
+    told = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if told["drive"] == "torque":
+        for columns in told["joints"].values():
+            columns["braking_slope"] = 1.0
+    (out / "servo_said.yaml").write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
+    return out / "servo_said.yaml"
 
 
 def _spent(s: dict, begun: float) -> bool:
@@ -146,6 +167,7 @@ def main(argv: list[str]) -> dict:
     begun = time.perf_counter()
     whose = None if s["hand"] == "xhand" and not s["mirror"] else load_hand(s["hand"], s["mirror"])
     name = f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}{'_' + whose.robot if whose else ''}"
+    name += "_said" if s["braking"] == "said" else ""
     root = Path(s["out"]).expanduser().resolve() / name
     plan = generate.plan(s["mix"], s["seed"], s["one_joint"])
     plan = plan[: s["first"] or len(plan)]
