@@ -364,6 +364,41 @@ MUTATIONS = (
         "",
         "tests/test_gap_rules_signal.py::test_a_lead_is_told_by_a_clear_correlation",
     ),
+    Mutation(
+        "messages of one length are decoded at once though a name in them differs",
+        "dexsim/recording/stacked.py",
+        "if not all((raw[:, part] == first[part]).all() for part in rest):",
+        "if False and not all((raw[:, part] == first[part]).all() for part in rest):",
+        "tests/test_recording_stacked.py::test_any_byte_that_differs_is_a_number_s_or_none_is_decoded_at_once",
+    ),
+    Mutation(
+        "all windows begin where the first one does",
+        "dexsim/gap/plant/kernel.py",
+        "    of = wp.min(w, c.inits.shape[1] - 1)",
+        "    of = 0 * wp.min(w, c.inits.shape[1] - 1)",
+        "tests/test_gap_fits.py::test_windows_may_begin_each_from_its_own_place_and_end_early",
+    ),
+    Mutation(
+        "a long recording is replayed whole",
+        "dexsim/gap/judge/full_model.py",
+        "    most = MOST\n",
+        "    most = math.inf\n",
+        "tests/test_gap_confirm.py::test_no_more_is_replayed_than_is_worth_its_time",
+    ),
+    Mutation(
+        "a joint without a loop is said to ring",
+        "dexsim/gap/search/ringing.py",
+        "return s.stiffness * s.span < SEARCH.doubt * s.tau",
+        "return s.stiffness * s.span < 0.0 * SEARCH.doubt * s.tau",
+        "tests/test_gap_ringing.py::test_nothing_makes_a_joint_ring_that_has_no_loop",
+    ),
+    Mutation(
+        "targets far off are another unit though no loop follows them",
+        "dexsim/gap/read/channels.py",
+        "and not far_target(f, r.path.name, openly)",
+        "and not (False and far_target(f, r.path.name, openly))",
+        "tests/test_reach.py",
+    ),
 )
 
 

@@ -185,6 +185,16 @@ def test_what_the_search_found_the_engine_does_too(effect, label, hidden, x, ser
     assert c.errors["believed"][0] > 3 * engine and engine < max(1.7 * plant, 0.8e-3), c.errors
 
 
+def test_no_more_is_replayed_than_is_worth_its_time(monkeypatch):
+    """Of a long recording its begin, however much time there is."""
+    whole = replayed("lag", "velocity filter", {"speed_lag": 0.03}, [0.03], None, False)
+    monkeypatch.setattr(full_model, "MOST", 1.0)
+    part = replayed("lag", "velocity filter", {"speed_lag": 0.03}, [0.03], None, False)
+    long, short = whole.simulated["joint"], part.simulated["joint"]
+    assert 95 <= len(short) <= 105 < len(long)
+    np.testing.assert_allclose(short, long[: len(short)], atol=1e-9)
+
+
 def test_what_training_cannot_be_given_is_not_confirmed():
     """The motor's servo has no linkage: the search's plant follows what it names, the engine does not, and both are
     said."""
