@@ -16,7 +16,7 @@ import pytest
 
 from tests.soak import __main__ as soak
 from tests.soak import parts
-from tests.soak.watch import Watch, grows, judge, look
+from tests.soak.watch import COLUMNS, Watch, grows, judge, look
 
 ROOT = Path(__file__).parents[1]
 
@@ -108,7 +108,8 @@ def test_a_leak_of_a_piece_of_work_is_found_in_what_the_process_keeps(leak_mib, 
         done=lambda: soak.done(soak.SETTINGS | {"envs": "100"}, tmp_path.parent, tmp_path.name),
     )
     watch.join()
-    found = judge(watch.rows)
+    # since it tells what it keeps: on a busy machine its imports take longer than what is left out as its warming up
+    found = judge([row for row in watch.rows if np.isfinite(row[COLUMNS.index("kept_mib")])])
     assert watch.child.wait() == 0 and ("kept_mib" in grows(found)) == bool(leak_mib), found["kept_mib"]
     assert abs(found["kept_mib"]["per_unit"] - leak_mib) < 0.1, found["kept_mib"]
 

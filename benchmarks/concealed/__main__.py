@@ -108,7 +108,7 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     start = time.perf_counter()
     files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
     fit, held = files[: -generate.HELD], files[-generate.HELD :]
-    servo = _with_braking(case, out) if s["braking"] == "said" else case / "servo.yaml"
+    servo = _with_braking(case, out) if s.get("braking") == "said" else case / "servo.yaml"
     own = [f"model={case / 'rig.xml'}", f"servo={servo}"] if (case / "rig.xml").is_file() else []
     argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]",
             *own, f"out={out}", "next=false", f"limit={s['limit']}"]
