@@ -91,7 +91,7 @@ give_back = runpy.run_path("dexsim/sim/memory.py")["give_back"]  # without the e
 rng, kept = np.random.default_rng(0), []
 for k in range(100):
     pieces = [bytearray(int(n)) for n in rng.integers(1000, 300_000, 60)]  # an environment, of some 9 MB
-    time.sleep(0.01)
+    time.sleep(0.04)
     kept.append(bytearray(int(float(sys.argv[2]) * 2**20)))
     del pieces
     give_back()
