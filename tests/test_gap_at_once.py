@@ -50,6 +50,39 @@ def test_searches_take_turns_at_the_interpreter_and_hand_them_over_while_they_wa
     assert map_joints(["a", "b", "c"], lambda k, tell: k, "cuda") == [0, 1, 2]
 
 
+def test_the_turn_goes_to_the_one_of_whom_most_is_left():
+    turns, order = compute.Turns(1), []
+    turns.take(0.0)
+
+    def wait(rank: float) -> None:
+        turns.take(rank)
+        order.append(rank)
+        turns.give()
+
+    threads = [threading.Thread(target=wait, args=(rank,)) for rank in (-1.0, -5.0, 0.0, -3.0)]
+    for asked, thread in enumerate(threads, 1):
+        thread.start()
+        while len(turns._waiting) < asked:
+            time.sleep(1e-3)
+    turns.give()
+    for thread in threads:
+        thread.join(20)
+    assert order == [-5.0, -3.0, -1.0, 0.0]
+    turns.take(9.0)  # it is free again
+
+
+def test_a_joints_hypotheses_have_their_joints_rank(monkeypatch):
+    ranks, turns = [], compute.Turns(compute.TURNS)
+    monkeypatch.setattr(compute, "_TURNS", turns)
+    monkeypatch.setattr(turns, "take", lambda rank, take=turns.take: ranks.append(rank) or take(rank))
+
+    def joint(k: int, tell) -> list[int]:
+        return list(side_by_side([lambda: 0, lambda: 1], "cuda"))
+
+    assert map_joints(["a", "b"], joint, "cuda", left=[2.0, 7.0]) == [[0, 1], [0, 1]]
+    assert ranks.count(-2.0) == ranks.count(-7.0) and set(ranks) == {-2.0, -7.0}
+
+
 def test_on_a_gpu_all_are_begun_at_once_on_a_cpu_each_when_it_is_asked_for():
     met, seen = threading.Barrier(3, timeout=20), []
 

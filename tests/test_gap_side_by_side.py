@@ -10,7 +10,9 @@ from test_gap_linkage import MODEL
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.case import _since_reversal, moved, refined_cases
-from dexsim.gap.plant.mechanics import cross, on_lines
+from dexsim.gap.plant.columns import SERIES
+from dexsim.gap.plant.lines import on_lines
+from dexsim.gap.plant.mechanics import cross
 from dexsim.gap.read import Run
 
 SERVO = {"drive": "torque", "joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit": 2.0}}}
@@ -67,13 +69,18 @@ def test_each_keeps_the_order_and_hands_errors_on(monkeypatch):
         compute.each(9, bad)
 
 
-def test_lines_between_rows_are_those_of_interp():
+@pytest.mark.parametrize("columns", [7, len(SERIES)])
+def test_lines_between_rows_are_those_of_interp(columns):
     rng = np.random.default_rng(0)
     known = np.sort(np.r_[rng.uniform(0, 5, 700), 1.0, 2.0])
-    x = rng.normal(size=(len(known), 7))
+    x = rng.normal(size=(len(known), columns))
     at = np.sort(np.r_[rng.uniform(-1, 6, 3000), known])  # before, after and exactly on what is known
     expected = np.stack([np.interp(at, known, c) for c in x.T], 1)
-    np.testing.assert_allclose(on_lines(at, known, x), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_array_equal(on_lines(at, known, x), expected)
+    room = np.full((len(at) + 2, columns), -1.0)  # into rows of a larger array, and no farther
+    on_lines(at, known, x, room[1:-1])
+    np.testing.assert_array_equal(room[1:-1], expected)
+    assert (room[[0, -1]] == -1.0).all()
     x[5] = np.nan
     with np.errstate(invalid="ignore"):
         expected = np.stack([np.interp(at, known, c) for c in x.T], 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import os
 import sys
 import threading
@@ -88,19 +90,50 @@ def workers(device: str, jobs: int) -> int:
 # searches that compute in Python at a time. One more would hide what numpy does without the interpreter, and each more
 # makes the others wait for it: a search hands the interpreter over thousands of times a second
 TURNS = 2
-_TURNS = threading.Semaphore(TURNS)
 _MINE = threading.local()
 
 
+class Turns:
+    """The interpreter, for `count` searches at a time. Of those that wait it goes to the one of the lowest rank, and of
+    these to the one that came first: the search that takes longest must not wait for those that are soon done."""
+
+    def __init__(self, count: int):
+        self._free, self._lock, self._came = count, threading.Lock(), itertools.count()
+        self._waiting: list[tuple[float, int, threading.Lock]] = []
+
+    def take(self, rank: float) -> None:
+        """Waits for a turn."""
+        with self._lock:
+            if self._free:
+                self._free -= 1
+                return
+            mine = threading.Lock()
+            mine.acquire()
+            heapq.heappush(self._waiting, (rank, next(self._came), mine))
+        mine.acquire()  # until `give` hands it over
+
+    def give(self) -> None:
+        """Hands a turn on."""
+        with self._lock:
+            if self._waiting:
+                heapq.heappop(self._waiting)[2].release()
+            else:
+                self._free += 1
+
+
+_TURNS = Turns(TURNS)
+
+
 @contextmanager
-def turn() -> Iterator[None]:
+def turn(rank: float) -> Iterator[None]:
     """A search's turn at the interpreter: what runs inside waits until it is one of the few."""
-    with _TURNS:
-        _MINE.held = True
-        try:
-            yield
-        finally:
-            _MINE.held = False
+    _TURNS.take(rank)
+    _MINE.held, _MINE.rank = True, rank
+    try:
+        yield
+    finally:
+        _MINE.held = False
+        _TURNS.give()
 
 
 @contextmanager
@@ -110,11 +143,11 @@ def away() -> Iterator[None]:
         yield
         return
     _MINE.held = False
-    _TURNS.release()
+    _TURNS.give()
     try:
         yield
     finally:
-        _TURNS.acquire()
+        _TURNS.take(_MINE.rank)
         _MINE.held = True
 
 
@@ -126,8 +159,10 @@ def side_by_side(work: Sequence[Callable[[], T]], device: str) -> Iterator[T]:
         yield from (one() for one in work)
         return
 
+    rank = getattr(_MINE, "rank", 0.0)  # of the search that asks
+
     def begun(one: Callable[[], T]) -> T:
-        with turn():
+        with turn(rank):
             return one()
 
     waiting = [_hands().submit(begun, one) for one in work]
@@ -155,9 +190,9 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
 
 
 def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
-             progress: Callable[[float, int, str], None] | None = None) -> list[T]:
+             progress: Callable[[float, int, str], None] | None = None, left: Sequence[float] = ()) -> list[T]:
     """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is
-    worked on)."""
+    worked on). left: what is to be explained of each, where that is known: the more, the sooner it has its turns."""
     parts = [0.0] * len(names)
     lock = threading.Lock()
 
@@ -169,7 +204,7 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None
                     progress(sum(parts), len(names), names[k])
 
         tell(0.0)
-        with turn():
+        with turn(-left[k] if len(left) else 0.0):
             out = work(k, tell)
         tell(1.0)
         return out

@@ -274,14 +274,16 @@ class Drives(Steps):
         if linked and 2 * self.modelling > w.limit.left():
             w.limit.leave_out("the joints' motion is not refined by what the others were fitted to")
             linked = False
+        left: list[float] = []  # by what each leaves as believed
         if linked:
             first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
             begun = [t for t in first if t is not None]
             if len(begun) == len(first):
+                left = [t.fit.loss for t in begun]
                 self._coupled_by(begun)
             w.clock.lap("model along the motion")
         self._test_stages()
-        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
+        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress, left)
         self._search_longer(answers)
         if linked:
             self._search_again(answers)

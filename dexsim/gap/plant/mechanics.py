@@ -13,6 +13,7 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
+from dexsim.gap.plant.lines import on_lines
 
 if TYPE_CHECKING:
     from dexsim.gap.read import Run
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 # Hz at which the model is evaluated (along a refined motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0
 CHUNK = 64  # samples of a motion that are evaluated in one call
-ROWS = 512  # of what is interpolated at a time: they stay in a core's cache
 
 
 @dataclass
@@ -255,28 +255,4 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
-    return out
-
-
-def on_lines(at: np.ndarray, known: np.ndarray, x: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """[n, E] columns x [m, E] known at times [m] that grow, at other times [n]: on straight lines between, held at the
-    ends: `np.interp` of each column, but row by row, which is how they lie in memory."""
-    out = np.empty((len(at), x.shape[1])) if out is None else out
-    if len(known) < 2 or not np.isfinite(x).all():
-        for e in range(x.shape[1]):
-            out[:, e] = np.interp(at, known, x[:, e])
-        return out
-    with np.errstate(divide="ignore", invalid="ignore"):  # between equal times, which no time lies between
-        slope = np.diff(x, axis=0) / np.diff(known)[:, None]
-    after, base = np.searchsorted(known, at, side="right"), np.empty((ROWS, x.shape[1]))
-    for first in range(0, len(at), ROWS):
-        here = out[first : first + ROWS]
-        k = np.clip(after[first : first + ROWS] - 1, 0, len(known) - 2)
-        past = at[first : first + ROWS] - known[k]
-        np.take(slope, k, 0, here, "clip")
-        here *= past[:, None]
-        here += np.take(x, k, 0, base[: len(k)], "clip")
-        there = np.flatnonzero(past == 0.0)
-        here[there] = x[k[there]]
-    out[after == 0], out[after == len(known)] = x[0], x[-1]
     return out
