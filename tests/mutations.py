@@ -302,28 +302,6 @@ MUTATIONS = (
         "tests/test_gap_rules.py::test_what_looked_like_an_effect_is_let_go_for_it",
     ),
     Mutation(
-        "a fit begins at the scan's size, whatever follows better",
-        "dexsim/gap/search/hypotheses.py",
-        "SIZES = (1.0, 0.2, 0.45, 0.7, 1.4, 2.0)",
-        "SIZES = (1.0,)",
-        "tests/test_gap_search.py::test_a_dead_zone_far_narrower_than_the_scans_start_is_found",
-    ),
-    Mutation(
-        "what follows less well keeps its own beliefs",
-        "dexsim/gap/search/search.py",
-        "trial = new if self._here(new) < here else trial",
-        "trial = trial",
-        "tests/test_gap_search.py::test_what_follows_less_well_begins_again_from_the_beliefs_of_the_best",
-    ),
-    Mutation(
-        "one step to what was left out decides between an effect and its rival",
-        "dexsim/gap/search/search.py",
-        "if better is not None and self._here(current) < (1 - SEARCH.tie) * self._here(better):",
-        "if False:",
-        "tests/test_gap_overtaken.py::"
-        "test_what_follows_better_is_overtaken_only_by_what_lasts_better_in_fits_of_its_own",
-    ),
-    Mutation(
         "a search's hypotheses wait behind those of joints that are soon done",
         "dexsim/gap/compute.py",
         'rank = getattr(_MINE, "rank", 0.0)  # of the search that asks',

@@ -234,7 +234,6 @@ class Selecting(Made):
     _on = cross = lambda *_: None
     thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
-    _from_the_best = lambda self, trials: trials  # noqa: E731
     _approximate = _more_general = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None

@@ -20,7 +20,7 @@ from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
-from dexsim.gap.search.fit import Fitted, Fitter, Residuals, centre_of, disbelief, slopes_of
+from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
 
 # -- a hypothesis -----------------------------------------------------------------------------------------------------
 # A hypothesis: its effects, its fit, and what a search ends with.
@@ -272,7 +272,6 @@ EXTREMES = (
 )  # regime variables whose largest values are never thinned out
 EXTREME, OF_RUN = 12, 3  # windows that are kept for their extremes, and of one recording
 PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
-SIZES = (1.0, 0.2, 0.45, 0.7, 1.4, 2.0)  # x that of the scan, or of a fit to short windows, from which a fit may begin
 MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
 
@@ -459,7 +458,6 @@ class JointHypotheses:
         free = np.array([p.mode == "add" for p in params[:n]], bool)
         x0[:n] = np.where(free, x0[:n], inside[:n])
         with self._fix(members):
-            x0 = self._sized(self.scan_fitter, members, params, x0)
             return (
                 members,
                 x0,
@@ -476,25 +474,11 @@ class JointHypotheses:
         params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
         x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
         with self._fix(members):
-            x = self._sized(self.fitter, members, params, x, x0)
             a = self.fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
             if like is not None and not quick and a.loss > like.fit.loss:
                 b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
                 a = b if b.loss < a.loss else a
         return Trial(members, a)
-
-    def _sized(
-        self, fitter: Fitter, members: tuple[Member, ...], params: list[Param], *starts: np.ndarray
-    ) -> np.ndarray:
-        """[P] of the starts, as they are and with other sizes of the effect that was added last, what follows best:
-        where play, a limit or sticking makes the loss rough, no slope leads from one size to the next."""
-        i = sum(len(m.variant.params) for m in members[:-1])
-        p = params[i]
-        zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
-        guesses = np.repeat(np.array(starts), len(SIZES), 0)
-        guesses[:, i] = np.clip(zero + np.tile(SIZES, len(starts)) * (guesses[:, i] - zero), p.low, p.high)
-        s = fitter.init_directions(params, starts[0])[1] if fitter.eliminate else None
-        return guesses[int(np.argmin(fitter.tried(params, guesses, s)))]
 
     def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
         """Beliefs that left no trace without any effect and leave one with these, and what is believed of them [n]: a

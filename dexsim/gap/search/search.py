@@ -18,7 +18,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, disbelief, huber_square, slopes_of
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, huber_square, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
@@ -216,7 +216,7 @@ class JointSelection(JointScan):
             return self._apart().finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
 
         each = compute.side_by_side([partial(finished, k) for k in range(len(drafts))], self.case.plant.device)
-        trials = self._from_the_best(sorted((t for t in each if t is not None), key=lambda t: t.fit.loss))
+        trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
         least = trials[0].fit.loss
         # those that may still be the best are looked at closely
         trials = [
@@ -233,26 +233,6 @@ class JointSelection(JointScan):
         for trial in trials:
             self.cross(trial)
         return trials
-
-    def _from_the_best(self, trials: Sequence[Trial]) -> list[Trial]:
-        """The trials, those that follow less well than the first fitted again from its beliefs where they do better
-        with them: steps along slopes stop at the first dent of a rough loss, and which hypothesis gets past it is
-        chance. What follows best is first again."""
-        found = [(p.key, x) for p, x in zip(trials[0].fit.params, trials[0].fit.x, strict=True) if p.nuisance]
-        out = [trials[0]]
-        for trial in trials[1:]:
-            params, here = trial.fit.params, self._here(trial)
-            known = dict(zip((p.key for p in params), trial.fit.x, strict=True))
-            x0 = np.array(list((known | {key: x for key, x in found if key in known}).values()))
-            if not self.deadline.over():
-                with self._fix(trial.members):
-                    there = self.fitter.loss(self.fitter.evaluate(params, x0)[None])[0]
-                    if there + disbelief(params, x0) / len(self.blocks) < (1 - SEARCH.tie) * here:
-                        fit = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, lazy=True)
-                        new = Trial(trial.members, fit)
-                        trial = new if self._here(new) < here else trial
-            out.append(trial)
-        return sorted(out, key=lambda t: t.fit.loss)
 
     def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
         """The one of the trials that loses least on what was left out; fits of their own decide where what follows best
@@ -277,12 +257,6 @@ class JointSelection(JointScan):
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):
             better = self._overtaken(current, final)
-            if better is not None and self._here(current) < (1 - SEARCH.tie) * self._here(better):
-                # it follows less well and seems to last better: fits of their own to the rest decide
-                current, better = (self.refold(t) for t in (current, better))
-                self.fitted |= {frozenset(t.ids): t for t in (current, better)}
-                final = self.rivals(current, pool)
-                better = self._overtaken(current, final)
             if better is None:
                 break
             self.fitted[frozenset(current.ids)] = current
