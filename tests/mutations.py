@@ -302,42 +302,6 @@ MUTATIONS = (
         "tests/test_gap_rules.py::test_what_looked_like_an_effect_is_let_go_for_it",
     ),
     Mutation(
-        "a fit begins at the scan's size, whatever follows better",
-        "dexsim/gap/search/hypotheses.py",
-        "SIZES = (1.0, 0.2, 0.45, 0.7, 1.4, 2.0)",
-        "SIZES = (1.0,)",
-        "tests/test_gap_search.py::test_a_dead_zone_far_narrower_than_the_scans_start_is_found",
-    ),
-    Mutation(
-        "far from the noise the size that follows best is believed too",
-        "dexsim/gap/search/hypotheses.py",
-        "    return loss < SEARCH.astray**2\n",
-        "    return True\n",
-        "tests/test_gap_search.py::test_far_from_the_noise_the_size_that_follows_best_is_not_asked_for",
-    ),
-    Mutation(
-        "of a draft's fits only the one that short windows prefer goes on",
-        "dexsim/gap/search/hypotheses.py",
-        "[f.x for _, f in rest if may_win(f.loss, best.loss)]",
-        "[]",
-        "tests/test_gap_search.py::test_where_another_draft_ended_counts_where_all_windows_are_fitted",
-    ),
-    Mutation(
-        "what follows less well keeps its own beliefs",
-        "dexsim/gap/search/search.py",
-        "trial = new if self._here(new) < here else trial",
-        "trial = trial",
-        "tests/test_gap_search.py::test_what_follows_less_well_begins_again_from_the_beliefs_of_the_best",
-    ),
-    Mutation(
-        "one step to what was left out decides between an effect and its rival",
-        "dexsim/gap/search/search.py",
-        "if follows_better and near(current.fit.loss):",
-        "if False:",
-        "tests/test_gap_overtaken.py::"
-        "test_what_follows_better_is_overtaken_only_by_what_lasts_better_in_fits_of_its_own",
-    ),
-    Mutation(
         "a search's hypotheses wait behind those of joints that are soon done",
         "dexsim/gap/compute.py",
         'rank = getattr(_MINE, "rank", 0.0)  # of the search that asks',

@@ -149,7 +149,7 @@ def test_of_hypotheses_that_are_out_of_time_the_first_is_fitted(monkeypatch):
     listed = s.scan(none)[:4]
     s.deadline = SimpleNamespace(over=lambda: True)
     drafts = s._drafts(listed, none, {}, {})
-    assert len(drafts) == 1 and drafts[0].members[0].id == listed[0][2].id
+    assert len(drafts) == 1 and drafts[0][0][0].id == listed[0][2].id
     assert len(s._finished(drafts * 2, none)) == 1
 
 

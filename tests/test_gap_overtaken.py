@@ -46,29 +46,3 @@ def test_draws_that_an_effects_like_wins_are_not_lost_to_a_rival():
     # a tilt of gravity and an encoder's zero: half of the draws together
     assert search(now, better)(now, shares("position_offset")) is None
     assert search(now, better)(now, shares("torque_ripple")) is better
-
-
-@pytest.mark.parametrize(
-    ("follows", "own", "near", "wins"),
-    [(0.8, 0.9, True, "payload"), (0.8, 1.5, True, "lag"), (1.2, 0.9, True, "lag"), (0.8, 0.9, False, "lag")],
-)
-def test_what_follows_better_is_overtaken_only_by_what_lasts_better_in_fits_of_its_own(follows, own, near, wins):
-    """follows: of the hypothesis beside its rival's 1, where both were fitted; own: what it loses on what was left out
-    in fits of its own, where one step to them says 2 of it and 1 of the rival; near: whether that is near the
-    noise."""
-    fit = Plain(loss=1.0 if near else 1e3)
-    payload, lag = (
-        Plain(members=[Plain(id=x)], ids=(x,), left=left, fit=fit) for x, left in (("payload", 2.0), ("lag", 1.0))
-    )
-    s = Plain(fitted={frozenset(("lag",)): lag, frozenset(("payload",)): payload}, _shrunk=lambda t: False)
-    s._here = lambda t: follows if t.ids == ("payload",) else 1.0
-    s.refold = lambda t: Plain(**vars(t) | {"left": own if t.ids == ("payload",) else 1.0})
-
-    def rivals(current, pool):
-        other = s.fitted[frozenset({"payload", "lag"} - set(current.ids))]
-        share = 0.9 if current.left < other.left else 0.1
-        return {current.ids[0]: ([(other.ids[0], 1 - share)], share, 0.5)}
-
-    s.rivals, s._overtaken = rivals, lambda current, final: JointSearch._overtaken(s, current, final)
-    found, final = JointSearch._settled(s, payload, {})
-    assert found.ids == (wins,) and final[wins][1] == 0.9

@@ -32,7 +32,7 @@ from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import ringing
 from dexsim.gap.search import search as selecting
 from dexsim.gap.search.fit import Fitted
-from dexsim.gap.search.hypotheses import Draft, JointHypotheses, Member, Trial, complexity_price, thin
+from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, thin
 from dexsim.gap.search.search import JointSearch, SearchedJoint
 from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
@@ -223,10 +223,10 @@ class Selecting(Made):
         return [row(0.5, price, e) for e, price in self.offered if e not in current.ids]
 
     def draft(self, members, x, like):
-        return Draft(members, x, self.fit(members).fit)
+        return members, x, self.fit(members).fit
 
-    def finish(self, draft, current, quick=False):
-        return self.fit(draft.members)
+    def finish(self, members, x, fit, current, quick=False):
+        return self.fit(members)
 
     def rivals(self, current, pool):
         return {m.id: ([], 1.0, 0.5) for m in current.members}
@@ -234,7 +234,6 @@ class Selecting(Made):
     _on = cross = lambda *_: None
     thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
-    _from_the_best = lambda self, trials: trials  # noqa: E731
     _approximate = _more_general = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
@@ -868,7 +867,7 @@ def takes_part(here: float, now: float, draft: float | None = None) -> bool:
     search._fix, search._on, search._price_factor = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
     search.cross, search._by_condition, search.deadline = lambda _: None, lambda *_: [], Deadline()
     search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.array(here))
-    search.draft = lambda *_: SimpleNamespace(fit=SimpleNamespace(loss=draft))
+    search.draft = lambda *_: (None, None, SimpleNamespace(loss=draft))
     search.finish = lambda *_, **__: rival
     return bool(search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"][0])
 

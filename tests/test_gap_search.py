@@ -3,7 +3,6 @@ reference."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,10 +16,9 @@ from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
-from dexsim.gap.search.hypotheses import Draft
-from dexsim.gap.search.search import JointSearch, Member, Trial, subset
+from dexsim.gap.search.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
 
 
@@ -236,100 +234,3 @@ def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
     assert error(True) < 0.7 * error(False)
     case.regimes["_speed"][0] = 0.0  # at rest nothing is fitted
     assert error(True) == error(False)
-
-
-def Plain(x, params, loss=5.0):  # noqa: N802
-    return SimpleNamespace(fit=SimpleNamespace(x=np.array(x), params=params, loss=loss, jacobian=np.zeros((4, 3))))
-
-
-def of_trials(loss, beliefs=("kp", "kd")):
-    """A search whose fits end where they begin; loss(x) of the effect's size and the beliefs."""
-    params = [Param("lag.time_constant", ("lag",), "set", 0.0, 1.0, 0.1)]
-    params += [Param(name, (name,), "factor", 0.5, 2.0, 1.0, nuisance=True) for name in beliefs]
-
-    def fitted(params, x0, **_):
-        return SimpleNamespace(params=params, x=np.array(x0), loss=loss(x0))
-
-    fitter = SimpleNamespace(
-        fit=fitted,
-        eliminate=False,
-        evaluate=lambda params, x: np.array(x),
-        loss=lambda rows: np.array([loss(x) for x in rows]),
-        tried=lambda params, guesses, s: np.array([loss(x) for x in guesses]),
-    )
-    out = SimpleNamespace(fitter=fitter, blocks=np.zeros(4), deadline=SimpleNamespace(over=lambda: False))
-    out._fix, out._here = lambda members: nullcontext(), lambda trial: trial.fit.loss
-    return out, params, fitted
-
-
-def test_what_follows_less_well_begins_again_from_the_beliefs_of_the_best():
-    """Both may have the same beliefs, but steps along slopes stopped one of them on the way."""
-    member = SimpleNamespace(id="lag", variant=SimpleNamespace(params=[0]))
-    for toward, taken in ((1.3, True), (0.8, False)):  # where those are no better for it, it stays
-        s, params, fitted = of_trials(lambda x, to=toward: 1.0 + abs(x[1] - to) + abs(x[2] - to))
-        first = Trial((member,), fitted(params, [0.2, 1.3, 1.3]))
-        first.fit.loss = 0.5
-        second = Trial((member,), fitted(params[:2] + params[2:], [0.7, 1.0, 1.0]))
-        before = second.fit.loss
-        one, two = JointSearch._from_the_best(s, [first, second])
-        assert one is first and (two is not second) == taken
-        np.testing.assert_allclose(two.fit.x, [0.7, 1.3, 1.3] if taken else [0.7, 1.0, 1.0])
-        assert two.fit.loss <= before
-
-
-def test_a_fit_begins_at_the_size_that_follows_best_too():
-    s, params, _ = of_trials(lambda x: abs(x[0] - 0.05) + 10 * abs(x[1] - 1.1))
-    earlier = SimpleNamespace(variant=SimpleNamespace(params=[]))
-    member = SimpleNamespace(variant=SimpleNamespace(params=params[:1]))
-    starts = np.array([0.25, 1.0, 1.0]), np.array([0.9, 1.1, 1.0])
-    sized = lambda members, params, *starts: JointSearch._sized(s, s.fitter, members, params, *starts)  # noqa: E731
-    begun = sized((earlier, member), params, *starts)
-    np.testing.assert_allclose(begun, [starts[0], [0.18, 1.1, 1.0]])  # a fifth of the second's
-    wide = sized((earlier, member), params, np.array([0.02, 1.1, 1.0]))
-    np.testing.assert_allclose(wide[1], [0.04, 1.1, 1.0])  # twice it
-    assert len(sized((earlier, member), params, np.array([0.05, 1.1, 1.0]))) == 1  # none follows better
-    added = [Param("x", ("lag",), "add", -1.0, 1.0, 0.0), *params[1:]]  # about what is no effect
-    back = sized((SimpleNamespace(variant=SimpleNamespace(params=added[:1])),), added, np.array([0.1, 1.1, 1.0]))
-    np.testing.assert_allclose(back[1], [0.045, 1.1, 1.0])
-
-
-def test_where_another_draft_ended_counts_where_all_windows_are_fitted():
-    """Short windows prefer one size, all of them the other, and no slope leads from one to the other."""
-    s, params, _ = of_trials(lambda x: 3.0 * (x[0] < 0.5))
-    s.scan_fitter = of_trials(lambda x: 1.0 + 0.1 * (x[0] > 0.5))[0].fitter
-    s.all_nuisances, s.short_slopes = [], {}
-    s._params = lambda members: list(params)
-    s._newly_identifiable = lambda members, fit: ([], np.zeros(0))
-    s._sized = lambda *given: JointSearch._sized(s, *given)
-    member, like = SimpleNamespace(id="lag", variant=SimpleNamespace(params=params[:1])), Plain([0.6, 1.0, 1.0], params)
-    draft = JointSearch.draft(s, (member,), np.array([0.6]), like)
-    assert draft.fit.x[0] < 0.5 and [x[0] for x in draft.others] == [0.6]
-    assert JointSearch.finish(s, draft, like).fit.x[0] == 0.6
-    s.scan_fitter = of_trials(lambda x: 1.0 + 2.0 * (x[0] > 0.5))[0].fitter  # what short windows rule out is not
-    assert JointSearch.draft(s, (member,), np.array([0.6]), like).others == []
-
-
-def test_far_from_the_noise_the_size_that_follows_best_is_not_asked_for():
-    for least, taken in ((0.99, True), (1.01, False)):
-        s, params, _ = of_trials(lambda x, least=least: SEARCH.astray**2 * (least if x[0] < 0.5 else 2.0))
-        s.scan_fitter, s.all_nuisances, s.short_slopes = s.fitter, [], {}
-        s._params = lambda members, params=params: list(params)
-        s._newly_identifiable = lambda members, fit: ([], np.zeros(0))
-        s._sized = lambda *given, s=s: JointSearch._sized(s, *given)
-        member = SimpleNamespace(id="lag", variant=SimpleNamespace(params=params[:1]))
-        like = Plain([0.9, 1.0, 1.0], params)
-        draft = JointSearch.draft(s, (member,), np.array([0.9]), like)
-        assert (draft.fit.x[0] < 0.5) == taken
-        start = Draft((member,), draft.begun, like.fit)
-        assert (JointSearch.finish(s, start, like).fit.x[0] < 0.5) == taken
-
-
-def test_a_dead_zone_far_narrower_than_the_scans_start_is_found():
-    """No slope leads from a dead zone of eight times its width to it: all inside of either is the same."""
-    s = searched({"deadband": 0.012})
-    none = s.start()
-    inside = [Member(m.effect, m.variant) for _, _, m, _ in s.scan(none) if m.variant.label == "no torque inside"]
-    for times in (1.0, 8.0):
-        trial = s.fit((inside[0],), np.array([0.012 * times]), none)
-        assert trial.fit.value("deadband.width") == pytest.approx(0.012, rel=0.1)
-        assert trial.fit.loss < 0.1 * none.fit.loss

@@ -77,8 +77,7 @@ class SearchRules:
     )
     astray: float = _rule(
         10.0,
-        "x the noise: where a further effect leaves more, whole recordings run free may speak for it, too, and the "
-        "size that follows best before all else is fitted is not believed",
+        "x the noise: where a further effect leaves more, whole recordings run free may speak for it, too",
         "between 9, the most left beside what was found in 35 cases of another plant, and 60, of a real pendulum",
         "test_far_from_the_noise_whole_recordings_decide",
     )

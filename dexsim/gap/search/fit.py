@@ -297,7 +297,7 @@ class Fitter:
                 out.append(g)
         return np.array(out)
 
-    def tried(self, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
+    def _tried(self, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
         """[K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
         res = self.residuals(params, trial)
         centre = np.array([p.start for p in params], float)
@@ -358,7 +358,7 @@ class Fitter:
                 break
             lambdas = damping * np.array([1e-2, 0.1, 1.0, 10.0, 100.0, 1000.0])
             trial = np.clip(x + _damped(A, b, free, lambdas) * span, low, high)
-            tried = self.tried(params, trial, s)
+            tried = self._tried(params, trial, s)
             best = int(np.argmin(tried))
             gain = (loss - float(tried[best])) / max(loss, 1e-30)
             # by slopes from elsewhere: here they are simulated before this is the end
@@ -377,7 +377,7 @@ class Fitter:
                     continue
                 # a kinked loss has no slope to follow: try sizes outright
                 trial = np.clip(self.pattern(params, x), low, high)
-                tried = self.tried(params, trial, s)
+                tried = self._tried(params, trial, s)
                 best = int(np.argmin(tried))
                 if not tried[best] < loss * (1 - tolerance):
                     break

@@ -20,7 +20,7 @@ from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
-from dexsim.gap.search.fit import Fitted, Fitter, Residuals, centre_of, disbelief, slopes_of
+from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
 
 # -- a hypothesis -----------------------------------------------------------------------------------------------------
 # A hypothesis: its effects, its fit, and what a search ends with.
@@ -51,17 +51,6 @@ class Trial:
     @property
     def ids(self) -> tuple[str, ...]:
         return tuple(m.id for m in self.members)
-
-
-@dataclass(frozen=True)
-class Draft:
-    """A hypothesis fitted on short windows: its members, where the fit began [P], the fit, and where others ended that
-    began at other sizes and may still win when all windows are fitted."""
-
-    members: tuple[Member, ...]
-    begun: np.ndarray
-    fit: Fitted
-    others: Sequence[np.ndarray] = ()
 
 
 @dataclass
@@ -283,7 +272,6 @@ EXTREMES = (
 )  # regime variables whose largest values are never thinned out
 EXTREME, OF_RUN = 12, 3  # windows that are kept for their extremes, and of one recording
 PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
-SIZES = (1.0, 0.2, 0.45, 0.7, 1.4, 2.0)  # x that of the scan, or of a fit to short windows, from which a fit may begin
 MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
 
@@ -451,8 +439,8 @@ class JointHypotheses:
 
     def draft(
         self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | SimpleNamespace | None = None
-    ) -> Draft:
-        """A hypothesis fitted on short windows, from `starts` of the members' parameters."""
+    ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
+        """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
         params = self._params(members)
         if like is not None:  # what left a trace in that alone starts from there too, not from what was believed
             taken = {c for p in params for c in p.columns}
@@ -470,51 +458,27 @@ class JointHypotheses:
         free = np.array([p.mode == "add" for p in params[:n]], bool)
         x0[:n] = np.where(free, x0[:n], inside[:n])
         with self._fix(members):
-            drafts = [
-                (
-                    x,
-                    self.scan_fitter.fit(
-                        params, x0=x, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False
-                    ),
-                )
-                for x in self._sized(self.scan_fitter, members, params, x0)
-            ]
-        drafts = sorted((d for k, d in enumerate(drafts) if k == 0 or near(d[1].loss)), key=lambda d: d[1].loss)
-        (begun, best), *rest = drafts
-        return Draft(members, begun, best, [f.x for _, f in rest if may_win(f.loss, best.loss)])
+            return (
+                members,
+                x0,
+                self.scan_fitter.fit(
+                    params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False
+                ),
+            )
 
-    def finish(self, draft: Draft, like: Trial | None = None, quick: bool = False) -> Trial:
-        """The draft refitted on long windows, from each place where it may have ended. quick: fewer steps, and beliefs
-        are not drawn back to their prior."""
-        members = draft.members
-        added, at = self._newly_identifiable(members, draft.fit)
-        params, slopes = [*draft.fit.params, *added], slopes_of(like.fit) if like is not None else None
-        x0, x, *others = (np.concatenate([x, at]) for x in (draft.begun, draft.fit.x, *draft.others))
+    def finish(
+        self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
+    ) -> Trial:
+        """The draft refitted on long windows. quick: fewer steps, and beliefs are not drawn back to their prior."""
+        added, at = self._newly_identifiable(members, short)
+        params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
+        x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
         with self._fix(members):
-            fits = [
-                self.fitter.fit(params, x0=y, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
-                for y in self._sized(self.fitter, members, params, x, x0, *others)
-            ]
-            a = min((f for k, f in enumerate(fits) if k == 0 or near(f.loss)), key=lambda f: f.loss)
+            a = self.fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
             if like is not None and not quick and a.loss > like.fit.loss:
                 b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
                 a = b if b.loss < a.loss else a
         return Trial(members, a)
-
-    def _sized(
-        self, fitter: Fitter, members: tuple[Member, ...], params: list[Param], *starts: np.ndarray
-    ) -> list[np.ndarray]:
-        """From where to fit: the first of the starts [P], and, where it follows better there, the best of all of them
-        with other sizes of the effect that was added last. Where play, a limit or sticking makes the loss rough, no
-        slope leads from one size to the next."""
-        i = sum(len(m.variant.params) for m in members[:-1])
-        p = params[i]
-        zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
-        guesses = np.repeat(np.array(starts), len(SIZES), 0)
-        guesses[:, i] = np.clip(zero + np.tile(SIZES, len(starts)) * (guesses[:, i] - zero), p.low, p.high)
-        s = fitter.init_directions(params, starts[0])[1] if fitter.eliminate else None
-        best = int(np.argmin(fitter.tried(params, guesses, s)))
-        return [starts[0]] if np.array_equal(guesses[best], starts[0]) else [starts[0], guesses[best]]
 
     def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
         """Beliefs that left no trace without any effect and leave one with these, and what is believed of them [n]: a
@@ -548,7 +512,8 @@ class JointHypotheses:
     ) -> Trial:
         """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long
         ones."""
-        return self.finish(self.draft(members, starts, like), like, quick)
+        members, x0, short = self.draft(members, starts, like)
+        return self.finish(members, x0, short, like, quick)
 
     def _values(self, trial: Trial) -> np.ndarray:
         n = sum(len(m.variant.params) for m in trial.members)
@@ -575,17 +540,6 @@ class JointHypotheses:
     def _here(self, trial: Trial) -> float:
         """Mean square where it was fitted, with what the beliefs give for it."""
         return trial.fit.loss + disbelief(trial.fit.params, trial.fit.x) / len(self.blocks)
-
-
-def near(loss: float) -> bool:
-    """Whether a hypothesis that leaves so much is near enough to the noise to believe the size at which its fit began:
-    far from it, the size that follows best is one that makes up for what else is missing."""
-    return loss < SEARCH.astray**2
-
-
-def may_win(loss: float, least: float) -> bool:
-    """Whether a draft of a loss on short windows may still be the best on long ones, beside the one of the least."""
-    return loss < 1.3 * least + 0.15
 
 
 def restlessness(r: np.ndarray, window: np.ndarray) -> float:

@@ -18,20 +18,8 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import AWAY, Fitter, Residuals, disbelief, huber_square, slopes_of
-from dexsim.gap.search.hypotheses import (
-    LONG,
-    MAYBE,
-    Draft,
-    Member,
-    Outcome,
-    Trial,
-    fits_beside,
-    may_win,
-    named,
-    near,
-    subset,
-)
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, huber_square, slopes_of
+from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
@@ -185,14 +173,14 @@ class JointSelection(JointScan):
         current: Trial,
         pool: dict[str, tuple[Member, np.ndarray]],
         price: dict[str, float],
-    ) -> list[Draft]:
+    ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
         """The hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted on
         short windows: those that follow best, the best first. pool, price: by effect, are filled."""
-        drafts: list[Draft] = []
+        drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
         followed: dict[str, float] = {}
         begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
 
-        def drafted(k: int) -> Draft | None:
+        def drafted(k: int) -> tuple[tuple[Member, ...], np.ndarray, Fitted] | None:
             _, _, member, start = listed[k]
             if k and self.deadline.over():
                 return None
@@ -200,7 +188,7 @@ class JointSelection(JointScan):
             tries = [mine.draft((*current.members, member), begin(start), current)]
             if k < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
                 tries.append(mine.draft((*current.members, member), begin(self.other_start[member.id]), current))
-            return min(tries, key=lambda d: d.fit.loss)
+            return min(tries, key=lambda d: d[2].loss)
 
         each = compute.side_by_side([partial(drafted, k) for k in range(len(listed))], self.case.plant.device)
         for (_, p, member, start), draft in zip(listed, each, strict=True):
@@ -210,24 +198,25 @@ class JointSelection(JointScan):
                 pool[member.id] = (member, start)
             price[member.id] = p
             drafts.append(draft)
-            if draft.fit.loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
+            if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
                 if member.id in followed:
                     pool[member.id] = (member, start)
-                followed[member.id] = draft.fit.loss
+                followed[member.id] = drafts[-1][2].loss
             self._on(0.03)
-        drafts.sort(key=lambda d: d.fit.loss)
+        drafts.sort(key=lambda d: d[2].loss)
         # how many are looked at: two, and others that may still win when they are fitted on long windows
-        return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and may_win(d.fit.loss, drafts[0].fit.loss))]
+        return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
 
-    def _finished(self, drafts: Sequence[Draft], current: Trial) -> list[Trial]:
+    def _finished(
+        self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
+    ) -> list[Trial]:
         """The drafts fitted on long windows, and judged on what was left out."""
 
         def finished(k: int) -> Trial | None:
-            return self._apart().finish(drafts[k], current) if k == 0 or not self.deadline.over() else None
+            return self._apart().finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
 
         each = compute.side_by_side([partial(finished, k) for k in range(len(drafts))], self.case.plant.device)
         trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
-        trials = self._from_the_best(trials) if near(trials[0].fit.loss) else trials
         least = trials[0].fit.loss
         # those that may still be the best are looked at closely
         trials = [
@@ -244,26 +233,6 @@ class JointSelection(JointScan):
         for trial in trials:
             self.cross(trial)
         return trials
-
-    def _from_the_best(self, trials: Sequence[Trial]) -> list[Trial]:
-        """The trials, those that follow less well than the first fitted again from its beliefs where they do better
-        with them: steps along slopes stop at the first dent of a rough loss, and which hypothesis gets past it is
-        chance. What follows best is first again."""
-        found = [(p.key, x) for p, x in zip(trials[0].fit.params, trials[0].fit.x, strict=True) if p.nuisance]
-        out = [trials[0]]
-        for trial in trials[1:]:
-            params, here = trial.fit.params, self._here(trial)
-            known = dict(zip((p.key for p in params), trial.fit.x, strict=True))
-            x0 = np.array(list((known | {key: x for key, x in found if key in known}).values()))
-            if not self.deadline.over():
-                with self._fix(trial.members):
-                    there = self.fitter.loss(self.fitter.evaluate(params, x0)[None])[0]
-                    if there + disbelief(params, x0) / len(self.blocks) < (1 - SEARCH.tie) * here:
-                        fit = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, lazy=True)
-                        new = Trial(trial.members, fit)
-                        trial = new if self._here(new) < here else trial
-            out.append(trial)
-        return sorted(out, key=lambda t: t.fit.loss)
 
     def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
         """The one of the trials that loses least on what was left out; fits of their own decide where what follows best
@@ -288,13 +257,6 @@ class JointSelection(JointScan):
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):
             better = self._overtaken(current, final)
-            follows_better = better is not None and self._here(current) < (1 - SEARCH.tie) * self._here(better)
-            if follows_better and near(current.fit.loss):
-                # it follows less well and seems to last better: fits of their own to the rest decide
-                current, better = (self.refold(t) for t in (current, better))
-                self.fitted |= {frozenset(t.ids): t for t in (current, better)}
-                final = self.rivals(current, pool)
-                better = self._overtaken(current, final)
             if better is None:
                 break
             self.fitted[frozenset(current.ids)] = current
@@ -372,9 +334,9 @@ class JointSelection(JointScan):
             short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
         like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
         draft = self.draft(tuple(members), np.concatenate(starts), like)
-        if draft.fit.loss > (1 - SEARCH.least) * short:
+        if draft[2].loss > (1 - SEARCH.least) * short:
             return current
-        trial = self.thorough(self.finish(draft, current))
+        trial = self.thorough(self.finish(*draft, current))
         if not self._earns(trial, current, further=False):
             return current
         return self._drop(trial)
@@ -468,7 +430,7 @@ class JointSelection(JointScan):
                 for start in extra.values():
                     values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
                     tries.append(self.draft(members, np.concatenate(values), current))
-                more = self.finish(min(tries, key=lambda d: d.fit.loss), current, quick=True)
+                more = self.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
                 if self._earns(more, current, further=False) and self._score(more) < self._score(current):
                     current = more
                     break
@@ -508,7 +470,7 @@ class JointSelection(JointScan):
                         self.draft((*others, member), np.concatenate([*kept, np.array(start)]), current)
                         for start in variant.starts
                     ]
-                    trial = self.finish(min(drafts, key=lambda d: d.fit.loss), current)
+                    trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
                     left = self._left(trial).sum()
                     far_more = left - noise < SEARCH.approximate * (mine - noise)
                     if far_more and left < self._left(best).sum() and not self._shrunk(trial):
@@ -592,9 +554,9 @@ class JointSelection(JointScan):
                 if trial is None:
                     draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
                     # one that cannot follow even short stretches is no rival
-                    if draft.fit.loss > SEARCH.rival * max(short, 1.0):
+                    if draft[2].loss > SEARCH.rival * max(short, 1.0):
                         continue
-                    trial = self.finish(draft, current, quick=True)
+                    trial = self.finish(*draft, current, quick=True)
                 self._on(0.05)
                 self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
