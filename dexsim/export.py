@@ -281,7 +281,7 @@ def _rotate(env: Any) -> dict[str, Any]:
     that is most like all others: where the fingers wait for the cube, and the targets they close to."""
     import copy
 
-    from dexsim.deploy import observations_rotate
+    from dexsim.tasks import observations_rotate
 
     task, g = env.task, env.grasps
     targets = task["observe"].get("last_action", "step") != "step"

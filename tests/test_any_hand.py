@@ -20,6 +20,7 @@ from dexsim.cli import train as training
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.simulated_hand import SimulatedXHand
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
@@ -28,7 +29,6 @@ from dexsim.recording.compare import compare
 from dexsim.tasks import grasp_eval, make_env
 from dexsim.tasks.env import UNIT_SPAN
 from dexsim.tasks.make_grasps import generate
-from dexsim.tasks.simulated_hand import SimulatedXHand
 from dexsim.view import plots
 from tests.made_hand import made_hand
 

@@ -22,12 +22,12 @@ from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.recorder import Recorder
 from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.safety import Guard
+from dexsim.deploy.simulated_hand import SimulatedXHand, choose_gl
 from dexsim.deploy.timing import Timing
 from dexsim.deploy.vendor import VendorXHand
 from dexsim.deploy.vision import CameraPose, FixedPlace, Frame, Vision, centroid
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
-from dexsim.tasks.simulated_hand import SimulatedXHand, choose_gl
 
 torch.set_num_threads(1)
 
@@ -528,7 +528,7 @@ CAMERA = """
 import sys
 from dexsim.calibration.file import Calibration
 from dexsim.deploy import bundle
-from dexsim.tasks.simulated_hand import SimulatedHand
+from dexsim.deploy.simulated_hand import SimulatedHand
 hand = SimulatedHand(bundle.load(sys.argv[1]).config, Calibration.default(), seed=4, camera=True, shape="sphere")
 for dz in (0.0, 0.02, -0.03):
     hand._start[0][0, 2] += dz

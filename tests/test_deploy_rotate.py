@@ -17,16 +17,16 @@ from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import main as command
 from dexsim.deploy import bundle
 from dexsim.deploy import loop as deploy_loop
-from dexsim.deploy import observations_rotate as observations
 from dexsim.deploy.driver import PASSIVE, HandState, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.measure import TurnMeasure, for_bundle
 from dexsim.deploy.recorder import GOAL, TURNED
 from dexsim.deploy.replay import ReplayHand
+from dexsim.deploy.simulated_hand import SimulatedXHand
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
-from dexsim.tasks.simulated_hand import SimulatedXHand
+from dexsim.tasks import observations_rotate as observations
 
 torch.set_num_threads(1)
 SETTINGS = {

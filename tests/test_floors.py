@@ -28,8 +28,8 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "actuator tactile",
         "recording view",
         "calibration",
-        "deploy",
         "tasks gap",  # neither knows of the other
+        "deploy",
         "learning",
         "cli excite export import_object",
         "import_hand",  # lets objects fall as `task=grasp` does, by the settings that the command line reads
@@ -37,7 +37,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     )
 )
 """Parts of dexsim from the ground up. A part imports itself and lower floors only."""
-NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
+NEVER = {"gap": {"view"}, "tasks": {"recording"}}
 """What a part does not import though it stands lower."""
 STEPS = ("read", "plant", "search", "locate", "judge", "report")
 """The steps of a diagnosis in the order in which `gap.inquiry.Steps` takes them, each a part of `dexsim.gap` (and of

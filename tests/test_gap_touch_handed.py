@@ -136,7 +136,7 @@ def test_a_checkpoint_carries_it_and_play_takes_it(late, tmp_path):
 
 def test_the_simulated_hand_of_deployment_has_it_too():
     from dexsim.calibration.file import Calibration
-    from dexsim.tasks.simulated_hand import SimulatedHand
+    from dexsim.deploy.simulated_hand import SimulatedHand
 
     hand = SimulatedHand(grasp_cfg("+tactile.pads.index={stuck: {5: 2.0}, delay: 0.06}"), Calibration.default())
     for k in range(1, 15):

@@ -11,11 +11,10 @@ import torch
 from worlds import grasp_cfg, grasp_env
 
 from dexsim.assets import xhand
-from dexsim.deploy import observations
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.sim.engine import FLAG_NAN
-from dexsim.tasks import grasp_eval, make_env
+from dexsim.tasks import grasp_eval, make_env, observations
 from dexsim.tasks.grasp import privileged
 
 N = 8

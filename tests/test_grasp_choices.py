@@ -8,10 +8,10 @@ import torch
 from worlds import grasp_env
 
 from dexsim.calibration.file import Calibration
-from dexsim.deploy import observations
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.measure import for_bundle
 from dexsim.errors import UserError
+from dexsim.tasks import observations
 
 FEW = ("task.objects.train=[box]", "task.objects.held_out=[sphere]")
 

@@ -16,6 +16,7 @@ from dexsim.cli import train as training
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.simulated_hand import SimulatedXHand
 from dexsim.gap import command
 from dexsim.hand import load_hand
 from dexsim.import_hand.command import main as import_hand
@@ -23,7 +24,6 @@ from dexsim.paths import CONFIGS
 from dexsim.recording import mechanism, write
 from dexsim.recording.realistic import realistic
 from dexsim.recording.schema import COMMANDS, Series
-from dexsim.tasks.simulated_hand import SimulatedXHand
 from tests import hands
 
 JOINT, DELAY = "middle_1", 0.06

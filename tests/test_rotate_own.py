@@ -18,13 +18,13 @@ from dexsim.cli.stable_grasps import main as stable_grasps
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.simulated_hand import SimulatedHand, SimulatedXHand
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env
 from dexsim.tasks.make_grasps import candidates
 from dexsim.tasks.reach import Reach
-from dexsim.tasks.simulated_hand import SimulatedHand, SimulatedXHand
 from dexsim.tasks.stable_grasps import ROWS, GraspSet, held_poses
 
 torch.set_num_threads(1)

@@ -159,7 +159,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
             raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
         place = FixedPlace(at)
     if kind == "sim":
-        from dexsim.tasks.simulated_hand import SimulatedXHand
+        from dexsim.deploy.simulated_hand import SimulatedXHand
 
         vision = given.get("vision", "truth")
         if vision not in ("truth", "camera"):

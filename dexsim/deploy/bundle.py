@@ -88,7 +88,7 @@ def _hand(which: manifests.HandEntry, path: Path) -> Hand:
 
 def builder(task: str) -> Any:
     """The module that builds a task's observation: `Signals` and `build(signals, settings)`."""
-    from dexsim.deploy import observations, observations_rotate
+    from dexsim.tasks import observations, observations_rotate
 
     return {"grasp": observations, "rotate": observations_rotate}[task]
 

@@ -10,9 +10,9 @@ import torch
 
 from dexsim import rotation
 from dexsim.calibration.file import Calibration
-from dexsim.deploy import observations, observations_rotate
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
+from dexsim.tasks import observations, observations_rotate
 
 PLACE, ORIENTATION = "place", "orientation"
 """What a policy needs to know of the object, beside what the hand reads."""

@@ -17,11 +17,10 @@ import torch
 import warp as wp
 
 from dexsim.assets.objects import library
-from dexsim.deploy import observations
 from dexsim.errors import UserError
 from dexsim.hand.places import approach
 from dexsim.tactile.clearance import Clearance
-from dexsim.tasks import base_path, grasp_rewards
+from dexsim.tasks import base_path, grasp_rewards, observations
 from dexsim.tasks import grasp_kernels as kernels
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press

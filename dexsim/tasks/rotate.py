@@ -18,12 +18,12 @@ import torch
 
 from dexsim import rotation
 from dexsim.assets.objects.own import is_own
-from dexsim.deploy import observations_rotate as observations
-from dexsim.deploy.observations_rotate import ORIENTATION
 from dexsim.errors import UserError
 from dexsim.hand.skin import tip_skins
 from dexsim.tactile.layout import hand_layout, tip_layout
+from dexsim.tasks import observations_rotate as observations
 from dexsim.tasks.env import HandEnv
+from dexsim.tasks.observations_rotate import ORIENTATION
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_poses
 
