@@ -1,4 +1,4 @@
-"""The tables and figures of docs/results/concealed.md:
+"""The tables and figures of lab/results/concealed.md:
 
     python -m benchmarks.concealed.page results=out/concealed/seed_N/results.json [figure=FILE.png] [limits=FILE.png]
 

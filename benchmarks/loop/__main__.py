@@ -362,7 +362,7 @@ class Loop:
         """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast
         that has to be, and are not fitted: a joint is judged while nothing is touched, and most of what they touch
         carries no taxels. What they command, played again on the empty hand, throws the joints against the ends of
-        their motion (docs/results/loop.md)."""
+        their motion (lab/results/loop.md)."""
 
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 """The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of
 the `used` speeds that they may reach; chirps tell a delay from a lag. Faster, a drive that is late swings into the ends
-of its range (docs/results/loop.md)."""
+of its range (lab/results/loop.md)."""
 KEPT = 1  # of them, the last, is for the proof
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
 FAST = ("fast.mcap", "fast_kept.mcap")  # the recordings of fast moves: one is fitted, one is for the proof

@@ -6,7 +6,7 @@ belief lacks.
 Built as `dexsim.tasks.reality` builds its own, but the drives are the believed ones, each quantity off by up to 3 %,
 with two or three effects of the catalogue in every joint. late: a delay, a lag, a lower no-load speed. stiff: twice the
 gain, less than half the damping. What they hide was chosen by what the naive policy loses by it and by what can be won
-back, since nothing of it takes away what the drives are able to do (docs/results/loop.md); the numbers are drawn.
+back, since nothing of it takes away what the drives are able to do (lab/results/loop.md); the numbers are drawn.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Table and figure of what has been judged: python -m benchmarks.touch_matters.analysis out=FOLDER [figure=FILE.png].
 
 Writes FOLDER/touch_matters.md, .json and the figure. How a difference is judged was fixed before any row was trained
-(docs/results/touch_matters.md). Three things were added when the rows had been seen, and decide nothing: intervals of
+(lab/results/touch_matters.md). Three things were added when the rows had been seen, and decide nothing: intervals of
 a row's average, Holm's correction over the paper's orderings, and the difference to a row of other seeds.
 """
 

@@ -42,7 +42,7 @@ def cuda_devices() -> int:
 def set_threads(where: str) -> None:
     """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread
     pool of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds
-    took 150 to 480 ms with two, 37 to 75 with one: docs/results/speed.md)."""
+    took 150 to 480 ms with two, 37 to 75 with one: lab/results/speed.md)."""
     if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
 

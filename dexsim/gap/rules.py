@@ -247,7 +247,7 @@ class JudgeRules:
     sure: float = _rule(
         0.8,
         "confidence from which a name stands alone: below it training is also given what was believed before",
-        "of names below, about half are true (docs/results/concealed.md)",
+        "of names below, about half are true (lab/results/concealed.md)",
         "test_what_is_not_sure_is_handed_on_with_what_was_believed",
     )
     earns: float = _rule(

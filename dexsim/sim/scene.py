@@ -4,7 +4,7 @@ One compiled model serves every shape: the object body carries geom slots (a box
 hulls or as many as the shapes need), of which a world uses those that its shape needs; the others are parked a
 kilometre away (they turn with the object, so such a scene must not have planes, which have no end). Per world only
 `geom_*` and `body_*` fields differ, so that topology, kernels and graphs are shared. Measured against one model a shape
-group, this needs one graph and one compile (see docs/results/speed.md).
+group, this needs one graph and one compile (see lab/results/speed.md).
 """
 
 from __future__ import annotations
