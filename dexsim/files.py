@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dexsim import system
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
@@ -141,18 +142,7 @@ def sweep(folder: Path) -> list[int]:
 def abandoned(name: str) -> bool:
     """Whether a file of this name is what a process of this machine wrote that is no more."""
     found = _UNFINISHED.fullmatch(name)
-    return found is not None and found["host"] == HOST and not lives(int(found["pid"]))
-
-
-def lives(pid: int) -> bool:
-    """Whether there is a process of this number on this machine."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True
+    return found is not None and found["host"] == HOST and not system.lives(int(found["pid"]))
 
 
 def _remove(path: Path) -> None:

@@ -22,7 +22,7 @@ import torch
 from bundles import make_checkpoint
 from test_deploy import FakeHand, FakePackage, recorder_at
 
-from dexsim import export
+from dexsim import export, system
 from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import _Stop
@@ -473,7 +473,7 @@ def test_a_signal_relaxes_and_those_after_it_change_nothing(b, number, tmp_path)
     rec = recorder_at(tmp_path / "run.mcap")
     with _Stop() as stop:
         report = run(b, hand, recorder=rec)
-    assert stop.status == 128 + number and report.ended == f"stopped by {_Stop.SIGNALS[number]}"
+    assert stop.status == 128 + number and report.ended == f"stopped by {system.stop_signals()[number]}"
     assert hand.relaxed_at[0] - hand.hit < 0.02 and report.acts > 10 and not rec.writer._open
 
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
-        "errors paths version rotation intervals",
+        "errors paths version rotation intervals system",
         "console files typed",
         "outputs yaml_text model_file",
         "assets hand",

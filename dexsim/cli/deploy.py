@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from dexsim import system
 from dexsim.errors import UserError
 from dexsim.typed import whole
 
@@ -104,16 +105,14 @@ def main(argv: Sequence[str]) -> int:
 class _Stop:
     """Ctrl-C, SIGTERM and SIGHUP: the first ends the run, which relaxes the hand; those after it change nothing."""
 
-    SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
-
     def __init__(self) -> None:
         self.status, self.ending = 0, False  # ending: the hand is relaxed, and what is left to do is done to its end
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> _Stop:
-        for number in self.SIGNALS:
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup is left as it is
-                self._before[number] = signal.signal(number, self._handle)
+        self._names = system.stop_signals()
+        for number in self._names:
+            self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -123,7 +122,7 @@ class _Stop:
     def _handle(self, number: int, _frame: Any) -> None:
         if not self.status and not self.ending:
             self.status = 128 + number
-            raise KeyboardInterrupt(f"stopped by {self.SIGNALS[signal.Signals(number)]}")
+            raise KeyboardInterrupt(f"stopped by {self._names[number]}")
 
 
 def _ending(report: Any, recorder: Any) -> None:

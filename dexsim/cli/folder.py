@@ -84,7 +84,7 @@ class ProgressFile:
         self._path: Path = path
         self._names: list[str] = []
         if earlier is not None and earlier.is_file():  # a resumed run's past
-            whole = earlier.read_text().splitlines(keepends=True)
+            whole = earlier.read_text("utf-8").splitlines(keepends=True)
             whole = [line for line in whole if line.endswith("\n")]  # power may have failed within the last one
             kept = (row for row in csv.DictReader(whole) if int(row["iteration"]) <= until)
             rows = [{k: v for k, v in row.items() if v} for row in kept]
@@ -99,17 +99,17 @@ class ProgressFile:
             self._names += new
             self._write([*self._read(), text])
         else:
-            with open(self._path, "a", newline="") as file:
+            with open(self._path, "a", newline="", encoding="utf-8") as file:
                 csv.DictWriter(file, self._names, restval="").writerow(text)
 
     def _read(self) -> list[dict[str, str]]:
         if not self._path.is_file():
             return []
-        with open(self._path, newline="") as file:
+        with open(self._path, newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
 
     def _write(self, rows: list[dict[str, str]]) -> None:
-        with files.beside(self._path) as part, open(part, "w", newline="") as file:
+        with files.beside(self._path) as part, open(part, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._names, restval="")
             writer.writeheader()
             writer.writerows(rows)

@@ -63,7 +63,7 @@ def text(script: str, config_dir: Path) -> str:
 def settings(path: Path) -> list[tuple[str, str, str]]:
     """(dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
     rows, owner = [], ""
-    for line in path.read_text().splitlines():
+    for line in path.read_text("utf-8").splitlines():
         if match := re.match(r"^(\w+):\s*$", line):
             owner = match[1] + "."
         elif match := re.match(r"^(\s*)(\w+):\s*(\S+)\s+#\s*(.+)$", line):

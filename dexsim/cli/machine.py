@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
+from dexsim import system
 from dexsim.errors import UserError
 from dexsim.version import VERSION
 
@@ -63,10 +64,10 @@ def memory(where: str) -> str:
     if where.startswith("cuda"):
         free, total = torch.cuda.mem_get_info(where)
     else:
-        if "SC_AVPHYS_PAGES" not in os.sysconf_names:  # macOS
+        known = system.memory()
+        if known is None:
             return "memory unknown"
-        page = os.sysconf("SC_PAGE_SIZE")
-        free, total = os.sysconf("SC_AVPHYS_PAGES") * page, os.sysconf("SC_PHYS_PAGES") * page
+        free, total = known
     return f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
 
 
@@ -74,4 +75,4 @@ def describe(where: str) -> str:
     """A device in words, e.g. "cuda:0 (NVIDIA H200)" or "cpu (2 cores)"."""
     if where.startswith("cuda"):
         return f"{where} ({torch.cuda.get_device_name(where)})"
-    return f"cpu ({len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()} cores)"
+    return f"cpu ({system.cores()} cores)"

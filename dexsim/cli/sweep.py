@@ -85,7 +85,7 @@ class Job:
         start = time.perf_counter()
         status = subprocess.run([*self.command, *settings, f"out={folder}"], env=env).returncode
         note = {"settings": settings, "status": status, "seconds": round(time.perf_counter() - start, 1)}
-        (folder / "job.json").write_text(json.dumps(note))
+        (folder / "job.json").write_text(json.dumps(note), "utf-8")
         if status in (130, 143):
             raise KeyboardInterrupt
         return status
@@ -127,12 +127,12 @@ def _collect(folder: Path) -> tuple[list[tuple], bool]:
     """A row for each job: name, settings, status, iterations, last step reward, seconds; and whether one failed."""
     rows, failed = [], False
     notes = sorted(folder.glob("*/job.json"), key=lambda p: int(p.parent.name))
-    jobs = [json.loads(note.read_text()) for note in notes]
+    jobs = [json.loads(note.read_text("utf-8")) for note in notes]
     common = set.intersection(*(set(job["settings"]) for job in jobs)) if len(jobs) > 1 else set()
     for note, job in zip(notes, jobs):
         progress: list[dict[str, str]] = []
         if (note.parent / "progress.csv").exists():
-            with open(note.parent / "progress.csv", newline="") as file:
+            with open(note.parent / "progress.csv", newline="", encoding="utf-8") as file:
                 progress = list(csv.DictReader(file))
         last = progress[-1] if progress else {}
         tail = [float(r["step_reward"]) for r in progress[-10:]]

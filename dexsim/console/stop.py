@@ -10,7 +10,8 @@ import time
 from types import FrameType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from dexsim import system
+
 SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to every process already
 
 
@@ -28,9 +29,8 @@ class Stop:
 
     def __enter__(self) -> Stop:
         try:
-            for number in SIGNALS:
-                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                    self._before[number] = signal.signal(number, self._handle)
+            for number in system.stop_signals():
+                self._before[number] = signal.signal(number, self._handle)
         except ValueError:  # not in the main thread: whoever runs us handles signals
             pass
         return self
@@ -44,7 +44,7 @@ class Stop:
         if self._several and self._last - before < SAME_SIGNAL_S:
             return
         self.status = 128 + number
-        if number == signal.SIGHUP:
+        if system.terminal_gone(number):
             without_terminal()
         if not self.gently or self._asked:
             raise KeyboardInterrupt

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import system
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
 from dexsim.errors import UserError
@@ -259,7 +260,7 @@ class SimulatedCamera:
     """A depth camera beside the hand: MuJoCo's offscreen depth and segmentation of the object, 160 x 120 pixels.
 
     It looks along the palm's plane from the fingers' side, a little from above, so that the mask's centroid is at the
-    height of the object's middle. Needs OpenGL (EGL or OSMesa), chosen by MUJOCO_GL before MuJoCo is imported
+    height of the object's middle. Needs OpenGL, chosen by MUJOCO_GL before MuJoCo is imported
     (`choose_gl`); raises UserError without.
     """
 
@@ -267,8 +268,6 @@ class SimulatedCamera:
 
     def __init__(self, env: Any):
         import mujoco
-
-        from dexsim.view.video import INSTALL
 
         self._mujoco, self._env = mujoco, env
         self._model = env.drawn_model(0)
@@ -280,9 +279,8 @@ class SimulatedCamera:
             self._renderer = mujoco.Renderer(self._model, self.HEIGHT, self.WIDTH)
         except Exception as error:  # whatever a driver raises
             raise UserError(
-                f"vision=camera: no OpenGL for offscreen rendering ({str(error).splitlines()[0]}); install one:"
-                f" {INSTALL};"
-                " or use vision=truth"
+                f"vision=camera: no OpenGL for offscreen rendering ({str(error).splitlines()[0]});"
+                f" {system.no_renderer()}; or use vision=truth"
             ) from None
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = [0.05, 0.0, 0.05]
@@ -332,16 +330,14 @@ def choose_gl() -> str:
     import subprocess
     import sys
 
-    from dexsim.view.video import BACKENDS, INSTALL
-
-    asked = os.environ.get("MUJOCO_GL", "").lower()
     probe = "import mujoco; c = mujoco.GLContext(8, 8); c.make_current()"
-    for name in (asked,) if asked in BACKENDS else BACKENDS:
-        env = os.environ | {"MUJOCO_GL": name, "PYOPENGL_PLATFORM": name}
-        if subprocess.run([sys.executable, "-c", probe], env=env, capture_output=True, timeout=60).returncode == 0:
-            os.environ.update(MUJOCO_GL=name, PYOPENGL_PLATFORM=name)
+    for name in system.renderers():
+        env = system.renderer_environment(name)
+        done = subprocess.run([sys.executable, "-c", probe], env=os.environ | env, capture_output=True, timeout=60)
+        if done.returncode == 0:
+            os.environ.update(env)
             return name
-    raise UserError(f"vision=camera: no OpenGL for offscreen rendering; install one: {INSTALL}; or use vision=truth")
+    raise UserError(f"vision=camera: no OpenGL for offscreen rendering; {system.no_renderer()}; or use vision=truth")
 
 
 # -- the driver
@@ -409,7 +405,7 @@ class SimulatedXHand:
         shared = _shared(context, self.joints, self.taxels)
         self._views = _views(shared)
         self._number, self._object = 0, 0.0
-        process = context.Process(target=_live, args=(self._args, shared, self.latency, os.getpid()), daemon=True)
+        process = context.Process(target=_live, args=(self._args, shared, self.latency), daemon=True)
         process.start()
         self._process = process
         limit = time.monotonic() + 180.0
@@ -519,7 +515,7 @@ def _views(raw: tuple) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
+def _live(args: tuple, raw: tuple, latency: float) -> None:
     """The hand's own process: one bus cycle after the other until it is told to stop or its parent is gone."""
     import signal
 
@@ -527,8 +523,9 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
 
     from dexsim.sim.quiet import quiet_warp
 
-    for number in (signal.SIGINT, signal.SIGHUP):  # the loop's to handle: it relaxes first
+    for number in set(system.stop_signals()) - {signal.SIGTERM}:  # the loop's to handle: it relaxes first
         signal.signal(number, signal.SIG_IGN)
+    lives = multiprocessing.parent_process().is_alive  # type: ignore[union-attr]  # this is a child
     torch.set_num_threads(1)
     quiet_warp("cpu")
     v = _views(raw)
@@ -541,7 +538,7 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
         hand.advance(k * BUS_PERIOD)  # compiles what is left
     zero, taken, count = time.monotonic() - hand.time, 0, -1
     due = time.monotonic()
-    while not v["stop"].value and os.getppid() == parent:
+    while not v["stop"].value and lives():
         number = v["sent"].value
         if number > taken:
             row = v["command"][number % 2].copy()

@@ -16,6 +16,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from dexsim import system
+
 # -- cores ------------------------------------------------------------------------------------------------------------
 # The cores of a machine: joints searched side by side, each a problem of its own in a thread of its own, and on a CPU
 # each launch of one in parts side by side. (Launches release the interpreter.)
@@ -36,7 +38,7 @@ def cores() -> int:
     given = os.environ.get("OMP_NUM_THREADS", "")
     if given.isdigit() and int(given) > 0:
         return int(given)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return system.cores()
 
 
 def parts(steps: np.ndarray, guesses: int) -> list[tuple[slice, slice]]:
@@ -77,7 +79,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(cores(), thread_name_prefix="plant")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has none of its parent's threads
+system.after_fork(_pool.cache_clear)  # a child process has none of its parent's threads
 
 
 def workers(device: str, jobs: int) -> int:
@@ -177,7 +179,7 @@ def _hands() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_GPU, thread_name_prefix="hypothesis")
 
 
-os.register_at_fork(after_in_child=_hands.cache_clear)
+system.after_fork(_hands.cache_clear)
 
 
 def each(count: int, work: Callable[[int], T]) -> list[T]:

@@ -222,7 +222,7 @@ def git_state(folder: Path | None = None) -> dict[str, Any]:
 
     def git(*args: str) -> str | None:
         try:
-            done = subprocess.run(["git", "-C", str(folder), *args], capture_output=True, text=True, timeout=20)
+            done = subprocess.run(["git", "-C", str(folder), *args], capture_output=True, encoding="utf-8", timeout=20)
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None

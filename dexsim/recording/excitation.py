@@ -192,13 +192,13 @@ def write_plan(p: Plan, folder: Path) -> list[Path]:
     left out, the peaks. Returns the paths."""
     paths = [folder / name for name in FILES]
     write_commands(p, paths[0])
-    with open(paths[1], "w", newline="") as file:
+    with open(paths[1], "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["time", *p.mechanism.joints])
         rows.writerows([f"{t:.4f}", *(f"{v:.6f}" for v in row)] for t, row in zip(p.t, p.value, strict=True))
     simulated = recorded(p.run, p.mechanism, Series(p.t, p.value, COMMANDS), p.mechanism.joints, rate=100.0)
     write(paths[2], simulated)
-    paths[3].write_text(yaml.safe_dump(summary(p), sort_keys=False))
+    paths[3].write_text(yaml.safe_dump(summary(p), sort_keys=False), "utf-8")
     return paths
 
 

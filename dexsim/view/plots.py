@@ -30,7 +30,7 @@ def read_progress(path: Path) -> dict[str, list[float]]:
     """Columns of a run's ``progress.csv``; an empty cell is NaN. Raises UserError where there is none."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; train.py writes it into the run folder")
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     names = list(rows[0]) if rows else []
     return {n: [float(r[n]) if r[n] else math.nan for r in rows] for n in names}

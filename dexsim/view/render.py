@@ -43,7 +43,7 @@ def main(folder: Path, path: Path) -> int:
         missing = isinstance(error, (ImportError, AttributeError))  # PyOpenGL's way to say that a library is not there
         print("library not found" if missing else str(error).splitlines()[0] if str(error) else type(error).__name__)
         return NO_GL
-    settings = json.loads((folder / "settings.json").read_text())
+    settings = json.loads((folder / "settings.json").read_text("utf-8"))
     try:
         film(folder, path, settings)
     except OSError as error:

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import system
+
 FIELD_OF_VIEW = 30.0  # degrees, from top to bottom
 
 
@@ -61,20 +63,20 @@ def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
         plain = [
             asdict(s) | {"qpos": [float(x) for x in s.qpos], "lookat": [float(x) for x in s.lookat]} for s in shots
         ]
-        (folder / "shots.json").write_text(json.dumps(plain))
-        asked = os.environ.get("MUJOCO_GL", "").lower()
+        (folder / "shots.json").write_text(json.dumps(plain), "utf-8")
         reasons = []
-        for backend in (asked,) if asked in video.BACKENDS else video.BACKENDS:
-            env = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+        for backend in system.renderers():
+            env = os.environ | system.renderer_environment(backend)
             done = subprocess.run(
-                [sys.executable, "-m", "dexsim.view.stills", name], env=env, capture_output=True, text=True
-            )
+                [sys.executable, "-m", "dexsim.view.stills", name],
+                env=env, capture_output=True, encoding="utf-8", errors="replace",
+            )  # fmt: skip
             if done.returncode == 0:
                 return [np.load(folder / f"{k}.npy") for k in range(len(shots))]
             said = (done.stdout + done.stderr).strip().splitlines()
             reasons.append(f"{backend}: {said[-1] if said else f'status {done.returncode}'}")
     raise video.NoRenderer(
-        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {video.INSTALL}"
+        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); {system.no_renderer()}"
     )
 
 
@@ -91,7 +93,7 @@ def main(folder: Path) -> int:
     except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
         print(str(error).splitlines()[0] if str(error) else type(error).__name__)
         return NO_GL
-    shots = [Shot(**s) for s in json.loads((folder / "shots.json").read_text())]
+    shots = [Shot(**s) for s in json.loads((folder / "shots.json").read_text("utf-8"))]
     for k in sorted({s.model for s in shots}):
         model = mujoco.MjModel.from_binary_path(str(folder / f"{k}.mjb"))
         own = [(n, s) for n, s in enumerate(shots) if s.model == k]

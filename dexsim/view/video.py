@@ -1,7 +1,7 @@
 """Headless video of simulated worlds: MuJoCo's offscreen renderer, several worlds in a grid, as H.264 mp4.
 
 Rendering runs in a process of its own, because MuJoCo fixes its OpenGL backend at import and a broken driver may take
-the process down with it. EGL (GPU or Mesa) is tried first, then OSMesa (CPU); ``MUJOCO_GL=...`` asks for one.
+the process down with it. Which are tried: `dexsim.system.renderers`; ``MUJOCO_GL=...`` asks for one.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import system
 from dexsim.errors import UserError
 
-BACKENDS = ("egl", "osmesa")
 NO_GL = 3  # exit status of the renderer: this backend cannot open a context
-INSTALL = "sudo apt-get install libegl1 libosmesa6, or the like of your system"
 
 
 @dataclass
@@ -82,22 +81,21 @@ def render(
         camera: lookat [3] (m), distance (m), azimuth and elevation (deg) instead of the usual view.
 
     Raises:
-        NoRenderer: neither EGL nor OSMesa opens a context; the message says what to install.
+        NoRenderer: no OpenGL of this system opens a context; the message says what to install.
         UserError: the video cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dexsim_video_") as folder:
         _hand_over(Path(folder), clips, dict(dt=dt, names=list(names), full=full, size=list(size), camera=camera or {}))
-        asked = os.environ.get("MUJOCO_GL", "").lower()
         reasons = []
-        for backend in (asked,) if asked in BACKENDS else BACKENDS:
+        for backend in system.renderers():
             status, said = _run(Path(folder), path, backend, progress)
             if status == 0:
                 return backend
             reasons.append(f"{backend}: {said}")
-            if status not in (NO_GL, -6, -11):  # -6, -11: the driver aborted or crashed
+            if status != NO_GL and not system.crashed(status):
                 raise UserError(f"cannot write {path}: {said}")
-    raise NoRenderer(f"no video: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {INSTALL}")
+    raise NoRenderer(f"no video: no OpenGL for offscreen rendering ({'; '.join(reasons)}); {system.no_renderer()}")
 
 
 def _hand_over(folder: Path, clips: Sequence[Clip], settings: dict[str, Any]) -> None:
@@ -109,15 +107,15 @@ def _hand_over(folder: Path, clips: Sequence[Clip], settings: dict[str, Any]) ->
         arrays = {n: getattr(clip, n) for n in ("qpos", "force", "command") if getattr(clip, n) is not None}
         np.savez(folder / f"{k}.npz", **arrays)
     settings["clips"] = [{"label": clip.label, "text": list(clip.text)} for clip in clips]
-    (folder / "settings.json").write_text(json.dumps(settings))
+    (folder / "settings.json").write_text(json.dumps(settings), "utf-8")
 
 
 def _run(folder: Path, path: Path, backend: str, progress: Callable[[int, int], None]) -> tuple[int, str]:
     """One try with one backend: exit status and the last line it said."""
-    env = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    env = os.environ | system.renderer_environment(backend)
     command = [sys.executable, "-m", "dexsim.view.render", str(folder), str(path)]
     last = ""
-    with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8",
                           errors="replace") as process:
         assert process.stdout is not None
         try:

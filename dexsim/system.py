@@ -1,0 +1,115 @@
+"""Operating systems and containers: where they differ, in one place. All of dexsim asks here and names none itself.
+
+Looked up at each call, so that a test can take away what a system lacks.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+RENDERERS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
+"""OpenGL that MuJoCo can open without a window, by `sys.platform`; Linux: a GPU's or Mesa's, then a CPU's."""
+INSTALL = "sudo apt-get install libegl1 libosmesa6, or the like of your system"
+SHARED = Path("/dev/shm")
+_STILL_ACTIVE, _QUERY = 259, 0x1000  # Windows: GetExitCodeProcess, PROCESS_QUERY_LIMITED_INFORMATION
+_CRASHES = (-6, -11, 0xC0000005, 0xC0000409)  # SIGABRT, SIGSEGV; Windows: access violation, abort
+
+
+def stop_signals() -> dict[int, str]:
+    """Signals that ask a program to end, with their names: Ctrl-C, SIGTERM, and a terminal that closes (SIGHUP; on
+    Windows SIGBREAK). A SIGHUP that is ignored already (nohup) is left out."""
+    found = {int(signal.SIGINT): "Ctrl-C", int(signal.SIGTERM): "SIGTERM"}
+    for name in ("SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+            found[int(number)] = name
+    return found
+
+
+def terminal_gone(number: int) -> bool:
+    """Return whether a signal says that nobody reads what is printed any more."""
+    return number in (getattr(signal, "SIGHUP", None), getattr(signal, "SIGBREAK", None))
+
+
+def lives(pid: int) -> bool:
+    """Return whether there is a process of this number on this machine."""
+    if sys.platform == "win32":  # os.kill(pid, 0) is Ctrl-C there
+        return _lives_on_windows(pid)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        pass
+    return True
+
+
+def _lives_on_windows(pid: int) -> bool:
+    import ctypes
+
+    kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]  # not of Linux
+    handle = kernel.OpenProcess(_QUERY, False, pid)
+    if not handle:
+        return bool(kernel.GetLastError() == 5)  # access denied: somebody else's
+    status = ctypes.c_ulong()
+    kernel.GetExitCodeProcess(handle, ctypes.byref(status))
+    kernel.CloseHandle(handle)
+    return status.value == _STILL_ACTIVE
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def memory() -> tuple[int, int] | None:
+    """Free and total bytes of memory, None where the system does not tell (macOS, Windows)."""
+    if "SC_AVPHYS_PAGES" not in getattr(os, "sysconf_names", ()):
+        return None
+    page = os.sysconf("SC_PAGE_SIZE")
+    return os.sysconf("SC_AVPHYS_PAGES") * page, os.sysconf("SC_PHYS_PAGES") * page
+
+
+def shared_memory() -> int | None:
+    """Bytes that are free in /dev/shm, which GPUs of one machine talk through; None where there is none."""
+    try:
+        about = os.statvfs(SHARED)
+    except (AttributeError, OSError):  # Windows; macOS, some containers
+        return None
+    return about.f_bavail * about.f_frsize
+
+
+def after_fork(forget: Callable[[], None]) -> None:
+    """Call `forget` in every process that is a fork of this one; Windows has none."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=forget)
+
+
+def renderers() -> tuple[str, ...]:
+    """Offscreen OpenGL to try in turn; only the one that MUJOCO_GL asks for, where this system knows it."""
+    known = RENDERERS.get(sys.platform, RENDERERS["linux"])
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    return (asked,) if asked in known else known
+
+
+def renderer_environment(name: str) -> dict[str, str]:
+    """Environment of a process that renders by one of :func:`renderers`."""
+    return {"MUJOCO_GL": name} | ({"PYOPENGL_PLATFORM": name} if name in RENDERERS["linux"] else {})
+
+
+def no_renderer() -> str:
+    """Say how to get an offscreen OpenGL here."""
+    if sys.platform in ("darwin", "win32"):
+        return "it needs a session with a screen (not ssh), or a driver of the graphics card"
+    return f"install one: {INSTALL}"
+
+
+def crashed(status: int) -> bool:
+    """Return whether an exit status says that a process was brought down by its driver."""
+    return status in _CRASHES

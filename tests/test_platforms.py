@@ -1,0 +1,156 @@
+"""Other operating systems and poorer machines, by switching off what they lack (tests/lesser.py)."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from dexsim import files, system
+from dexsim.console.stop import Stop
+
+ROOT = Path(__file__).resolve().parents[1]
+LESSER = Path(__file__).with_name("lesser.py")
+ONLY_HERE = (
+    "SIGHUP", "sched_getaffinity", "register_at_fork", "sysconf", "statvfs", "fcntl", "osmesa", "/dev/shm", "getppid",
+    "os.kill(", "sys.platform", "import resource", "import pwd", "os.fork", "killpg", "setsid",
+)  # fmt: skip
+"""Of one system, or different between them."""
+
+
+def run(name: str, folder: Path, *commands: list[str]) -> subprocess.CompletedProcess:
+    """The commands on a lesser system, in a folder."""
+    env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")} | {
+        "PYTHONPATH": str(ROOT), "PYTHONWARNDEFAULTENCODING": "1", "PYTHONUTF8": "0", "LC_ALL": "C",
+        "PYTHONCOERCECLOCALE": "0", "OMP_NUM_THREADS": "1",
+    }  # fmt: skip
+    return subprocess.run(
+        [sys.executable, LESSER, name], cwd=folder, env=env, input="\n".join(map(json.dumps, commands)), text=True,
+        capture_output=True, timeout=600,
+    )  # fmt: skip
+
+
+def code_lines(path: Path):
+    """Lines of a file that are neither comment nor docstring, roughly: those with a call or an attribute."""
+    return [line.split("#")[0] for line in path.read_text("utf-8").splitlines()]
+
+
+def test_systems_are_named_in_one_file():
+    found = [
+        f"{path.relative_to(ROOT)}: {word}"
+        for path in sorted((ROOT / "dexsim").rglob("*.py"))
+        for line in code_lines(path)
+        for word in ONLY_HERE
+        if word in line and ("(" in line or "import" in line) and '"""' not in line and path.name != "system.py"
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("platform, names", [("linux", ("egl", "osmesa")), ("darwin", ("cgl",)), ("win32", ("wgl",))])
+def test_each_system_has_its_opengl(monkeypatch, platform, names):
+    monkeypatch.setattr(system, "sys", types.SimpleNamespace(platform=platform))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    assert system.renderers() == names
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert system.renderers() == (("osmesa",) if platform == "linux" else names)
+    assert ("PYOPENGL_PLATFORM" in system.renderer_environment(names[0])) == (platform == "linux")
+
+
+def test_a_process_is_asked_for_without_a_signal_on_windows(monkeypatch):
+    """Windows' answers, given by a stand-in for its kernel: running, ended, not there, somebody else's."""
+    asked = []
+
+    class Kernel:
+        def OpenProcess(self, rights, inherit, pid):
+            asked.append(pid)
+            return pid if pid < 3 else 0
+
+        def GetLastError(self):
+            return 5 if asked[-1] == 4 else 87
+
+        def GetExitCodeProcess(self, handle, status):
+            status._obj.value = 259 if handle == 1 else 0
+
+        def CloseHandle(self, handle):
+            pass
+
+    monkeypatch.setattr(system, "sys", types.SimpleNamespace(platform="win32"))
+    monkeypatch.setattr(ctypes, "windll", types.SimpleNamespace(kernel32=Kernel()), raising=False)
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("a signal was sent"))
+    assert [system.lives(k) for k in (1, 2, 3, 4)] == [True, False, False, True]
+    assert files.abandoned(f".a.pt.{files.HOST}.2.tmp") and not files.abandoned(f".a.pt.{files.HOST}.1.tmp")
+
+
+def test_processes_of_this_system():
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert system.lives(os.getpid()) and system.lives(1) and not system.lives(ended.pid)
+
+
+def test_signals_that_are_there(monkeypatch):
+    hangup = signal.SIGHUP
+    monkeypatch.delattr(signal, "SIGHUP")
+    assert set(system.stop_signals()) == {signal.SIGINT, signal.SIGTERM} and not system.terminal_gone(hangup)
+    with Stop() as stop:
+        stop.gently = True
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.asked() and stop.status == 143
+    monkeypatch.setattr(signal, "SIGBREAK", hangup, raising=False)  # Windows: the window is closed
+    with Stop() as stop:
+        stop.gently = True
+        monkeypatch.setattr("dexsim.console.stop.without_terminal", lambda: None)
+        os.kill(os.getpid(), hangup)
+        assert stop.asked() and stop.status == 128 + hangup
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["win32", "darwin", "linux"])
+def test_a_lesser_system_trains_plays_and_diagnoses(name, tmp_path):
+    small = ["device=cpu", "worlds=2"]
+    done = run(
+        name, tmp_path,
+        ["train", "task=grasp", *small, "iterations=1", "final_episodes=0", "run=a"],
+        ["play", "checkpoint=runs/grasp/a/policy.pt", *small, "episodes=2", f"video={str(name != 'linux').lower()}"],
+        ["diagnose", "demo=true"],
+        ["audit", "out/demo/recordings/motion_1.mcap"],
+        ["excite", "joints=index_joint1", "kinds=steps", "out=excited"],
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
+    assert (tmp_path / "out/demo/report.html").is_file() and (tmp_path / "excited").is_dir()
+    assert ("no video: no OpenGL" in done.stdout) == (name != "linux"), done.stdout  # and the play went on
+
+
+@pytest.mark.slow
+def test_a_container_without_shared_memory(tmp_path):
+    """A /dev/shm in which nothing can be made: what processes share goes into the folder of temporary files."""
+    script = "mount -t tmpfs -o size=4k none /dev/shm && head -c 4096 /dev/zero > /dev/shm/full && exec \"$@\""
+    if subprocess.run(["unshare", "-m", "sh", "-c", script, "x", "true"], capture_output=True).returncode:
+        pytest.skip("no mounts of its own here")
+    program = "from dexsim import system; print(system.shared_memory())"
+    env = os.environ | {"PYTHONPATH": f"{ROOT}:{Path(__file__).parent}"}
+    run = ["unshare", "-m", "sh", "-c", script, "x", sys.executable]
+    done = subprocess.run([*run, "-c", program], env=env, capture_output=True, text=True)
+    assert done.stdout.strip() == "0", done.stderr
+    done = subprocess.run(
+        [*run, "-m", "dexsim", "deploy", "bundle=" + str(bundle(tmp_path)), "driver=sim", "seconds=2",
+         "stale=9", "late=9", "hang=9", "overruns=99999"],
+        cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def bundle(folder: Path) -> Path:
+    """A bundle of the included policy of the grasp."""
+    done = subprocess.run(
+        [sys.executable, "-m", "dexsim", "export", f"checkpoint={ROOT / 'checkpoints/grasp.pt'}", "out=bundle"],
+        cwd=folder, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "bundle"
