@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.options import options
 from dexsim.console.ending import guard
-from dexsim.errors import UserError
 
 DEFAULTS = {
     "joints": "12",
@@ -34,22 +34,6 @@ DEFAULTS = {
     "replay": "mujoco",
     "out": "",
 }
-
-
-def settings(argv: list[str]) -> dict[str, str]:
-    """key=value arguments over DEFAULTS."""
-    out = dict(DEFAULTS)
-    for a in argv:
-        key, equals, value = a.partition("=")
-        if not equals or key not in out:
-            raise UserError(
-                f"'{a}' is not a setting of this benchmark: {', '.join(f'{k}={v}' for k, v in DEFAULTS.items())}"
-            )
-        out[key] = value
-    for key in ("joints", "recordings", "seed"):
-        if not out[key].isdigit():
-            raise UserError(f"{key}={out[key]}: must be a whole number")
-    return out
 
 
 def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool, seed: int) -> tuple[list[Path], str]:
@@ -132,7 +116,7 @@ def main(argv: list[str]) -> int:
     if argv and argv[0] in ("-h", "--help"):
         print(__doc__)
         return 0
-    s = settings(argv)
+    s = options(argv, DEFAULTS)
     from dexsim.gap import demo
     from dexsim.gap.command import available
     from dexsim.gap.diagnosis import Settings, diagnose, save

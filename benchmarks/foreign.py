@@ -26,35 +26,18 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
+from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 NULLS = range(49, 61)  # numbers of the plant's cases with nothing missing
 SETTINGS = {
-    "seed": "source",
-    "nulls": "40",
-    "cases": "",
-    "jobs": "1",
-    "limit": "300",
-    "plant": "../shared/foreign",
-    "out": "out/foreign",
-    "threads": "1",
-}
-
-
-def parse(argv: Sequence[str]) -> dict[str, str]:
-    """key=value settings as text; UserError for one that does not exist."""
-    given = dict(SETTINGS)
-    for argument in argv:
-        key, equals, text = argument.partition("=")
-        if not equals or key not in SETTINGS:
-            raise UserError(f"'{argument}' is not a setting; valid: {', '.join(SETTINGS)} (key=value)")
-        if key in ("nulls", "jobs", "limit", "threads") and not text.isdigit():
-            raise UserError(f"{argument}: must be a whole number")
-        given[key] = text
-    return given
+    "seed": "source", "nulls": 40, "cases": "", "jobs": 1, "limit": 300, "plant": "../shared/foreign",
+    "out": "out/foreign", "threads": 1,
+}  # fmt: skip
 
 
 def seed_of_sources(folder: Path = ROOT / "dexsim") -> int:
@@ -215,7 +198,7 @@ def table(truths: Sequence[dict], answers: dict[str, dict | None], seconds: dict
 
 def main(argv: Sequence[str]) -> dict | None:
     """Runs the benchmark; returns what the JSON line says, None where it is skipped."""
-    s = parse(argv)
+    s = options(argv, SETTINGS)
     plant = Path(s["plant"]).expanduser().resolve()
     if not (plant / "generate.py").is_file():
         print(f"skipped: plant={plant} is not there (a plant by other hands, which is not part of dexsim)")
@@ -224,27 +207,24 @@ def main(argv: Sequence[str]) -> dict | None:
         print("skipped: the plant is compiled by numba, which is not installed (pip install numba)")
         return None
     seed = seed_of_sources() if s["seed"] == "source" else int(s["seed"])
-    out, jobs = Path(s["out"]).expanduser().resolve() / f"seed_{seed}", int(s["jobs"])
+    out, jobs = Path(s["out"]).expanduser().resolve() / f"seed_{seed}", s["jobs"]
     only = [int(x) for x in s["cases"].strip("[]").split(",") if x]
     if not (out / "made").is_file():
         print(f"making the cases of seed {seed} ...", flush=True)
         wanted: list[tuple[int, Sequence[int]]] = [(seed, only)]
-        for k in range(0, int(s["nulls"]), len(NULLS)):
-            wanted.append((seed + 1 + k // len(NULLS), list(NULLS)[: int(s["nulls"]) - k]))
+        for k in range(0, s["nulls"], len(NULLS)):
+            wanted.append((seed + 1 + k // len(NULLS), list(NULLS)[: s["nulls"] - k]))
         generate(plant, wanted, out, jobs)
         (out / "made").write_text("", encoding="utf-8")
     ids = sorted(p.name for p in (out / "cases").iterdir())
     np.random.default_rng(seed).shuffle(ids)  # where it is ended early, what was done is a fair sample
-    begun = time.perf_counter()
     with ThreadPoolExecutor(max(jobs, 1)) as pool:
         work = [
-            pool.submit(diagnose, out / "cases" / i, out / "diagnoses" / i, int(s["limit"]), int(s["threads"]))
+            pool.submit(diagnose, out / "cases" / i, out / "diagnoses" / i, s["limit"], s["threads"])
             for i in ids
         ]
-        for n, done in enumerate(as_completed(work), 1):
+        for done in tqdm(as_completed(work), "diagnosed", len(work)):
             done.result()
-            spent = time.perf_counter() - begun
-            print(f"  {n}/{len(ids)}, about {spent / n * (len(ids) - n):.0f} s left", flush=True)
     return report(plant, out)
 
 

@@ -28,7 +28,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from tqdm import tqdm
 
+from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -659,12 +661,7 @@ def show(results: list[dict]) -> str:
 
 def main(argv: list[str]) -> dict:
     """Runs the sweep; returns what the JSON line says."""
-    s = dict(SETTINGS)
-    for argument in argv:
-        key, equals, text = argument.partition("=")
-        if not equals or key not in s or (key not in ("out", "effects") and not text.isdigit()):
-            raise UserError(f"'{argument}' is not a setting; valid: {', '.join(s)} (key=value)")
-        s[key] = text if key in ("out", "effects") else int(text)
+    s = options(argv, SETTINGS)
     s["out"] = str(Path(s["out"]).expanduser().resolve())
     effects = {e for e in s["effects"].split(",") if e}
     unknown = effects - set(PLANTS) - {p.effect for p in PLANTS.values()}
@@ -710,22 +707,19 @@ def _warm(kernel) -> None:
 
 
 def _watch(stream, total: int, start: float, limit: float) -> list[dict]:
-    """Results as they come, until all are there or `limit` [s] is over (0: none)."""
+    """Return results as they come, until all are there or `limit` [s] is over (0: no limit)."""
     out: list[dict] = []
-    while len(out) < total:
-        left = limit - (time.perf_counter() - start) if limit else None
-        try:
-            if left is not None and left <= 0:
-                raise mp.TimeoutError
-            out.append(stream.next(left) if hasattr(stream, "next") else next(stream))
-        except mp.TimeoutError:
-            print(f"  {limit:g} s are over: {len(out)} of {total} cases are done", flush=True)
-            break
-        r = out[-1]
-        spent = time.perf_counter() - start
-        print(f"  {len(out)}/{total} {r['kind'] or 'nothing'} ({r['tier']}): {' '.join(r['said']) or '-'};"
-              f" {r['seconds']:.0f} s;"
-              f" about {spent / len(out) * (total - len(out)):.0f} s left", flush=True)  # fmt: skip
+    with tqdm(total=total, desc="cases") as bar:
+        while len(out) < total:
+            left = limit - (time.perf_counter() - start) if limit else None
+            try:
+                if left is not None and left <= 0:
+                    raise mp.TimeoutError
+                out.append(stream.next(left) if hasattr(stream, "next") else next(stream))
+            except mp.TimeoutError:
+                bar.write(f"{limit:g} s are over: {len(out)} of {total} cases are done")
+                break
+            bar.update()
     return out
 
 

@@ -17,7 +17,7 @@ COMMANDS = sorted(
 
 
 def test_commands_are_found():
-    assert {"step", "engines", "planted", "concealed", "loop", "reproduce"} <= set(COMMANDS)
+    assert {"step", "learning", "planted", "concealed", "loop", "real"} <= set(COMMANDS)
 
 
 def ends_well(done, name):
@@ -39,7 +39,7 @@ def test_help_from_a_shell():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["benchmarks.loop.worlds", "benchmarks.reproduce.pack", "dexsim.tasks.reality"])
+@pytest.mark.parametrize("module", ["benchmarks.loop.worlds", "dexsim.tasks.reality"])
 def test_help_of_what_writes_files(module):
     done = forked.run(module, "--help")
     assert done.returncode == 0 and module in done.stdout, done.stderr

@@ -10,12 +10,12 @@ import torch
 import warp as wp
 from worlds import grasp_env
 
-from benchmarks import cylinder_exact
-from benchmarks import narrow_phase as bench
 from dexsim.errors import UserError
 from dexsim.sim import make_engine, warmup
 from dexsim.sim.collision import unsupported
 from dexsim.sim.pendulum import pendulum_spec
+from tests import cylinder_exact
+from tests import narrow_phase as bench
 
 POSES = 768
 

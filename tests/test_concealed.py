@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from benchmarks.concealed import __main__ as command
-from benchmarks.concealed import baselines, effects, generate, page, plant, rigs, same_cases, score, touch
+from benchmarks.concealed import effects, generate, plant, rigs, same_cases, score, touch
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.recording import read
@@ -488,48 +488,9 @@ def test_three_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
     assert command.main(cases)["lines"] == line["lines"]
 
 
-def test_baselines_recover_what_they_can(tmp_path, monkeypatch):
-    """CMA-ES finds a minimum; the plain simulation agrees with the plant where nothing but a known delay is wrong."""
-    best = baselines.cma(
-        lambda x: ((x - [0.3, -0.2]) ** 2 * [1.0, 25.0]).sum(1),
-        np.array([-1.0, -1.0]),
-        np.array([1.0, 1.0]),
-        np.array([0.8, 0.8]),
-        40,
-        0,
-    )
-    assert best == pytest.approx([0.3, -0.2], abs=0.01)
-    monkeypatch.setattr(generate, "SECONDS", 1.5)
-    monkeypatch.setattr(generate, "SIZES", 2)
-    made = generate.build(entries("none")[0], 9, 3, tmp_path / "cases", tmp_path / "truth")
-    rig = baselines.Rig(tmp_path / "cases" / made["name"])
-    error = rig.error({"delay": np.array([0.0, 0.05])}, baselines.HELD)
-    assert error[0] < 0.02 and error[1] > 2 * error[0]
-
-
-def test_the_hidden_number_is_compared_where_both_have_it(tmp_path):
-    """mujoco.sysid's armature is of the rotor, the truth's is beyond what is believed; an effect that is not named is
-    100 % off."""
-    said = tmp_path / "diagnosis.json"
-    said.write_text(
-        json.dumps(
-            {"findings": [{"effect": "inertia", "parameters": {"armature": {"value": 1.1e-3, "low": 0, "high": 2e-3}}}]}
-        )
-    )
-    effect = {"kind": "inertia", "effect": "inertia", "parameters": {"armature": 1e-3}}
-    found = {"sysid_values": {"armature": 1.8e-3}, "meant": {"armature": 6e-4, "mass": 0.1, "kp": 1.0}}
-    assert baselines._parameter(effect, said, found) == pytest.approx({"sysid": 0.2, "diagnose": 0.1})
-    said.write_text(json.dumps({"findings": []}))
-    assert baselines._parameter(effect, said, found)["diagnose"] == 1.0
-    assert (
-        baselines._parameter(effect, said, {}) is None
-        and baselines._parameter({**effect, "kind": "backlash"}, said, found) is None
-    )
-
-
 def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, monkeypatch):
-    """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong answer; other
-    methods' cases come among them."""
+    """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong
+    answer."""
     made = [{"name": "late", "digest": ""}, {"name": "slow", "digest": ""}]
     monkeypatch.setattr(sys, "executable", "/bin/false")
     begun = command.time.perf_counter()
@@ -544,35 +505,6 @@ def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, mon
     assert not (tmp_path / "diagnoses" / "late" / "seconds").exists()
     assert json.loads((tmp_path / "diagnoses" / "slow" / "diagnosis.json").read_text())["status"] == "out of time"
     assert command._room(s, begun - 1.5) <= 1.0 and command._room({"until": 0, "limit": 9}, begun) == 9
-    command._others(made[0], s, tmp_path, begun)  # one that is not done has no say
-    assert baselines.compare(made, [], tmp_path)["cases"] == []
-
-
-def test_the_others_are_asked_about_what_stands_out(some):
-    root, made, _ = some
-    kinds = {m["name"]: p["kinds"] for m, p in zip(made, some[2], strict=True)}
-    picked = [kinds[m["name"]] for m in baselines.comparable(made, root, 9)]
-    assert picked and ["cable_spring"] not in picked and [] not in picked
-    assert len(baselines.comparable(made, root, 1)) == 1 and baselines.comparable(made, root, 0) == []
-
-
-def test_right_by_size_and_by_confidence_are_counted():
-    r = {
-        "group": "effect",
-        "decoy": "",
-        "right": True,
-        "ratio": 3.0,
-        "hidden": [("lag", "j")],
-        "said": [("lag", "j", 0.99, []), ("payload", "j", 0.7, [])],
-    }
-    silent, as_set = (
-        {**r, "right": False, "said": [], "ratio": 39.0},
-        {**r, "said": [("lag", "j", 0.9, ["command_delay", "lag"])]},
-    )
-    sizes = {a: x for a, _, *x in page.by_size([r, silent, as_set])}
-    assert sizes[2.2] == [2, 2, 0] and sizes[6.0] == [1, 0, 1] and sizes[1.25] == [0, 0, 0]
-    sure = {a: x for a, _, *x in page.by_confidence([r, silent, as_set, {**r, "decoy": "bad_channel"}])}
-    assert sure[0.95] == [1, 1] and sure[0.65] == [1, 0] and sure[0.8] == [0, 0]  # a set is no single name
 
 
 def test_two_runs_of_the_same_cases_are_compared_case_by_case(tmp_path):

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import narrow_phase as bench
-from benchmarks import places
+from tests import narrow_phase as bench
+from tests import places
 
 # All of 4.4 million contacts with one nearest point whose place was more than 1e-6 m off: a facet 1e-4 rad across left
 # out, a face near its corner taken for its edge or its edge for it, the prism's chord for the rim. Then crossing edges,

@@ -227,7 +227,7 @@ def test_every_benchmark_stands_where_figures_are_reproduced():
         p.stem for p in (ROOT / "benchmarks").glob("*.py") if f"python -m benchmarks.{p.stem}" in p.read_text("utf-8")
     ]
     jobs += [p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")]
-    assert len(jobs) > 15
+    assert len(jobs) > 7
     assert [job for job in sorted(jobs) if not re.search(rf"\b{job}\b", text)] == []
 
 

@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from worlds import task_cfg
 
-from benchmarks import launches
 from dexsim.sim import warmup
 from dexsim.tasks import make_env
+from tests import launches
 
 MOST = {"grasp": 110, "rotate": 440}
 """101 and 436 were counted when this was written."""

@@ -106,32 +106,6 @@ def test_a_models_meshes_stay_in_its_folder(tmp_path, where):
     mujoco.MjModel.from_xml_path(str(out / "model.xml"))
 
 
-def test_archives_of_others_stay_and_a_cut_one_leaves_no_half(tmp_path):
-    import io
-    import os
-    import tarfile
-
-    from benchmarks.reproduce import pack
-
-    (tmp_path / "state_0.tgz").write_text("mine")
-    job = tmp_path / "out" / "row" / "seed0" / "train_1"
-    job.mkdir(parents=True)
-    (job / "last.pt").write_bytes(b"x")
-    with pytest.raises(UserError, match="state_0.tgz is not a result"):
-        pack.pack(tmp_path / "out", tmp_path / "state", 1e6)
-    assert (tmp_path / "state_0.tgz").read_text() == "mine"
-    with tarfile.open(tmp_path / "cut_0.tgz", "w:gz") as archive:
-        for name in ("a", "b"):
-            entry = tarfile.TarInfo(f"row/{name}")
-            entry.size = 300_000
-            archive.addfile(entry, io.BytesIO(os.urandom(300_000)))
-    data = (tmp_path / "cut_0.tgz").read_bytes()
-    (tmp_path / "cut_0.tgz").write_bytes(data[: int(0.75 * len(data))])
-    with pytest.raises(UserError, match="cut off"):
-        pack.unpack(tmp_path / "cut", tmp_path / "there")
-    assert [(p.name, p.stat().st_size) for p in (tmp_path / "there").rglob("*") if p.is_file()] == [("a", 300_000)]
-
-
 def killed(work) -> None:
     """Run in a child that ends with kill -9 inside `work`."""
     import os

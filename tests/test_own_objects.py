@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
 
 from dexsim import import_object
 from dexsim.assets.objects import decompose, library, mesh, own, parts
-from dexsim.assets.objects.geometry import signed_distance
+from dexsim.assets.objects.geometry import _triangle_distance, signed_distance
 from dexsim.cli import objects as settings
 from dexsim.errors import UserError
 from dexsim.sim.scene import SLOTS, hand_object_scene
@@ -237,20 +238,75 @@ def test_import_object_refuses(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+BALL = 0.006  # m, radius of the ball that looks for contact
+BAND = 0.008  # m from the mesh to the ball's surface, at most
+
+
+def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Winding number [P] of a closed surface about points [P, 3]: 1 inside, 0 outside (Van Oosterom and Strackee 1983,
+    The solid angle of a plane triangle)."""
+    out = np.empty(len(points))
+    for k, p in enumerate(points):
+        a, b, c = (triangles[:, i] - p for i in range(3))
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        over = np.einsum("ti,ti->t", a, np.cross(b, c))
+        under = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+        out[k] = 2 * np.arctan2(over, under).sum() / (4 * np.pi)
+    return out
+
+
+def mesh_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Exact signed distance [P] m, negative inside."""
+    far = np.concatenate([_triangle_distance(points[k : k + 1000], triangles) for k in range(0, len(points), 1000)])
+    return np.where(winding(points, triangles) > 0.5, -far, far)
+
+
+def places(triangles: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """Centres [count, 3] of balls about a surface."""
+    rng = np.random.default_rng(seed)
+    size = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    chosen = triangles[rng.choice(len(triangles), count, p=size / size.sum())]
+    points = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), count), chosen)
+    way = rng.normal(size=(count, 3))
+    return points + way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(0, BALL + BAND, (count, 1))
+
+
+def model_of(shape):
+    """The object, fixed, and a ball."""
+    spec = mujoco.MjSpec()
+    for k, hull in enumerate(shape.hulls):
+        spec.add_mesh(name=f"part{k}", uservert=np.asarray(hull).ravel())
+        spec.worldbody.add_geom(name=f"part{k}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{k}")
+    ball = spec.worldbody.add_body(name="ball", pos=[0, 0, 0.2])
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[BALL, 0, 0], density=1000)
+    return spec.compile()
+
+
+def contact_distance(shape, centres):
+    """What MuJoCo measures [P] m from the ball's surface to the nearest of the object's geoms."""
+    spec_model = model_of(shape)
+    data = mujoco.MjData(spec_model)
+    body, ball = spec_model.body("ball").id, spec_model.geom("ball").id
+    out = np.full(len(centres), np.inf)
+    for k, centre in enumerate(centres):
+        spec_model.body_pos[body] = centre
+        mujoco.mj_kinematics(spec_model, data)
+        for g in range(len(shape.hulls)):
+            out[k] = min(out[k], mujoco.mj_geomDistance(spec_model, data, g, ball, 1.0, None))
+    return out
+
+
 @pytest.mark.slow
 def test_a_pipe_split_by_coacd_is_open_for_contact_and_touch(tmp_path):
-    """The measure of `benchmarks.objects`, on its simplest solid."""
     pytest.importorskip("coacd")
-    from benchmarks import objects as benchmark
-
     solid = trimesh.creation.annulus(r_min=0.018, r_max=0.026, height=0.07, sections=24)
     solid.export(tmp_path / "pipe.stl")
     error = {}
     for most in (1, 16):
         shape = own.own_shape(str(tmp_path / "pipe.stl"), parts=most)
         triangles = (np.asarray(solid.triangles) - shape.file_centre) @ shape.file_axes
-        centres = benchmark.places(triangles, 300)
-        true = benchmark.mesh_distance(centres, triangles)
+        centres = places(triangles, 300)
+        true = mesh_distance(centres, triangles)
         centres, true = centres[true > 0.004], true[true > 0.004]
-        error[most] = np.abs(benchmark.contact_distance(shape, centres) - (true - benchmark.BALL)).mean()
+        error[most] = np.abs(contact_distance(shape, centres) - (true - BALL)).mean()
     assert error[16] < 0.1 * error[1] and error[16] < 5e-4

@@ -12,10 +12,10 @@ import warp as wp
 from worlds import grasp_env
 
 from benchmarks import tools
-from benchmarks.narrow_phase import tip_vertices
 from dexsim.assets.objects import library
 from dexsim.sim.collision import NarrowPhase
 from dexsim.sim.solver import NewtonSolver
+from tests.narrow_phase import tip_vertices
 
 WORLDS = 4
 pytestmark = pytest.mark.slow

@@ -3,7 +3,6 @@
     python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [laws=two] [out=out/concealed] [jobs=1]
     [limit=900] [budget=0] [until=0] [first=0] [hand=xhand] [mirror=false] [braking=unsaid]
     python -m benchmarks.concealed ci=true                    # six cases of one to three joints
-    python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight
 
 mix: number of cases by group (see `generate.plan`); seed: a number, or `source`: read off the sources of dexsim, so
 that no change of the tool can have been made with its cases in view; hand, mirror: whose cases those of the groups hand
@@ -19,7 +18,6 @@ with laws=one, seed_N_NAME of another hand, seed_N_said with braking=said); prin
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import subprocess
@@ -30,71 +28,35 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import yaml
+from tqdm import tqdm
 
-from benchmarks.concealed import baselines, generate, laws, score
+from benchmarks.concealed import generate, laws, score
 from benchmarks.foreign import seed_of_sources
+from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
-            "budget": 0, "until": 0, "first": 0, "baselines": 0, "ci": False, "one_joint": False,
+SETTINGS = {"mix": "", "seed": "1", "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
+            "budget": 0, "until": 0, "first": 0, "ci": False, "one_joint": False,
             "hand": "xhand", "mirror": False, "braking": "unsaid"}
 CI = {"effect": 2, "none": 1, "pair": 1, "outside": 1, "decoy": 1}
 
 
 def parse(argv: list[str]) -> dict:
-    """key=value settings; UserError for one that does not exist or is no number."""
-    given = dict(SETTINGS)
-    for argument in argv:
-        key, equals, text = argument.partition("=")
-        if not equals or key not in SETTINGS:
-            raise UserError(f"'{argument}' is not a setting; valid: {', '.join(SETTINGS)} (key=value)")
-        if key == "mix":
-            pairs = [part.partition(":")[::2] for part in text.split(",")]
-            if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
-                raise UserError(f"mix={text}: must read like effect:14,none:4 with groups of {', '.join(generate.MIX)}")
-            given[key] = {group: int(number) for group, number in pairs}
-        elif key in ("out", "hand"):
-            given[key] = text
-        elif key == "laws":
-            if text not in laws.LAWS:
-                raise UserError(f"laws={text}: must be {' or '.join(laws.LAWS)}")
-            given[key] = text
-        elif key == "braking":
-            if text not in ("said", "unsaid"):
-                raise UserError(f"braking={text}: must be said or unsaid")
-            given[key] = text
-        elif key == "seed" and text == "source":
-            given[key] = seed_of_sources()
-        elif isinstance(SETTINGS[key], bool):
-            if text not in ("true", "false"):
-                raise UserError(f"{key}={text}: must be true or false")
-            given[key] = text == "true"
-        elif text.isdigit():
-            given[key] = int(text)
-        else:
-            raise UserError(f"{key}={text}: must be a whole number")
+    """Return the settings; raises UserError for one that does not exist or has a value that is not allowed."""
+    given = options(argv, SETTINGS, laws=laws.LAWS, braking=("said", "unsaid"))
+    pairs = [part.partition(":")[::2] for part in given["mix"].split(",") if part]
+    if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
+        raise UserError(f"mix={given['mix']}: must read like effect:14,none:4, groups of {', '.join(generate.MIX)}")
+    given["mix"] = {group: int(number) for group, number in pairs} or dict(generate.MIX)
+    if given["seed"] != "source" and not given["seed"].isdigit():
+        raise UserError(f"seed={given['seed']}: must be a whole number or source")
+    given["seed"] = seed_of_sources() if given["seed"] == "source" else int(given["seed"])
     if given["ci"]:
         given["mix"] = dict(CI)
     return given
-
-
-class Progress:
-    """A line now and then: done of all, seconds left."""
-
-    def __init__(self, what: str, total: int):
-        self.what, self.total, self.done, self.start, self.last = what, total, 0, time.perf_counter(), 0.0
-
-    def __call__(self) -> None:
-        """One more is done."""
-        self.done += 1
-        spent = time.perf_counter() - self.start
-        if spent - self.last > 5 or self.done == self.total:
-            self.last = spent
-            print(f"  {self.what} {self.done}/{self.total}, about {spent / self.done * (self.total - self.done):.0f} s"
-                  " left", flush=True)
 
 
 def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
@@ -151,16 +113,6 @@ def _room(s: dict, begun: float) -> float:
     return min(s["limit"], max(s["until"] - (time.perf_counter() - begun), 1.0)) if s.get("until") else s["limit"]
 
 
-def _others(m: dict, s: dict, root: Path, begun: float) -> None:
-    """What other methods leave of a case's error, kept on disk, unless the budget is spent."""
-    kept = root / "baselines" / f"{m['name']}.json"
-    if kept.is_file() or _spent(s, begun):
-        return
-    argv = [sys.executable, "-m", "benchmarks.concealed.baselines", str(root / "cases" / m["name"]), str(kept)]
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        subprocess.run(argv, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=_room(s, begun), check=False)
-
-
 def main(argv: list[str]) -> dict:
     """Runs the benchmark; returns what the JSON line says."""
     s = parse(argv)
@@ -178,25 +130,17 @@ def main(argv: list[str]) -> dict:
     # the hand's first: they take longest, and the run's end would cut them off. Else in the order of the plan, which is
     # drawn: where the budget ends the run, what was done is a fair sample of each
     jobs.sort(key=lambda job: -len(job[0]["kinds"]) - 1 if job[0]["shape"] == "hand" else 0)
-    made, tick = [], Progress("made", len(jobs))
     with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
-        for m in pool.map(generate.once, jobs):
-            made.append(m)
-            tick()
+        made = list(tqdm(pool.map(generate.once, jobs), "made", len(jobs)))
     (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made,
                                                                                              key=lambda m: m["name"])),
                                                                                              encoding="utf-8")
     print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}",
           flush=True)
-    work = [(_diagnose, m) for m in made]
-    compared = baselines.comparable(made, root, s["baselines"])
-    for k, m in enumerate(compared):  # among the diagnoses, not after them all: the budget may end before
-        work.insert((k + 1) * len(work) // (2 * len(compared)), (_others, m))
-    tick = Progress("diagnosed", len(work))
     with ThreadPoolExecutor(max(s["jobs"], 1)) as pool:
-        for done in as_completed([pool.submit(run, m, s, root, begun) for run, m in work]):
+        waiting = [pool.submit(_diagnose, m, s, root, begun) for m in made]
+        for done in tqdm(as_completed(waiting), "diagnosed", len(waiting)):
             done.result()
-            tick()
     results, seconds = [], []
     for m in made:
         folder = root / "diagnoses" / m["name"]
@@ -206,12 +150,10 @@ def main(argv: list[str]) -> dict:
         results.append(score.one(truth, json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))))
         seconds.append(float((folder / "seconds").read_text()))
     lines = score.table(results)
-    others = None
-    if compared:
-        others = baselines.compare(compared, results, root)
-    (root / "results.json").write_text(json.dumps({"seed": s["seed"], "results": results, "lines": lines,
-                                                   "baselines": others}), encoding="utf-8")
-    text = score.show(lines, results) + ("\n\n" + baselines.show(others) if others else "")
+    (root / "results.json").write_text(
+        json.dumps({"seed": s["seed"], "results": results, "lines": lines}), encoding="utf-8"
+    )
+    text = score.show(lines, results)
     (root / "table.txt").write_text(text + "\n", encoding="utf-8")
     print("\n" + text)
     line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "left_out": len(made) - len(results),

@@ -15,11 +15,16 @@ import tarfile
 from pathlib import Path
 
 from benchmarks.concealed import score
-from benchmarks.concealed.page import value
+from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 ASKED = ("group", "decoy", "shape", "tier", "hidden")
+
+
+def value(line: str, x: float) -> str:
+    """Return a figure as text: per cent, or a plain number where the line is a score."""
+    return f"{x:.2f}" if any(word in line for word in ("(F1)", "mean", "error removed")) else f"{100 * x:.1f} %"
 
 
 def load(path: str) -> dict[str, dict]:
@@ -79,8 +84,8 @@ def show(before: list[dict], after: list[dict]) -> str:
 
 def main(argv: list[str]) -> int:
     """Exit status; UserError for what is missing."""
-    given = dict(argument.partition("=")[::2] for argument in argv)
-    if set(given) != {"before", "after"}:
+    given = options(argv, {"before": "", "after": ""})
+    if not all(given.values()):
         raise UserError("give before=FILE after=FILE, results.json of two runs of the same cases or archives of them")
     print(show(*compared(load(given["before"]), load(given["after"]))))
     return 0

@@ -19,7 +19,7 @@ run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU, 
 changes next to nothing, so that is for trying the command. diagnose_gpus: GPUs beside those of gpus= on which the
 diagnoses are computed too (a reality each), and then so many trainings at a time. Resumable: a step that is done is not
 repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
-runs is ended. Writes loop.json, table.md, loop.png.
+runs is ended. Writes loop.json and table.md.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from scipy.stats import t as student
 
 from benchmarks.loop import presses
 from benchmarks.loop.steps import FAST, KEPT
+from benchmarks.options import options
 from dexsim import intervals
 from dexsim.console.ending import guard
-from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
@@ -650,46 +650,12 @@ def markdown(data: dict) -> str:
     return "\n".join(text) + "\n"
 
 
-def figure(data: dict, path: Path) -> None:
-    """Each policy in each reality, a point a seed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    lines = [x for x in data["lines"] if any(a == a for v in x["values"].values() for a in v)]
-    if not lines:
-        return
-    rows, columns = -(-len(lines) // 3), min(len(lines), 3)
-    fig, axes = plt.subplots(rows, columns, figsize=(3.2 * columns, 3.1 * rows), squeeze=False)
-    for ax in axes.flat[len(lines) :]:
-        ax.set_visible(False)
-    for ax, line in zip(axes.flat, lines, strict=False):
-        for k, v in enumerate(VARIANTS):
-            y = [a for a in line["values"][v] if a == a]
-            ax.plot([k] * len(y), y, "o", color=("#888888", "#c98f2b", "#2b6cb0", "#2f855a")[k], alpha=0.8)
-            if y:
-                ax.plot([k - 0.25, k + 0.25], [np.mean(y)] * 2, color="black", lw=1.5)
-        ax.set_xticks(range(len(VARIANTS)), ["naive", "wide", "fitted", "true"], fontsize=8)
-        ax.set_title(f"{line['task']} in {line['world']}\n{line['measure']}", fontsize=9)
-        ax.set_xlim(-0.5, len(VARIANTS) - 0.5)
-        ax.grid(axis="y", alpha=0.3)
-    fig.tight_layout()
-    fig.savefig(path, dpi=130)
-    plt.close(fig)
-
-
 def main(argv: list[str]) -> int:
     """Runs what is not done yet and reports. Raises UserError for a setting that is none."""
     if any(a in ("-h", "--help", "help") for a in argv):
         print(__doc__)
         return 0
-    s = dict(SETTINGS)
-    for item in argv:
-        key, equals, value = item.partition("=")
-        if not equals or key not in s:
-            raise UserError(f"{item}: not a setting; valid: {', '.join(s)} (key=value)")
-        s[key] = value
+    s = options(argv, SETTINGS)
     loop = Loop(s)
     loop.out.mkdir(parents=True, exist_ok=True)
     if s["report"] != "true":
@@ -697,7 +663,6 @@ def main(argv: list[str]) -> int:
     data = loop.report()
     (loop.out / "loop.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")
-    figure(data, loop.out / "loop.png")
     print("\n" + markdown(data))
     print(
         json.dumps(

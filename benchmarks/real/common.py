@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from scipy.optimize import differential_evolution
 
 from dexsim.recording import Recording, Series, States, write
 from dexsim.recording.schema import COMMANDS, DEFAULTS, DUTY, ENABLED, STATES, SUPPLY, TEMPERATURES
@@ -65,21 +63,3 @@ def dump(path: Path, content: dict) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return path
-
-
-def fitted(
-    error: Callable[[np.ndarray], np.ndarray], bounds: Sequence[tuple[float, float]], generations: int, seed: int = 0
-) -> np.ndarray:
-    """[P] parameters within `bounds` (equal ends: held) at which error(candidates [C, P]) -> [C] is least, by
-    differential evolution."""
-    return differential_evolution(
-        lambda x: error(x.T),
-        list(bounds),
-        vectorized=True,
-        updating="deferred",
-        popsize=CANDIDATES,
-        maxiter=generations,
-        tol=1e-4,
-        polish=False,
-        seed=seed,
-    ).x

@@ -24,8 +24,7 @@ from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 BLOCK_DIM = 128
 """Threads a block of the touch kernel on CUDA: 4 warps, each a pad of its own."""
 REGISTERS = 80
-"""Most registers of its threads: 3 to 10 % faster than as many as the compiler likes (H200; `benchmarks.touch
-variants=true`)."""
+"""Most registers of its threads: 3 to 10 % faster on an H200 than as many as the compiler likes."""
 
 
 class Posed(Protocol):

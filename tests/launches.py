@@ -1,6 +1,6 @@
 """Kernels that a control step launches outside physics, and which lines launch them.
 
-    python -m benchmarks.launches [lines=25] [any setting of train.py]
+    python -m tests.launches [lines=25] [any setting of train.py]
 
 On a GPU each of them costs 1.6 to 2 us, whatever it does, so that their number is what the step costs beside its
 physics. They are counted on a CPU with MuJoCo-Warp, in the step as a GPU records it: torch operations that compute

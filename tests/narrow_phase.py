@@ -1,6 +1,6 @@
 """Contacts of two bodies: how exact and how fast, of dexsim's own narrow phase and of MuJoCo-Warp's, in one run.
 
-    python -m benchmarks.narrow_phase [poses=100000] [device=cuda:0] [worlds=8192] [kinds=box-hull,...]
+    python -m tests.narrow_phase [poses=100000] [device=cuda:0] [worlds=8192] [kinds=box-hull,...]
                                       [out=narrow_phase.json]
 
 Random poses of every kind of pair that a hand and an object have; surfaces from 2 mm deep to 1.5 mm (the margin) apart.
@@ -36,12 +36,12 @@ import numpy as np
 import warp as wp
 
 from benchmarks import tools
-from benchmarks.places import exact, judge
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.sim.collision import NarrowPhase
 from dexsim.sim.collision.shapes import hull_corners
+from tests.places import exact, judge
 
 MARGIN = 0.0015
 REFERENCE, MUJOCO_WARP = (1e-14, 200), (1e-6, 35)

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
-from benchmarks import cylinder_exact
 from dexsim.sim.collision.shapes import hull_corners
+from tests import cylinder_exact
 
 LIMIT = 1e-6
 """What a place is held to [m]."""

@@ -1,1 +1,0 @@
-"""dexsim beside what else one could use, in one run on one machine: only ratios are meant to be quoted."""

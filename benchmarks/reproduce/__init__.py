@@ -1,1 +1,0 @@
-"""The paper's two ablation tables, trained and judged again: `python -m benchmarks.reproduce table=rotation|grasp`."""
