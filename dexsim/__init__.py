@@ -28,7 +28,10 @@ Importing dexsim loads nothing else: a name is loaded when it is first used.
 
 from __future__ import annotations
 
+import ctypes.util
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from dexsim.version import VERSION as __version__
@@ -76,6 +79,20 @@ _ELSEWHERE = {
     "UserError": "dexsim.errors",
 }
 """Modules of the names that are not in `dexsim.api`."""
+
+
+def _without_absent_gl() -> None:
+    """Turns MUJOCO_GL off where it names an OpenGL that is not here: MuJoCo loads it when it is imported, and commands
+    that draw nothing would die of it. What draws tries each backend in a process of its own (`dexsim.view.video`)."""
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    libraries = {"osmesa": "OSMesa", "egl": "EGL"} if sys.platform == "linux" else {}
+    known = ("", "off", "disable", "disabled", "false", "0", "on", "enable", "enabled", "true", "1", "glfw", "glx",
+             "cgl", "wgl", *libraries)  # fmt: skip
+    if asked not in known or (asked in libraries and not ctypes.util.find_library(libraries[asked])):
+        os.environ["MUJOCO_GL"] = "off"
+
+
+_without_absent_gl()
 
 
 def __getattr__(name: str) -> Any:

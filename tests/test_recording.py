@@ -573,7 +573,8 @@ def test_an_unknown_encoding_is_named(tmp_path):
     [
         (b"", "is empty"),
         (b"hello world", "not an MCAP"),
-        (b"SQLite format 3\0", "ros2 bag convert"),
+        (b"SQLite format 3\0", "SQLite file cannot be read"),
+        (b"#ROSBAG V2.0\n", "rosbags-convert"),
         (None, "does not exist"),
     ],
 )

@@ -84,6 +84,15 @@ def test_without_opengl_there_is_one_line(tmp_path, monkeypatch):
     assert "\n" not in message and not (tmp_path / "a.mp4").exists()
 
 
+@pytest.mark.parametrize("name", ["osmesa", "egl", "bogus"])
+def test_what_draws_nothing_needs_no_opengl(name):
+    hidden = "import ctypes.util as u; u.find_library = lambda name: None; import dexsim, os, mujoco; "
+    said = "print(os.environ['MUJOCO_GL'], mujoco.MjModel.from_xml_string('<mujoco/>').nq)"
+    done = subprocess.run([sys.executable, "-c", hidden + said], env=os.environ | {"MUJOCO_GL": name},
+                          capture_output=True, text=True)  # fmt: skip
+    assert done.stdout.split() == ["off", "0"], done.stderr
+
+
 def test_a_crashing_driver_does_not_take_us_down(tmp_path, monkeypatch):
     broken = tmp_path / "site"
     broken.mkdir()

@@ -724,7 +724,7 @@ def _other(search: JointSearch, found: Outcome) -> bool:
 
 def _step(runs: list[Run]) -> float:
     """Integration step [s]: 1 ms, and no coarser than half a sampling period."""
-    period = min(float(np.median(np.diff(r.t))) for r in runs)
+    period = min(r.period for r in runs)
     return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
 
 

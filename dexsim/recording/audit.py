@@ -22,7 +22,9 @@ KINDS: dict[str, str] = {
     "metadata_override": "a key whose recorded value is not the one used",
     "metadata_unknown": "a key that this format does not have",
     "topic": "a topic found under another name",
-    "joint_names": "joints found under other names, or left out",
+    "joint_names": "joints found under other names, left out, or not named in the messages",
+    "joint_order": "commands of one joint that another follows",
+    "trajectory": "commands that came as trajectories, and when each point holds",
     "unit": "numbers that cannot be of the stated unit, or were converted",
     "time_not_monotonic": "times that go backwards",
     "time_repeated": "samples with the host time of the one before",
@@ -49,8 +51,6 @@ def audit(recording: Recording) -> list[Finding]:
     series: list[Series] = [
         s
         for s in (
-            r.commands,
-            r.states.position,
             r.temperature,
             r.duty,
             r.enabled,
@@ -66,23 +66,34 @@ def audit(recording: Recording) -> list[Finding]:
     with np.errstate(all="ignore"):
         for s in series:
             found += audit_time.timing(s)
-        found += audit_time.stamps(series)
-        found += audit_time.between_topics(r)
-        for check in (
-            audit_values.commanded,
-            audit_values.finite,
-            audit_values.wraps,
-            audit_values.spikes,
-            audit_values.held,
-            audit_values.stuck,
-            audit_values.saturation,
-            audit_values.signs,
-            audit_values.units,
-        ):
-            found += check(r)
-        told = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
-        found += reach.unreachable(r, told)
+        found += audit_time.stamps([r.commands, r.states.position, *series])
+        found += audit_values.order(r)
+        for part in r.parts():
+            for s in (part.commands, part.states.position):
+                found += audit_time.timing(s)
+            found += audit_time.between_topics(part)
+            found += _of_joints(part)
+    found = list({str(f): f for f in found}.values())  # what is not of a joint, each part finds
     return sorted(found, key=lambda f: (f.topic, f.time if np.isfinite(f.time) else -1.0))
+
+
+def _of_joints(r: Recording) -> list[Finding]:
+    """Findings about values; each message tells of every joint."""
+    found: list[Finding] = []
+    for check in (
+        audit_values.commanded,
+        audit_values.finite,
+        audit_values.wraps,
+        audit_values.spikes,
+        audit_values.held,
+        audit_values.stuck,
+        audit_values.saturation,
+        audit_values.signs,
+        audit_values.units,
+    ):
+        found += check(r)
+    told = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
+    return [*found, *reach.unreachable(r, told)]
 
 
 def table(findings: Sequence[Finding]) -> str:

@@ -27,7 +27,7 @@ def timing(series: Series) -> Iterator[Finding]:
     dt = np.diff(t)
     period = float(np.median(dt[dt > 0])) if (dt > 0).any() else 0.0
     same = np.flatnonzero(dt == 0)
-    if len(same):
+    if len(same) and not series.lines:
         yield Finding(
             "time_repeated",
             topic,

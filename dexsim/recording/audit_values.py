@@ -18,6 +18,8 @@ RATIOS = {
     1000.0: "thousandths",
     65536 / (2 * np.pi): "counts of a 16-bit encoder",
 }
+FOLLOWS, STRAY = 0.9, 0.5
+"""Correlation from which on a position follows a command, and below which it does not."""
 LARGEST = 1e6
 """rad (m): no joint gets there; a wheel that turns ten times a second needs four hours."""
 SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousandths of rad/s"}
@@ -69,6 +71,58 @@ def commanded(r: Recording) -> Iterator[Finding]:
             "diagnose and replay cannot use this recording")  # fmt: skip
         text = f"no commands: {use}; {COMMANDS_FIX}"
         yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if felt else "error")
+
+
+def order(r: Recording) -> Iterator[Finding]:
+    """Commands that belong to another joint: of those joints that move, each follows another's command and not its
+    own."""
+    grid, commands, positions = _together(r)
+    if len(grid) < 100:
+        return
+    moving = [j for j in range(len(r.joints)) if np.ptp(commands[:, j]) > 0.02 and np.ptp(positions[:, j]) > 0.02]
+    if len(moving) < 2:
+        return
+    like = {(k, j): _follows(commands[:, k], positions[:, j]) for k in moving for j in moving}
+    whose = {j: max(moving, key=lambda k: like[k, j]) for j in moving}
+    wrong = [j for j, k in whose.items() if k != j and like[k, j] > FOLLOWS and like[j, j] < STRAY]
+    wrong = [j for j in wrong if sum(whose[i] == whose[j] for i in moving) == 1]
+    if len(wrong) < 2:
+        return
+    nameless = any(f.kind == "joint_names" and f.topic == COMMANDS and "carry no" in f.text for f in r.findings)
+    for j in wrong:
+        k = whose[j]
+        cure = (
+            f"the values are in another order: meta.joint_names=... with {r.joints[j]} where {r.joints[k]} is now"
+            if nameless
+            else f"whose commands are these? remap.{r.joints[j]}=... or, of columns, remap.command.{r.joints[j]}=COLUMN"
+        )
+        text = (
+            f"command of {r.joints[j]} is not what it follows: that is the command of {r.joints[k]} (correlation "
+            f"{like[k, j]:.2f}, with its own {like[j, j]:.2f}); {cure}"
+        )
+        yield Finding("joint_order", COMMANDS, float(grid[0]), len(grid), text, "error", r.joints[j], float(grid[-1]))
+
+
+def _together(r: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(times [n] every 10 ms, targets in force [n, J], positions [n, J]) while both are recorded."""
+    c, s, none = r.commands, r.states.position, np.zeros((0, len(r.joints)))
+    if len(c) < 20 or len(s) < 20:
+        return none[:, 0], none, none
+    grid = np.arange(max(c.t[0], s.t[0]), min(c.t[-1], s.t[-1]), 0.01)[:30000]
+    out = [np.zeros((len(grid), len(r.joints))) for _ in range(2)]
+    for j in range(len(r.joints)):
+        for x, series, kind in zip(out, (c, s), ("previous", "line"), strict=True):
+            ok = np.isfinite(series.value[:, j])
+            if ok.sum() > 5:
+                t, v = series.t[ok], series.value[ok, j]
+                held = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, None)]
+                x[:, j] = held if kind == "previous" else np.interp(grid, t, v)
+    return grid, out[0], out[1]
+
+
+def _follows(command: np.ndarray, position: np.ndarray) -> float:
+    """The largest correlation of a position with a command of up to 0.3 s before."""
+    return max(_corr(command[: len(command) - k], position[k:]) for k in range(0, 31, 3))
 
 
 def finite(r: Recording) -> Iterator[Finding]:

@@ -1,14 +1,19 @@
-"""The records of an MCAP file, whatever state it is in: finished, cut off by a kill, or damaged in the middle."""
+"""The records of an MCAP file, whatever state it is in: finished, cut off by a kill, or damaged in the middle; and of
+what `ros2 bag record` makes of it otherwise: an SQLite file (.db3), and either packed as a whole or message by
+message (zstd)."""
 
 from __future__ import annotations
 
+import contextlib
 import mmap
+import sqlite3
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
@@ -31,6 +36,10 @@ MAX_UNPACKED = 4 << 30
 MAX_PACKED = 200
 MAX_MESSAGES = 5_000_000
 MAGIC = b"\x89MCAP0\r\n"
+SQLITE = b"SQLite format 3\0"
+ZSTD = b"\x28\xb5\x2f\xfd"
+BAGS = ("*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
+"""What the files of a bag's folder are called."""
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _MESSAGE = struct.Struct("<HIQQ")  # how a message's record begins: channel, sequence, log and publish time
 _BROKEN = (
@@ -70,24 +79,85 @@ class Container:
 
 
 def open_container(path: Path) -> Container:
-    """Read every record that can be read. Raises UserError for what is not an MCAP file at all."""
+    """Read every record that can be read. Raises UserError for what is not a bag's file at all."""
     size = files.check(path, MAX_FILE, "recording")
     try:
         with open(path, "rb") as file:
-            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+            data: Any = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    if data[: len(MAGIC)] != MAGIC:
+    out = Container(path)
+    out.most = min(MAX_UNPACKED, MAX_CHUNK + MAX_PACKED * size)
+    if data[: len(ZSTD)] == ZSTD:
+        try:
+            data = _unzip(data, out.most)
+        except _BROKEN as error:
+            raise UserError(
+                f"recording {path}: compressed as a whole, and cannot be unpacked here ({error}); `zstd -d {path.name}`"
+            ) from None
+    if data[: len(SQLITE)] == SQLITE:
+        _sqlite(data, out)
+    elif data[: len(MAGIC)] == MAGIC:
+        _mcap(data, len(data), out)
+    else:
         what = "empty" if not size else "not an MCAP file"
         hint = (
-            "; convert it with `ros2 bag convert`, or record with `ros2 bag record -s mcap`"
-            if data[:6] == b"SQLite"
+            f"; it is a bag of ROS 1: `rosbags-convert --src {path.name} --dst {path.stem}` makes one of ROS 2"
+            if data[:8] == b"#ROSBAG "
             else "; numbers in named columns are read from .csv, .tsv and .npz"
         )
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
-    out = Container(path)
+    for m in out.messages:
+        if m.data[: len(ZSTD)] == ZSTD:  # plain CDR begins with a zero
+            try:
+                m.data = _unzip(m.data)
+            except _BROKEN:
+                continue  # its decoder says that it cannot be read
+            out.unpacked += len(m.data)
+            _limit(out)
+    return out
+
+
+def _sqlite(data: Any, out: Container) -> None:
+    """The messages of an SQLite bag. Definitions that it lacks (before ROS 2 Iron) are those of the standard types."""
+    try:
+        with contextlib.closing(sqlite3.connect(":memory:")) as db:
+            db.deserialize(data)
+            tables = {name for (name,) in db.execute("select name from sqlite_master where type = 'table'")}
+            if not {"topics", "messages"} <= tables:
+                raise UserError(f"recording {out.path}: an SQLite file without a bag's tables (topics, messages)")
+            defined = {}
+            if "message_definitions" in tables:
+                rows = db.execute("select topic_type, encoding, encoded_message_definition from message_definitions")
+                defined = {str(kind): (str(encoding), str(text)) for kind, encoding, text in rows}
+            for number, topic, kind, encoding in db.execute("select id, name, type, serialization_format from topics"):
+                how, text = defined.get(str(kind)) or ("ros2msg", _standard(str(kind)))
+                out.schemas[number] = Schema(data=text.encode(), encoding=how, id=number, name=str(kind))
+                out.channels[number] = Channel(id=number, topic=str(topic), message_encoding=str(encoding),
+                                               metadata={}, schema_id=number)  # fmt: skip
+            for k, (number, t, content) in enumerate(db.execute("select topic_id, timestamp, data from messages")):
+                out.messages.append(Message(number, int(t), bytes(content), int(t), k))
+                out.unpacked += len(content)
+                _limit(out)
+    except (sqlite3.Error, TypeError, ValueError) as error:
+        if not out.messages:
+            raise UserError(f"recording {out.path}: its SQLite file cannot be read: {error}") from None
+        out.damage.append((None, 0, f"its SQLite file ends in damage: {error}"))
+
+
+def _standard(kind: str) -> str:
+    """The definition of a standard message type; empty for another."""
+    from rosbags.typesys import Stores, TypesysError, get_typestore
+
+    try:
+        return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(kind, ros_version=2)[0]
+    except (TypesysError, KeyError, ValueError):
+        return ""
+
+
+def _mcap(data: mmap.mmap | bytes, size: int, out: Container) -> None:
+    """The records of an MCAP file."""
     finished = False
-    out.most = min(MAX_UNPACKED, MAX_CHUNK + MAX_PACKED * size)
     for opcode, at, length in _records(data, out):
         body = data[at : at + length]
         if opcode == Opcode.FOOTER:
@@ -100,7 +170,6 @@ def open_container(path: Path) -> Container:
         out.damage.append(
             (None, 0, f"the file ends at byte {size} without its index: it was cut off, or its writer was killed")
         )
-    return out
 
 
 def _records(data: mmap.mmap | bytes, out: Container) -> Iterator[tuple[int, int, int]]:
@@ -181,16 +250,16 @@ def _limit(out: Container) -> None:
         )
 
 
-def _unzip(packed: bytes) -> bytes:
-    """What zstd packed, as far as it is there. Raises ValueError beyond MAX_CHUNK."""
-    if not packed:
+def _unzip(packed: Any, most: int = MAX_CHUNK) -> bytes:
+    """What zstd packed, as far as it is there. Raises ValueError beyond `most` bytes."""
+    if not len(packed):
         return b""
     parts, size = [], 0
     with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
         while part := reader.read(1 << 20):
             size += len(part)
-            if size > MAX_CHUNK:
-                raise ValueError(f"it unpacks to more than {MAX_CHUNK >> 20} MiB")
+            if size > most:
+                raise ValueError(f"it unpacks to more than {most >> 20} MiB")
             parts.append(part)
     return b"".join(parts)
 

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from dexsim.recording import ros2, stacked
-from dexsim.recording.samples import Array, JointSample, Reader, Vector
+from dexsim.recording.samples import Array, JointSample, Reader, Trajectory, Vector
 from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
 
 
@@ -43,8 +43,9 @@ def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
     return schema.encoding != "ros2msg" or not text.strip() or lines(text) == lines(DEFINITIONS[kind])
 
 
-def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[JointSample]:
-    """Reads joint states. part: dotted path of the sub-message that holds them ("" the message itself)."""
+def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[Any]:
+    """Reads joint states, or trajectories of them. part: dotted path of the sub-message that holds them ("" the
+    message itself)."""
     decode = decoder(channel, schema)
     if not part and _usual(channel, schema, JOINT_STATE):
 
@@ -57,20 +58,19 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[J
 
         return Reader(standard, stacked.joint_rows)
 
-    def read(data: bytes) -> JointSample:
+    def read(data: bytes) -> JointSample | Trajectory:
         whole = decode(data)
         m = walk(whole, part)
         stamp = stamp_of(whole) or stamp_of(m)
         if isinstance(m, (list, tuple, np.ndarray)):  # the path leads straight to the positions
             return JointSample([], floats(m), np.zeros(0), np.zeros(0), stamp)
-        if get(m, "points"):  # trajectory_msgs/JointTrajectory: its first point
-            return JointSample(
-                list(get(m, "joint_names") or []),
-                floats(get(get(m, "points")[0], "positions")),
-                np.zeros(0),
-                np.zeros(0),
-                stamp,
-            )
+        points = get(m, "points")
+        if points is not None:  # trajectory_msgs/JointTrajectory
+            each = [
+                (_seconds(get(p, "time_from_start")), floats(get(p, "positions")), floats(get(p, "velocities")))
+                for p in points
+            ]
+            return Trajectory(list(get(m, "joint_names") or []), [p for p in each if len(p[1])], stamp)
         names = first(m, "name", "names", "joint_names") or first(whole, "name", "names", "joint_names") or []
         position = first(m, "position", "positions", "data")
         if position is None:
@@ -175,6 +175,14 @@ def stamp_of(m: Any) -> int | None:
     if seconds is None:
         return None
     return (int(seconds) * 1_000_000_000 + int(nanos or 0)) or None
+
+
+def _seconds(duration: Any) -> float:
+    """A duration [s]: a message, a dict or a number; 0 for None."""
+    if duration is None or isinstance(duration, (int, float)):
+        return float(duration or 0.0)
+    sec, nano = first(duration, "sec", "secs", "seconds"), first(duration, "nanosec", "nsec", "nsecs", "nanos")
+    return float(sec or 0) + 1e-9 * float(nano or 0)
 
 
 def _wrench(m: Any) -> np.ndarray:

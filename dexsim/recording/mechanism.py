@@ -387,7 +387,7 @@ def replay(
     end = max(recording.duration, float(recording.commands.t[-1])) + timestep
     led = None if follow is None or recording.object_pose is None else (follow, recording.object_pose)
     return drive(
-        m, recording.commands, recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led
+        m, recording.targets(), recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led
     )
 
 

@@ -14,12 +14,16 @@ from mcap.records import Schema as McapSchema
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
-from dexsim.recording.container import Container, open_container
-from dexsim.recording.samples import JointRows, JointSample, Reader
+from dexsim.recording.container import BAGS, Container, open_container
+from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
 
 NAN = float("nan")
 MAX_JOINTS = 1000
+STARTED, PLANNED = 0.5, 60.0
+"""s before and after its receipt in which the header.stamp of a trajectory says when it begins."""
+LINE = 0.1
+"""s: points of a trajectory that lie further apart get targets between them (cubic where speeds are given)."""
 MAX_START = 1 << 62
 """ns: a start up to which a stamp less it fits 64 bits."""
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
@@ -33,7 +37,7 @@ def read(
     audit: bool = True,
     hand: Hand | None = None,
 ) -> Recording:
-    """The recording in an MCAP file, in a folder that `ros2 bag record -s mcap` wrote, or in a CSV or NPZ file with
+    """The recording in an MCAP file, in a folder that `ros2 bag record` wrote, or in a CSV or NPZ file with
     named columns (`columns.py`).
 
     Arguments:
@@ -76,9 +80,9 @@ def read(
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    found = sorted(path.glob("*.mcap"), key=lambda p: (len(p.name), p.name))  # NAME_2 before NAME_10
+    found = sorted((p for kind in BAGS for p in path.glob(kind)), key=lambda p: (len(p.name), p.name))  # _2 before _10
     if not found:
-        raise UserError(f"recording {path}: the folder holds no .mcap file (record with `ros2 bag record -s mcap`)")
+        raise UserError(f"recording {path}: the folder holds no .mcap or .db3 file (as `ros2 bag record` writes them)")
     return found
 
 
@@ -316,8 +320,9 @@ class _Reading:
     # -- values -------------------------------------------------------------------
     def build(self, stated: dict[str, str], joints: Sequence[str] | None) -> Recording:
         """The recording, with metadata complete."""
-        t_command, commands = self._decode(schema.COMMANDS, decode.joint_reader)
+        t_command, commands, lines = self._points(*self._decode(schema.COMMANDS, decode.joint_reader))
         t_state, states = self._decode(schema.STATES, decode.joint_reader)
+        given = set(stated)
         theirs = self._their_joints(stated, commands, states, joints)
         if len(theirs) > MAX_JOINTS:
             raise UserError(f"recording {self.path}: names {len(theirs)} joints; at most {MAX_JOINTS} are read")
@@ -349,8 +354,11 @@ class _Reading:
         stated["effort_sign"] = ",".join(f"{int(sign[source[k]]):+d}" for k in range(len(ours)))
         stated["joint_names"] = ",".join(ours)
 
+        self._unnamed(theirs, commands, states, "joint_names" in given)
         place = _Placer(theirs, column, len(ours))
         command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place, scale["position"])
+        if command is not None:
+            command.lines = lines
         out = Recording(
             path=self.path,
             meta=stated,
@@ -481,7 +489,8 @@ class _Reading:
         if not len(samples) or (name != "position" and not any(len(getattr(s, name)) for s in _unlike(samples))):
             return None
         value = np.full((len(t), place.count), np.nan)
-        bad = _placed(value, samples, name, place)
+        carried = np.zeros(value.shape, bool)
+        bad = _placed(value, carried, samples, name, place)
         if bad:
             self.findings.append(
                 Finding(
@@ -495,7 +504,52 @@ class _Reading:
                 )
             )
         stamp = self._stamps(samples)
-        return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp)
+        partly = not carried[:, carried.any(0)].all()
+        return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp,
+                      carried=carried if partly else None)  # fmt: skip
+
+    def _points(self, t: np.ndarray, samples: Sequence[Any]) -> tuple[np.ndarray, Sequence[Any], bool]:
+        """(times [T] s, targets, whether they are joined by lines): each point of a trajectory is a target of its own
+        time, until another trajectory begins. t [N], samples: as messages have them."""
+        if isinstance(samples, JointRows) or not any(isinstance(s, Trajectory) for s in samples):
+            return t, samples, False
+        none, out, late, most = np.zeros(0), [], 0, 0
+        for receipt, s in zip(t.tolist(), samples, strict=True):
+            if not isinstance(s, Trajectory):
+                out.append((receipt, s))
+                continue
+            if not s.points:
+                continue
+            stamp = NAN if s.stamp is None else (s.stamp - self.start_ns) * 1e-9
+            begin = stamp if -STARTED < stamp - receipt < PLANNED else receipt
+            late, most = late + any(p[0] > 0 for p in s.points), max(most, len(s.points))
+            first = begin + s.points[0][0]
+            while out and out[-1][0] > first:  # what the new one replaces
+                out.pop()
+            if out and out[-1][0] < begin - LINE and first > begin:  # it held its last target until then
+                out.append((begin, out[-1][1]))
+            before: tuple[float, Any, Any] | None = None
+            for after, q, v in s.points:
+                if before is not None and after - before[0] > LINE:
+                    for u in np.arange(1, np.ceil((after - before[0]) / LINE)) / np.ceil((after - before[0]) / LINE):
+                        at = before[0] + u * (after - before[0])
+                        out.append((begin + at, JointSample(s.names, _between(before, (after, q, v), at), none, none,
+                                                            None)))  # fmt: skip
+                out.append((begin + after, JointSample(s.names, q, none, none, None)))
+                before = (after, q, v)
+        text = f"trajectories of up to {most} points: each is a target at its message's header.stamp (or receipt)" + (
+            " + time_from_start" if late else "") + ", joined by lines"  # fmt: skip
+        self.findings.append(Finding("trajectory", schema.COMMANDS, NAN, len(samples), text, "info"))
+        out.sort(key=lambda x: x[0])
+        return np.array([x for x, _ in out]), [s for _, s in out], True
+
+    def _unnamed(self, theirs: list[str], commands: Sequence, states: Sequence, stated: bool) -> None:
+        """Says in which order values without names are taken, where nothing states it."""
+        for topic, group in ((schema.COMMANDS, commands), (schema.STATES, states)):
+            if len(theirs) > 1 and not stated and any(not len(s.names) for s in _unlike(group)):
+                order = f"taken in the order {', '.join(theirs)}; state theirs with meta.joint_names=a,b,..."
+                text = f"{len(group)} messages carry no joint names: {order}"
+                self.findings.append(Finding("joint_names", topic, NAN, len(group), text, "warning"))
 
     def _stamps(self, samples: Sequence[JointSample]) -> np.ndarray:
         """[T] `header.stamp` in s from the recording's start, NaN where there is none."""
@@ -637,6 +691,17 @@ class _TableReading(_Reading):
         return super()._match(theirs, joints)
 
 
+def _between(a: tuple[float, Any, Any], b: tuple[float, Any, Any], t: float) -> np.ndarray:
+    """Position [n] at t between points (s, position [n], velocity [n] or empty): a cubic by both speeds, else a
+    line."""
+    size = b[0] - a[0]
+    u = (t - a[0]) / size
+    if len(a[2]) != len(a[1]) or len(b[2]) != len(b[1]):
+        return np.asarray(a[1] + u * (b[1] - a[1]))
+    slope = (u**3 - 2 * u**2 + u) * size * a[2] + (u**3 - u**2) * size * b[2]
+    return np.asarray((2 * u**3 - 3 * u**2 + 1) * a[1] + (3 * u**2 - 2 * u**3) * b[1] + slope)
+
+
 def _line(t: np.ndarray, own: np.ndarray, x: np.ndarray) -> np.ndarray:
     ok = np.isfinite(x) & np.isfinite(own)
     return np.interp(t, own[ok], x[ok]) if ok.any() else np.full(len(t), np.nan)
@@ -651,8 +716,11 @@ def _unlike(samples: Sequence[JointSample]) -> Sequence[JointSample]:
     return samples[:1] if isinstance(samples, JointRows) else samples
 
 
-def _placed(value: np.ndarray, samples: Sequence[JointSample], name: str, place: _Placer) -> list[int]:
-    """Fills value [T, J] with a quantity of T samples; returns those whose names and values do not fit."""
+def _placed(
+    value: np.ndarray, carried: np.ndarray, samples: Sequence[JointSample], name: str, place: _Placer
+) -> list[int]:
+    """Fills value [T, J] with a quantity of T samples, and carried with what each of them tells of; returns those whose
+    names and values do not fit."""
     if isinstance(samples, JointRows):
         rows = getattr(samples, name)
         to = place(samples.names, rows.shape[1]) if rows.shape[1] else (np.zeros(0, int),) * 2
@@ -660,6 +728,7 @@ def _placed(value: np.ndarray, samples: Sequence[JointSample], name: str, place:
             return list(range(len(samples)))
         for source, column in zip(*to, strict=True):  # in order: of a name that comes twice, the last counts
             value[:, column] = rows[:, source]
+            carried[:, column] = True
         return []
     bad = []
     for i, s in enumerate(samples):
@@ -672,6 +741,7 @@ def _placed(value: np.ndarray, samples: Sequence[JointSample], name: str, place:
         else:
             keep, columns = to
             value[i, columns] = values[keep]
+            carried[i, columns] = True
     return bad
 
 

@@ -23,6 +23,16 @@ class JointSample:
         self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
 
 
+class Trajectory:
+    """A message of several targets: names, points (s after its start, position [n], velocity [n] or empty), stamp [ns]
+    or None."""
+
+    __slots__ = ("names", "points", "stamp")
+
+    def __init__(self, names: Sequence[str], points: Sequence[tuple[float, Any, Any]], stamp: int | None):
+        self.names, self.points, self.stamp = names, points, stamp
+
+
 class JointRows(Sequence[JointSample]):
     """Joint samples of the same names and numbers of values: position, velocity, effort [T, n], each with n = 0 where
     not given, stamp [T] int64 ns, 0 for None."""

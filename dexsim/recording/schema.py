@@ -174,7 +174,9 @@ COMMANDS_FIX = (
 class Series:
     """Samples of one quantity. t [T] host time [s since start], never decreasing; value [T, ...] with NaN for absent.
 
-    stamp [T]: `header.stamp` on the same axis as t, NaN where unset (None: the message has no header).
+    stamp [T]: `header.stamp` on the same axis as t, NaN where unset (None: the message has no header). carried [T, J]:
+    which joints each message tells of (None: all of them). lines: between its samples the value goes along straight
+    lines, as between the points of a trajectory.
     """
 
     t: np.ndarray
@@ -182,15 +184,21 @@ class Series:
     topic: str = ""
     stamp: np.ndarray | None = None
     frame: str = ""  # header.frame_id of the first message
+    carried: np.ndarray | None = None
+    lines: bool = False
 
     def __len__(self) -> int:
         return len(self.t)
 
     def between(self, start: float, end: float) -> Series:
         """The samples with start <= t < end [s]."""
-        keep = (self.t >= start) & (self.t < end)
+        return self.take((self.t >= start) & (self.t < end))
+
+    def take(self, which: np.ndarray) -> Series:
+        """These samples: [T] bool, or their numbers."""
+        part = lambda x: None if x is None else x[which]  # noqa: E731
         return replace(
-            self, t=self.t[keep], value=self.value[keep], stamp=None if self.stamp is None else self.stamp[keep]
+            self, t=self.t[which], value=self.value[which], stamp=part(self.stamp), carried=part(self.carried)
         )
 
     @classmethod
@@ -245,6 +253,56 @@ class Recording:
     def duration(self) -> float:
         """Time of the last command or state [s]."""
         return max([0.0, *(s.t[-1] for s in (self.commands, self.states.position) if len(s))])
+
+    def targets(self, step: float = 0.005) -> Series:
+        """The commands as the servos are sent them: the points of trajectories joined, with a sample every `step` s."""
+        c = self.commands
+        if not c.lines or len(c) < 2:
+            return c
+        counts = np.maximum(np.ceil(np.diff(c.t) / step - 1e-6).astype(int), 1)
+        t = np.r_[np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in zip(c.t, c.t[1:], counts,
+                                                                                          strict=False)]), c.t[-1]]
+        value = np.full((len(t), c.value.shape[1]), np.nan)
+        for j, x in enumerate(c.value.T):
+            ok = np.isfinite(x)
+            if ok.any():
+                value[:, j] = np.where(t >= c.t[ok][0] - 1e-9, np.interp(t, c.t[ok], x[ok]), np.nan)
+        return Series(t, value, c.topic)
+
+    def parts(self) -> list[Recording]:
+        """The recording as one for each group of joints that are told of in the same messages, without the messages of
+        others; itself where each message tells of all."""
+        groups: dict[tuple[bytes, ...], list[int]] = {}
+        told = [s.carried for s in (self.commands, self.states.position)]
+        for j in range(len(self.joints)):
+            groups.setdefault(tuple(b"" if c is None else c[:, j].tobytes() for c in told), []).append(j)
+        if len(groups) < 2 and all(c is None or c.all() for c in told):
+            return [self]
+        return [self._of(columns) for columns in groups.values()]
+
+    def _of(self, columns: list[int]) -> Recording:
+        """These joints, and the messages that tell of them."""
+
+        def own(s: Series | None) -> Series | None:
+            if s is None or s.value.ndim != 2 or s.value.shape[1] != len(self.joints):
+                return s
+            s = s if s.carried is None else s.take(s.carried[:, columns[0]])
+            return replace(s, value=s.value[:, columns], carried=None)
+
+        s = self.states
+        commands, position = own(self.commands), own(s.position)
+        assert commands is not None and position is not None
+        out = replace(
+            self,
+            joints=tuple(self.joints[j] for j in columns),
+            commands=commands,
+            states=States(position, own(s.velocity), own(s.effort)),
+            meta=self.meta | {"effort_sign": ",".join(f"{int(self.effort_sign[j]):+d}" for j in columns)},
+            findings=[],
+        )
+        for name in ("temperature", "duty", "enabled"):
+            setattr(out, name, own(getattr(self, name)))
+        return out
 
     @property
     def effort_is(self) -> str:

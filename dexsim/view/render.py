@@ -40,8 +40,7 @@ def main(folder: Path, path: Path) -> int:
         context.make_current()
         context.free()
     except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
-        missing = isinstance(error, (ImportError, AttributeError))  # PyOpenGL's way to say that a library is not there
-        print("library not found" if missing else str(error).splitlines()[0] if str(error) else type(error).__name__)
+        print(why(error))
         return NO_GL
     settings = json.loads((folder / "settings.json").read_text("utf-8"))
     try:
@@ -50,6 +49,13 @@ def main(folder: Path, path: Path) -> int:
         print(error.strerror or error)
         return 1
     return 0
+
+
+def why(error: Exception) -> str:
+    """Say in a line why no OpenGL context opens."""
+    if isinstance(error, (ImportError, AttributeError)):  # PyOpenGL's way to say that a library is not there
+        return "library not found"
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def film(folder: Path, path: Path, settings: dict[str, Any]) -> None:

@@ -84,14 +84,14 @@ def main(folder: Path) -> int:
     """The rendering process."""
     import mujoco
 
-    from dexsim.view.render import NO_GL, backdrop
+    from dexsim.view.render import NO_GL, backdrop, why
 
     try:
         context = mujoco.GLContext(64, 64)
         context.make_current()
         context.free()
     except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
-        print(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        print(why(error))
         return NO_GL
     shots = [Shot(**s) for s in json.loads((folder / "shots.json").read_text("utf-8"))]
     for k in sorted({s.model for s in shots}):

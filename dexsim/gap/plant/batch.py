@@ -187,6 +187,7 @@ class JointPlant:
         self._t: list[np.ndarray] = []
         self._q: list[np.ndarray] = []
         self._torque: list[np.ndarray] = []
+        self._read: list[np.ndarray | None] = []
         self._start: list[float] = []
         self._grid, self._cmds = [0], [0]
         self._rows = [0]
@@ -196,8 +197,9 @@ class JointPlant:
 
     def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
             cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None,
-            exact: dict[str, np.ndarray]) -> None:
-        """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]."""
+            exact: dict[str, np.ndarray], read: np.ndarray | None = None) -> None:
+        """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]; read [S]:
+        which of the positions were read (None: all); windows hold no others."""
         t0 = float(t[0])
         steps = max(int(np.ceil((float(t[-1]) - t0) / self.dt)) + 2, 2)
         self._added.append((times, series, exact))
@@ -207,6 +209,7 @@ class JointPlant:
         self._cmds.append(self._cmds[-1] + len(cmd_t))
         self._t.append(t)
         self._q.append(q)
+        self._read.append(read)
         self._torque.append(np.full(len(t), np.nan) if torque is None else torque)
         self._rows.append(self._rows[-1] + len(t))
         self.nominal.append(nominal)
@@ -320,24 +323,27 @@ class JointPlant:
                 lo, hi = np.searchsorted(t - t[0], [a - 1e-9, b - 1e-9])
                 if i == count - 1 and b >= stop - 1e-6:
                     hi = int(np.searchsorted(t - t[0], b + 1e-9))
-                if hi - lo < 3:
+                rows = np.arange(lo, hi)
+                read = self._read[r]
+                rows = rows if read is None else rows[read[rows]]
+                if len(rows) < 3:
                     continue
                 g = int(round((a - w) / self.dt))
                 first_time = self._start[r] + g * self.dt
                 warm_steps = int(round(w / self.dt))
-                at = (t[lo:hi] - first_time) / self.dt
+                at = (t[rows] - first_time) / self.dt
                 at = np.maximum(at, 0.0)
                 total = int(np.floor(at[-1])) + 1
                 total = min(total, self._grid[r + 1] - self._grid[r] - g)
                 s = np.minimum(np.floor(at).astype(int), total - 1)
                 c0, c1 = self._cmds[r], self._cmds[r + 1]
                 k = c0 + int(np.clip(np.searchsorted(self._cmd_t[r], first_time - 0.6) - 1, 0, c1 - c0 - 1))
-                window.append([self._grid[r] + g, total, warm_steps, len(row), hi - lo, c0, c1, k])
+                window.append([self._grid[r] + g, total, warm_steps, len(row), len(rows), c0, c1, k])
                 window_t.append(first_time)
                 step.extend(s)
                 part.extend(at - s)
-                of.extend([len(window) - 1] * (hi - lo))
-                row.extend(range(self._rows[r] + lo, self._rows[r] + hi))
+                of.extend([len(window) - 1] * len(rows))
+                row.extend(self._rows[r] + rows)
                 run_of.append(r)
         return Windows(
             np.array(window, np.int32).reshape(-1, 8),

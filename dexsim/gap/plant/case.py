@@ -101,11 +101,15 @@ def noise_of(run: Run, j: int) -> tuple[float, float]:
     return _noises(run)[1][j]
 
 
-def _noises(run: Run) -> tuple[np.ndarray, list[tuple[float, float]], np.ndarray]:
-    """(positions [S, J], by joint the `noise` of them, what they miss local cubics by (`misfit`))."""
+def _noises(run: Run) -> tuple[np.ndarray, list[tuple[float, float]], list[np.ndarray]]:
+    """(positions [S, J]; by joint the `noise` of its readings, and what these miss local cubics by (`misfit`))."""
     if run.noises is None or run.noises[0] is not run.q:
-        miss = misfit(run.t, run.q)
-        run.noises = run.q, [noise(run.t, q, m) for q, m in zip(run.q.T, miss.T, strict=True)], miss
+        each = [run.readings(j) for j in range(run.q.shape[1])]
+        if run.read is None:
+            miss = list(misfit(run.t, run.q).T)
+        else:
+            miss = [misfit(t, q[:, None])[:, 0] for t, q in each]
+        run.noises = run.q, [noise(t, q, m) for (t, q), m in zip(each, miss, strict=True)], miss
     return run.noises
 
 
@@ -178,8 +182,9 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
     usual = float(np.median([_of_recordings(runs, [noise_of(r, k)[0] for r in runs]) for k in others]))
     if own <= BELIEF.noisier * usual:
         return None
-    apart = np.mean([_coloured(r.q[:, j]) for r in runs], 0) - WHITE
-    if np.abs(apart).max() >= BELIEF.coloured or np.mean([_kurtosis(r.q[:, j]) for r in runs]) < BELIEF.steady:
+    read = [r.readings(j)[1] for r in runs]
+    apart = np.mean([_coloured(q) for q in read], 0) - WHITE
+    if np.abs(apart).max() >= BELIEF.coloured or np.mean([_kurtosis(q) for q in read]) < BELIEF.steady:
         return usual
     return usual if _torque_scatter(runs, j, others, limits) > BELIEF.noisier * own / usual else None
 
@@ -325,6 +330,7 @@ def moved(
                 run.q[:, j],
                 effort,
                 exact,
+                None if run.read is None else run.read[:, j],
             )
         out.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
         out.finish(_taken(rooms))
@@ -416,7 +422,7 @@ def _case(
     estimates = [noise_of(run, j) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
-    quiet = quiet_noise([(runs[i].t, runs[i].q[:, j], _noises(runs[i])[2][:, j]) for i in told], quantum)
+    quiet = quiet_noise([(*runs[i].readings(j), _noises(runs[i])[2][j]) for i in told], quantum)
     sigma = min(sigma, quiet) if quiet is not None else sigma
     usual = usual_noise([runs[i] for i in told], j, sigma, rows[0][:, SERVO_INDEX["torque_limit"]])
     sigma = min(sigma, usual) if usual is not None else sigma

@@ -22,6 +22,10 @@ def wrong_signal(finding: dict[str, Any]) -> bool:
     return bool(finding["effect"] == WRONG_SIGNAL)
 
 
+COLUMNS = ("v", "torque", "temperature", "duty", "enabled", "read")
+"""Of a run, what may be absent and has a column for each joint."""
+
+
 @dataclass
 class Run:
     """One recording, J joints; times in s from the recording's first sample, positions in rad (m for a slide).
@@ -31,7 +35,8 @@ class Run:
     where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V. gravity: the world's, m/s2, [3].
     servo: the table believed for this recording; counted: the mechanism's joints, by whose number its `coupling_from`
     counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of
-    them. breaks: stretches [s] over which its clock cannot be trusted.
+    them. breaks: stretches [s] over which its clock cannot be trusted. read [S, J]: where a position was read; between
+    these q is interpolated (None: all were).
     """
 
     name: str
@@ -54,6 +59,7 @@ class Run:
     counted: tuple[str, ...] = ()
     left_out: frozenset[str] = frozenset()
     breaks: tuple[tuple[float, float], ...] = ()
+    read: np.ndarray | None = None
     # filled by `smooth`
     qs: np.ndarray = None  # type: ignore[assignment]  # asked for only after it
     vs: np.ndarray = None  # type: ignore[assignment]
@@ -61,9 +67,18 @@ class Run:
     # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
     # filled by `gap.plant.case.noise_of`: the positions that it is of, of each joint, and what these miss by sample
-    noises: tuple[np.ndarray, list[tuple[float, float]], np.ndarray] | None = None
+    noises: tuple[np.ndarray, list[tuple[float, float]], list[np.ndarray]] | None = None
     # filled by `local`: the times that it is of, its width
     smoother: tuple[np.ndarray, float, LocalPolynomial] | None = None
+
+    def readings(self, j: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times [s] and positions of joint j where they were read."""
+        return (self.t, self.q[:, j]) if self.read is None else (self.t[self.read[:, j]], self.q[self.read[:, j], j])
+
+    @property
+    def period(self) -> float:
+        """s between readings of a joint."""
+        return float(np.median([np.median(np.diff(self.readings(j)[0])) for j in range(len(self.joints))]))
 
     @property
     def duration(self) -> float:

@@ -24,12 +24,13 @@ import numpy as np
 from scipy import fft
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.read import WRONG_SIGNAL, Run
+from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Finding, Recording
 
-SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
+# kinds of the audit's errors after which a position or a target cannot be used
+SPOILS = ("joint_order", "wrap", "unit")
 PAUSE = 1.0  # s without a sample, over which no lag is measured
 STEP, BEFORE, AFTER = 0.005, 120, 80  # s of the grid on which a lag is measured, and steps of it on either side
 TURN = 180 / np.pi
@@ -122,28 +123,41 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
         for j, joint in enumerate(run.joints):
             if (run.name, joint) in out:
                 continue
-            q, whole = run.q[:, j], [(run.t[0], run.t[-1])]
+            whole = [(run.t[0], run.t[-1])]
             wrong = _wrong(runs, run, j, model, targets[i])
             if wrong is not None:
                 add(wrong.kind, wrong.text, run, joint, wrong.topics, wrong.spans or whole, wrong.confidence)
                 out[run.name, joint] = f"{wrong.kind}: {wrong.text}"
                 continue
             if beat[joint] > 0:
-                between &= between_readings(run.t, q, beat[joint])  # joints of one bus are read one after the other
+                old = _on_rows(run, j, between_readings(*run.readings(j), beat[joint]))
+                if run.read is None:
+                    between &= old  # joints of one bus are read one after the other
+                else:
+                    stale |= old
                 text = f"{joint} is read every {1e3 * beat[joint]:.3g} ms only; the samples between repeat it"
                 add("stale", text, run, joint, [STATES], whole)
                 continue
-            repeated, said, lost = _repeated(run.t, q, joint, long[joint][i])
+            repeated, said, lost = _repeated(*run.readings(j), joint, long[joint][i])
             if lost:
                 blind.setdefault(run.name, []).extend(lost)
             for text, spans in said:
                 add("stale", text, run, joint, [STATES], spans)
-            stale |= repeated
-        if not between.all():
+            stale |= _on_rows(run, j, repeated)
+        if run.read is None and not between.all():
             stale |= between
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
     return list(found.values()), out, blind
+
+
+def _on_rows(run: Run, j: int, on: np.ndarray) -> np.ndarray:
+    """[S] bool of a run's samples from that of joint j's readings."""
+    if run.read is None:
+        return on
+    out = np.zeros(len(run.t), bool)
+    out[run.read[:, j]] = on
+    return out
 
 
 def _repeated(
@@ -302,7 +316,7 @@ def drop(
                 continue
             run.joints = tuple(run.joints[i] for i in k)
             run.cmd, run.q = run.cmd[:, k], run.q[:, k]
-            for name in ("v", "torque", "temperature", "duty", "enabled"):
+            for name in COLUMNS:
                 x = getattr(run, name)
                 setattr(run, name, None if x is None else x[:, k])
         kept.append(run)
@@ -464,7 +478,7 @@ def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def _keep(run: Run, on: np.ndarray) -> None:
     run.t, run.q = run.t[on], run.q[on]
-    for name in ("v", "torque", "temperature", "duty", "enabled", "supply"):
+    for name in (*COLUMNS, "supply"):
         x = getattr(run, name)
         setattr(run, name, None if x is None else x[on])
 
@@ -490,22 +504,23 @@ def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_stretches(
     runs: Sequence[Run], joint: str, targets: Sequence[Targets] | None = None
 ) -> list[list[tuple[int, int]]]:
-    """Of each run, (first, last) sample of the stretches in which the joint's readings are old ones; `last` is the last
-    old one. Runs without the joint have none. targets: of each run, where they are found already."""
+    """Of each run, (first, last) number of the joint's readings in the stretches in which they are old ones; `last` is
+    the last old one. Runs without the joint have none. targets: of each run, where they are found already."""
     out: list[list[tuple[int, int]]] = [[] for _ in runs]
     stood: dict[int, list[tuple[int, int]]] = {}
     for k, run in enumerate(runs):
         if joint in run.joints and len(run.t) >= 20:
-            q = run.q[:, run.joints.index(joint)]
-            stood[k] = [(a, b) for a, b in rests(q) if b + 1 < len(q) and run.t[b] - run.t[a] >= SIGNAL.long]
+            t, q = run.readings(run.joints.index(joint))
+            stood[k] = [(a, b) for a, b in rests(q) if b + 1 < len(q) and t[b] - t[a] >= SIGNAL.long]
     if not any(stood.values()):
         return out
     seen: list[tuple[int, int, int, float, float]] = []  # run, first, last, pulse at its end, way of the target
     pulse, spans = [], []
     for k, long in stood.items():
         run, j = runs[k], runs[k].joints.index(joint)
-        cmd = (Targets(run) if targets is None else targets[k]).before()[:, j]
-        size = pulses(run.t, run.q[:, j])
+        on = slice(None) if run.read is None else run.read[:, j]
+        cmd = (Targets(run) if targets is None else targets[k]).before()[on, j]
+        size = pulses(*run.readings(j))
         spans.append(float(np.ptp(cmd)))
         for a, b in long:
             seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
@@ -533,7 +548,7 @@ def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def common_rhythm(runs: Sequence[Run], joint: str) -> float:
     """s between readings of a joint that is read more seldom than it is logged, in most of the runs that can tell; 0
     else."""
-    told = [rhythm(r.t, r.q[:, r.joints.index(joint)]) for r in runs if joint in r.joints]
+    told = [rhythm(*r.readings(r.joints.index(joint))) for r in runs if joint in r.joints]
     told = [x for x in told if not np.isnan(x)]
     slow = [x for x in told if x > 0]
     return float(np.median(slow)) if slow and len(slow) > 0.5 * len(told) else 0.0

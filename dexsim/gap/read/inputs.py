@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap.read import WRONG_SIGNAL, Run, channels
+from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run, channels
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
@@ -22,7 +22,7 @@ from dexsim.recording.schema import COMMANDS_FIX, DUTY, STATES, Recording, Serie
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
-WRONG = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
+WRONG = ("joint_order", "wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
 SHORTEST = 0.5  # s: what a recording must last to be read
 
 
@@ -37,14 +37,14 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     column = [recording.joints.index(j) for j in joints]
     _without_spikes(recording, notes)
     notes += [f"{name}: {f.topic}: {f.text}" for f in recording.findings if f.kind == "time_not_monotonic"]
-    t, q, good = _positions(recording, joints, column, notes)
+    t, q, read, good = _positions(recording, joints, column, notes)
     ct, c, kept = _commands(recording, joints, column, good, notes)
     if not kept:
         raise Unusable(f"{name}: no joint has both commands and positions")
     joints, column = tuple(joints[j] for j in kept), [column[j] for j in kept]
-    q, c = q[:, kept], c[:, kept]
+    q, c, read = q[:, kept], c[:, kept], read[:, kept]
     start = _begin(name, t, ct, notes)
-    t, q = t[start:], q[start:]
+    t, q, read = t[start:], q[start:], read[start:]
     table = m.table
     if recording.meta.get("servo"):
         table = ServoTable.from_dict(
@@ -53,6 +53,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         )
     run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
     run.breaks = tuple(recording.breaks)
+    run.read = None if read.all() else read
     run.v = _at(recording.states.velocity, t, column)
     run.torque = _torque(recording, table, joints, t, column, notes)
     run.temperature = _at(recording.temperature, t, column)
@@ -92,30 +93,35 @@ def _known_joints(recording: Recording, m: Mechanism, notes: list[str]) -> tuple
 
 def _positions(
     recording: Recording, joints: tuple[str, ...], column: list[int], notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """(times [S], positions [S, J] without gaps, which of the joints have enough of them). Raises Unusable where they
-    are too few."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
+    """(times [S], positions [S, J] without gaps, which of them were read [S, J], which of the joints have enough of
+    them). Raises Unusable where they are too few."""
     name, p = recording.path.name, recording.states.position
     t, q = np.asarray(p.t, float), p.value[:, column]
     keep = np.r_[True, np.diff(t) > 1e-6] & np.isfinite(q).any(1)
     t, q = t[keep], q[keep].copy()
+    read = np.isfinite(q)
     if len(t) < 20 or t[-1] - t[0] < SHORTEST:
         span = t[-1] - t[0] if len(t) else 0.0
         raise Unusable(f"{name}: {len(t)} samples over {span:.2f} s; at least 20 samples and {SHORTEST:g} s are needed")
     good = []
     for j in range(q.shape[1]):
-        finite = np.isfinite(q[:, j])
-        if finite.mean() < 0.5:
+        finite = read[:, j]
+        told = p.carried[keep, column[j]] if p.carried is not None else np.ones(len(t), bool)
+        missing = int((told & ~finite).sum())
+        if finite.sum() < 20 or missing > 0.5 * told.sum() or np.ptp(t[finite]) < SHORTEST:
             notes.append(
-                f"{name}: {joints[j]} has {100 * (1 - finite.mean()):.0f} % of its positions missing; left out"
+                f"{name}: {joints[j]} has {100 * missing / max(told.sum(), 1):.0f} % of its {int(told.sum())} positions"
+                " missing; left out"
             )
             continue
+        if missing:
+            notes.append(f"{name}: {joints[j]}: {missing} positions are missing; nothing is measured there")
         if not finite.all():
-            notes.append(f"{name}: {joints[j]}: {int((~finite).sum())} missing positions are interpolated")
             q[:, j] = PchipInterpolator(t[finite], q[finite, j], extrapolate=False)(t)
             q[:, j] = np.where(np.isfinite(q[:, j]), q[:, j], np.interp(t, t[finite], q[finite, j]))
         good.append(j)
-    return t, q, good
+    return t, q, read, good
 
 
 def _commands(
@@ -123,7 +129,8 @@ def _commands(
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """(times [C] in order, targets [C, J], each held until the next, which of the `good` joints have any)."""
     name = recording.path.name
-    t, c = np.asarray(recording.commands.t, float), recording.commands.value[:, column].copy()
+    commands = recording.targets()
+    t, c = np.asarray(commands.t, float), commands.value[:, column].copy()
     kept = []
     for j in good:
         finite = np.isfinite(c[:, j])
@@ -286,6 +293,7 @@ def cut(run: Run, start: float, end: float) -> Run:
         notes=list(run.notes),
         counted=run.counted,
         left_out=run.left_out,
+        read=part(run.read),
     )
 
 
@@ -302,7 +310,7 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
             notes.append(f"{r.name}: {', '.join(extra)} not in every recording; left out")
         k = [r.joints.index(j) for j in shared]
         r.cmd, r.q = r.cmd[:, k], r.q[:, k]
-        for name in ("v", "torque", "temperature", "duty", "enabled"):
+        for name in COLUMNS:
             x = getattr(r, name)
             setattr(r, name, None if x is None else x[:, k])
         r.joints = tuple(shared)

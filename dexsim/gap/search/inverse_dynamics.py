@@ -237,6 +237,7 @@ def readable(run: Run, j: int) -> bool:
         run.torque is None
         or run.torque_unit != "N.m"
         or not np.isfinite(run.torque[:, j]).all()
+        or run.read is not None
         or len(run.t) < 2 * EDGE + 100
     ):
         return False
