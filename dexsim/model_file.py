@@ -29,12 +29,37 @@ def read(path: Path, where: str) -> mujoco.MjSpec:
     check(path, where)
     try:
         with warned() as said:
-            spec = mujoco.MjSpec.from_file(str(path))
+            spec = parsed(path)
             spec.copy().compile()
     except (ValueError, RuntimeError) as error:
         raise UserError(f"{where}: {' '.join(str(error).split())}") from None
     for text in dict.fromkeys(said):
         print(f"warning: {where}: {text}", file=sys.stderr)
+    return spec
+
+
+def parsed(path: Path) -> mujoco.MjSpec:
+    """MuJoCo's reading of an MJCF or URDF file, whatever its name ends in: the root element says what it is. Raises
+    ValueError, as MuJoCo does. Give `check` the file first."""
+    if path.suffix.lower() in (".xml", ".urdf"):
+        return mujoco.MjSpec.from_file(str(path))
+    included: dict[str, bytes] = {}
+    waiting = [path]
+    while waiting:
+        file = waiting.pop()
+        try:
+            root = ET.fromstring(file.read_bytes())
+        except ET.ParseError as error:
+            raise ValueError(f"{file.name} is not XML: {error}") from None
+        for element, name, places in _named(root, path.parent):
+            if element.tag == "include" and name not in included:
+                for place in places:
+                    if place.is_file():
+                        included[name] = place.read_bytes()
+                        waiting.append(place)
+                        break
+    spec = mujoco.MjSpec.from_string(path.read_text(encoding="utf-8"), include=included)
+    spec.modelfiledir = str(path.parent)
     return spec
 
 

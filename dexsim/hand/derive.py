@@ -54,6 +54,7 @@ def derived(spec: mujoco.MjSpec, mirror: bool, scale: float) -> mujoco.MjSpec:
         joint.axis = np.array(joint.axis) * (-flip if hinge and mirror else flip)
         if not hinge:
             joint.range = np.array(joint.range) * scale
+            joint.ref, joint.springref = joint.ref * scale, joint.springref * scale
     for geom in out.geoms:
         _plain(geom, "geom")
         geom.pos, geom.quat = np.array(geom.pos) * lengths, turned(geom.quat)

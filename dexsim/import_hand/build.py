@@ -96,7 +96,7 @@ def build(
             lines.append(
                 f'{inner}<joint name="{_t(joint)}"{kind} pos="{_n(m.jnt_pos[j])}" axis="{_n(m.jnt_axis[j])}"'
                 f' range="{_n(m.jnt_range[j])}" armature="{_n(figures.armature[joint])}"'
-                f' damping="{_n(figures.damping[joint])}"/>'
+                f' damping="{_n(figures.damping[joint])}"{_spring(m, j)}/>'
             )
         for n, c in enumerate(c for c in shapes.capsules if c.body == b):
             others = everyone & ~own(b)
@@ -122,6 +122,8 @@ def build(
             if not len(faces):
                 continue
             file = f"{_safe(m.body(b).name)}_{n}.obj"
+            while file in out.meshes:  # names that differ in a dot or a case alone
+                file = f"_{file}"
             out.meshes[file] = obj(vertices, faces)
             files.append(file)
             lines.append(
@@ -144,6 +146,15 @@ def build(
         contact=f"\n  <contact>\n{apart}\n  </contact>" if apart else "",
     )  # fmt: skip
     return out
+
+
+def _spring(m: mujoco.MjModel, j: int) -> str:
+    """What a joint is where the model is drawn, and its spring, where it has them."""
+    at = int(m.jnt_qposadr[j])
+    said = [("ref", m.qpos0[at]), ("stiffness", m.jnt_stiffness[j])]
+    if m.jnt_stiffness[j]:
+        said.append(("springref", m.qpos_spring[at]))
+    return "".join(f' {key}="{_n(value)}"' for key, value in said if value)
 
 
 def _subtree(m: mujoco.MjModel, root: int) -> list[int]:

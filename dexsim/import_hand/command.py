@@ -31,15 +31,30 @@ settings (key=default):
                     finger,x,y,z,nx,ny,nz (m, in the tip body's frame)
   effort= speed=    N m and rad/s of the joints for which the file says none
   density=          kg/m3 of links without an inertia
+  inertia=          of links whose moments no body has: shapes (those of its shapes) or balance (the mean of the three)
   coupled=refuse    joints tied by tendons, mimic or equality: refuse, or independent: a motor for each
-  holes=refuse      a fingertip's mesh with a hole: refuse, or hull: take its convex hull
+  holes=hull        of a fingertip's mesh with a hole the convex hull is taken, or refuse
   packages=         folders in which package:// is looked for, separated by commas
   drops=256         objects let fall, to find where the hand holds them; 0: told from its cupped pose alone
   picture=true      false: do not render
   PLACE=VALUE       any place of hand.yaml, e.g. palm.normal=[0,0,1] poses.cupped.j1=0.8 fingers.thumb.closes=[1,-1]
 """
 MOST_DROPS = 100_000
-KEYS = ("out", "name", "palm", "pads", "effort", "speed", "density", "coupled", "holes", "drops", "packages", "picture")
+KEYS = (
+    "out",
+    "name",
+    "palm",
+    "pads",
+    "effort",
+    "speed",
+    "density",
+    "inertia",
+    "coupled",
+    "holes",
+    "drops",
+    "packages",
+    "picture",
+)
 PLACES = ("palm.", "poses.", "fingers.", "joints.", "places.", "opposing", "handedness", "span", "force")
 
 
@@ -101,11 +116,17 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
     """The settings as `dexsim.import_hand.importing.Settings`."""
     from dexsim.import_hand.importing import Settings
 
-    for key, allowed in (("coupled", ("refuse", "independent")), ("holes", ("refuse", "hull"))):
+    options = (
+        ("coupled", ("refuse", "independent")),
+        ("holes", ("hull", "refuse")),
+        ("inertia", ("shapes", "balance")),
+    )
+    for key, allowed in options:
         if given.get(key, allowed[0]) not in allowed:
             raise UserError(f"{key}={given[key]}: must be {' or '.join(allowed)}")
     out = Settings(said=said)
-    out.coupled, out.holes = given.get("coupled", "refuse"), given.get("holes", "refuse")
+    out.coupled, out.holes = given.get("coupled", "refuse"), given.get("holes", "hull")
+    out.inertia = given.get("inertia")
     out.palm, out.name = given.get("palm") or None, given.get("name") or None
     for key, low, high, unit in (
         ("effort", 0.001, 100.0, "N m"),

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 NOTE = ".import.json"
+ORDER = "joint order"
+"""Of the places, the one that is no field: names of the joints in a person's order on the wire."""
+OPTIONAL = ("places",)  # mappings that are left out where nothing is said of them
 
 
 @dataclass
@@ -76,22 +79,30 @@ def lay_over(hand: dict[str, Any], fixes: Corrections) -> None:
     """Write what a person said and no step asked for (a rotor's inertia, `places`, a file of held poses) into the
     content of hand.yaml, in place. Whether it fits is for the hand's own checks."""
     for place, value in fixes.values.items():
-        if place in fixes.used or " " in place:
-            continue
-        node: Any = hand
-        *path, last = place.split(".")
-        for key in path:
-            if isinstance(node, list):
-                node = next((x for x in node if isinstance(x, dict) and x.get("name") == key), None)
-            elif isinstance(node, dict):
-                if node.get(key) is None:
-                    node[key] = {}
-                node = node[key]
-        if isinstance(node, list):
-            node = next((x for x in node if isinstance(x, dict) and x.get("name") == last), None)
-        if isinstance(node, dict):
-            node[last] = value
+        if place not in fixes.used and place != ORDER and _laid(hand, place, value):
             fixes.used.add(place)
+
+
+def _laid(node: Any, place: str, value: Any) -> bool:
+    """Whether `place` was found below `node`, and given the value; names have dots of their own."""
+    if isinstance(node, list):
+        named = [x for x in node if isinstance(x, dict) and place.startswith(f"{x.get('name')}.")]
+        named.sort(key=lambda x: -len(str(x["name"])))
+        return any(_laid(x, place[len(str(x["name"])) + 1 :], value) for x in named)
+    if not isinstance(node, dict):
+        return False
+    for key in sorted((k for k in node if place.startswith(f"{k}.")), key=lambda k: -len(k)):
+        if node[key] is None:
+            node[key] = {}
+        if _laid(node[key], place[len(key) + 1 :], value):
+            return True
+    if place.partition(".")[0] in OPTIONAL:
+        key, _, rest = place.partition(".")
+        return _laid(node.setdefault(key, {}), rest, value)
+    if "." in place and place not in node:
+        return False
+    node[place] = value
+    return True
 
 
 def written(folder: Path) -> dict[str, Any] | None:

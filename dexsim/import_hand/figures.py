@@ -8,13 +8,15 @@ import mujoco
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.import_hand import geometry
+from dexsim.import_hand import geometry, inertias
 from dexsim.import_hand.frame import Motion
 from dexsim.import_hand.source import Source
 from dexsim.import_hand.tree import Tree
 
 PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
 SPEED = 6.0  # rad/s, of a small geared motor, where no file says it
+MESH = 12.0  # times the size of the hand, or a twelve-hundredth of it: no mesh of a hand is so large, or so small
+BODY = 3.0  # m within which a hand's joints lie
 REACH = (0.015, 0.6)  # m from a finger's root to its tip
 LINK_MASS = (1e-4, 3.0)  # kg
 TORQUE = (0.005, 50.0)  # N m
@@ -37,6 +39,7 @@ class Figures:
     guessed_effort: list[str] = field(default_factory=list)
     guessed_speed: list[str] = field(default_factory=list)
     guessed_armature: list[str] = field(default_factory=list)
+    guessed_damping: list[str] = field(default_factory=list)
     massless: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -58,7 +61,7 @@ def check(
             name = m.joint(j).name
             if name in out.effort:
                 continue
-            out.effort[name] = _stated(source.efforts, name, effort, out.guessed_effort, PRESS * x.reach)
+            out.effort[name] = _stated(source.drives.effort, name, effort, out.guessed_effort, PRESS * x.reach)
             out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, SPEED)
             for what, value, (low, high), unit in (
                 ("effort", out.effort[name], TORQUE, "N m"), ("speed", out.speed[name], TURN_SPEED, "rad/s"),
@@ -72,10 +75,41 @@ def check(
             if out.armature[name] <= 0:
                 out.armature[name] = ROTOR * out.effort[name]
                 out.guessed_armature.append(name)
-            out.damping[name] = float(m.dof_damping[dof]) or DAMPING * out.effort[name]
+            out.damping[name] = float(m.dof_damping[dof])
+            if out.damping[name] <= 0:
+                out.damping[name] = DAMPING * out.effort[name]
+                out.guessed_damping.append(name)
     out.warnings += _inertias(m, tree)
     out.massless = _massless(m, tree)
     return out
+
+
+def mended(source: Source, tree: Tree, inertia: str | None) -> list[str]:
+    """A line for each inertia that is none and was mended; inertia: "shapes", "balance", or None: not asked for.
+
+    Raises UserError, which lists them, for links that move, where nobody asked. What is held has an inertia that never
+    counts.
+    """
+    m = source.model
+    moved = {name: moments for name, moments in source.mended.items() if _moves(m, m.body(name).id, tree.palm)}
+    if moved and inertia is None:
+        raise inertias.refused(moved, source.path)
+    out = []
+    for name, moments in source.mended.items():
+        how = "of its shapes taken" if inertia == "shapes" else "the mean of the three taken"
+        if name not in moved:
+            how = "it is held fast, its inertia never counts"
+        out.append(f"inertia of '{name}' ({' '.join(f'{x:.3g}' for x in moments)} kg m2) is no body's: {how}")
+    return out
+
+
+def _moves(m: mujoco.MjModel, body: int, palm: int) -> bool:
+    """Whether a joint lies between the palm and a body."""
+    joints = 0
+    while body > palm:
+        joints += int(m.body_jntnum[body])
+        body = int(m.body_parentid[body])
+    return body == palm and joints > 0
 
 
 def _stated(stated: dict[str, float], name: str, given: float | None, guessed: list[str], guess: float) -> float:
@@ -96,6 +130,36 @@ def _size(motions: list[Motion], where: str) -> None:
             fix = f'the file is probably in {unit}: a mesh has scale="0.001 0.001 0.001" and every origin is in metres'
             break
     raise UserError(f"{where}: its longest finger is {reach:.3g} m, allowed {REACH[0]:g} to {REACH[1]:g} m; {fix}")
+
+
+def mesh_sizes(source: Source, tree: Tree) -> None:
+    """Raise UserError, naming them, for meshes whose size is out of all proportion to the distances between the
+    hand's joints: those in another unit than the rest."""
+    m = source.model
+    d = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, d)
+    bodies = [b for b in range(1, m.nbody) if _under(m, b, tree.palm)]
+    hand = max(float(np.linalg.norm(np.ptp(d.xpos[bodies], axis=0))), 0.01)
+    if hand > BODY:  # all of it is in another unit
+        return
+    said = {}
+    for g in range(m.ngeom):
+        if m.geom_bodyid[g] not in bodies or m.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
+            continue
+        size = float(np.ptp(geometry.geom_surface(m, g)[0], axis=0).max())
+        if hand / (100 * MESH) < size < hand * MESH:
+            continue
+        units = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
+        unit, factor = min(units, key=lambda u: abs(np.log(max(size, 1e-9) * u[1] / (0.5 * hand))))
+        why = (
+            f'in {unit}? scale="{factor:g} {factor:g} {factor:g}"' if size > hand else "scaled twice? leave scale= out"
+        )
+        name = m.mesh(m.geom_dataid[g]).name
+        said[name] = f"'{name}' of '{m.body(m.geom_bodyid[g]).name}' is {size:.3g} m across ({why})"
+    if said:
+        raise UserError(
+            f"model {source.path}: mesh {'; '.join(said.values())}: the hand's joints lie within {hand:.2g} m"
+        )
 
 
 def _limits(m: mujoco.MjModel, j: int, where: str, stated: tuple[float, float] | None) -> None:

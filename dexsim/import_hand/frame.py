@@ -14,6 +14,7 @@ from dexsim.import_hand.tree import Finger, Tree
 PARALLEL = 0.8
 """Cosine from which on a joint's axis counts as that of the distal joint: they bend the finger in one plane."""
 
+HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 SNAP = np.cos(np.radians(12.0))
 
 
@@ -56,53 +57,128 @@ def neutral(m: mujoco.MjModel) -> np.ndarray:
     return np.clip(np.zeros(m.nq), m.jnt_range[:, 0], m.jnt_range[:, 1])
 
 
-def motion(
-    m: mujoco.MjModel, finger: Finger, flexion: list[int] | None = None, closes: list[int] | None = None
-) -> Motion:
-    """A finger's motion; flexion, closes: where a person has said them.
+def motions(
+    m: mujoco.MjModel, fingers: list[Finger], flexion: list[list[int] | None], closes: list[list[int] | None]
+) -> tuple[list[Motion], list[str]]:
+    """How every finger moves, and a line for each whose closing side is not sure; flexion, closes: where a person has
+    said them, else None.
 
-    The joints that bend a finger have the axis of the distal one (within 37 degrees) where all joints are at 0; a joint
-    closes towards the side on which it has more room. The tip lies on the axis of the distal link, three quarters out.
+    The joints that bend a finger have the axis of the distal one (within 37 degrees) where all joints are at 0. They
+    close it together, as their axes say, towards the end that brings its tip nearer to the other fingertips; where
+    that does not tell, towards the side on which they have more room. The tip lies on the axis of the distal link,
+    three quarters out.
     """
     d = mujoco.MjData(m)
     d.qpos[:] = neutral(m)
     mujoco.mj_kinematics(m, d)
     mujoco.mj_comPos(m, d)
+    bends, tips = [], []
+    for finger, said in zip(fingers, flexion, strict=True):
+        distal = finger.joints[-1]
+        own = [j for j in finger.joints if abs(d.xaxis[j] @ d.xaxis[distal]) > PARALLEL and m.jnt_type[j] == HINGE]
+        bends.append(said or own or [distal])
+        tips.append(_tip(m, d, finger, bends[-1][-1]))
+    guess, doubts = _closing(m, d, fingers, bends, tips)
+    out, lines = [], []
+    for k, finger in enumerate(fingers):
+        given = closes[k]
+        signs = guess[k] if given is None or len(given) != len(bends[k]) else given
+        if signs is guess[k] and doubts[k]:
+            lines.append(f"finger {finger.name}: {doubts[k]}: say fingers.{finger.name}.closes={[-x for x in signs]}"
+                         " where that is wrong")  # fmt: skip
+        out.append(_moved(m, d, finger, bends[k], list(signs), tips[k]))
+    return out, lines
+
+
+STEP = 0.1  # of the way from where a finger is drawn to its ends: how its tip begins to move
+FACING = 0.1  # of a tip's way, taken towards the other tips: less does not tell a side
+LEAN = 0.2  # of a joint's range, more on one side of 0 than on the other: less does not tell one either
+
+
+def _closing(
+    m: mujoco.MjModel, d: mujoco.MjData, fingers: list[Finger], bends: list[list[int]], tips: list[np.ndarray]
+) -> tuple[list[list[int]], list[str]]:
+    """Which way the joints of each finger close it, and a doubt, or "", for each. d: at `neutral`; tips [F][3] m: in
+    the tips' frames."""
+    together, ends, room = [], [], []
+    for finger, joints, tip in zip(fingers, bends, tips, strict=True):
+        sign = [int(np.sign(d.xaxis[j] @ d.xaxis[joints[-1]])) if m.jnt_type[j] == HINGE else 1 for j in joints]
+        lean = [s * m.jnt_range[j].sum() / max(np.ptp(m.jnt_range[j]), 1e-9) for s, j in zip(sign, joints, strict=True)]
+        moved = []
+        for way in (1, -1):
+            q = neutral(m)
+            for s, j in zip(sign, joints, strict=True):
+                q[j] += STEP * (m.jnt_range[j, 1 if way * s > 0 else 0] - q[j])
+            other = mujoco.MjData(m)
+            other.qpos[:] = q
+            mujoco.mj_kinematics(m, other)
+            moved.append(tip_at(other, finger.tip, tip))
+        together.append(sign)
+        ends.append(moved)
+        room.append(float(np.mean(lean)))
+    ways = [0 if x >= 0 else 1 for x in room]  # index into ends
+    nearer = [0.0] * len(fingers)
+    for _ in range(len(fingers) + 2):  # each against where the others go, until none turns round
+        before = list(ways)
+        for k, (one, other) in enumerate(ends):
+            goals = np.array([ends[n][ways[n]] for n in range(len(fingers)) if n != k])
+            far = [float(np.linalg.norm(goals - tip, axis=1).mean()) for tip in (one, other)]
+            nearer[k] = (far[1] - far[0]) / max(float(np.linalg.norm(one - other)), 1e-4)
+            if abs(nearer[k]) > FACING:
+                ways[k] = 0 if nearer[k] > 0 else 1
+        if ways == before:
+            break
+    out, doubts = [], []
+    for k, sign in enumerate(together):
+        side, doubt = ways[k], ""
+        if abs(nearer[k]) <= FACING and abs(room[k]) <= LEAN:
+            doubt = "neither its limits nor the other fingertips tell which way it closes, guessed"
+        elif nearer[k] * room[k] < 0 and abs(nearer[k]) > FACING and abs(room[k]) > LEAN:
+            doubt = "closes towards the other fingertips, though its joints have more room to the other side"
+            if abs(nearer[k]) < min(0.5, abs(room[k])):
+                side = 0 if room[k] > 0 else 1
+                doubt = "closes to the side where its joints have more room, though that leads off the other fingertips"
+        out.append([s if side == 0 else -s for s in sign])
+        doubts.append(doubt)
+    return out, doubts
+
+
+def _tip(m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, last: int) -> np.ndarray:
+    """The end of a finger [3] m, in its tip's frame; last: id of its last flexion joint."""
     distal = finger.joints[-1]
-    if flexion is None:
-        flexion = [j for j in finger.joints if abs(d.xaxis[j] @ d.xaxis[distal]) > PARALLEL and m.jnt_type[j] == 3]
-        flexion = flexion or [distal]
-    if closes is None:
-        closes = []
-        for j in flexion:
-            low, high = m.jnt_range[j]
-            closes.append(1 if high >= -low else -1)
-        if m.jnt_type[distal] == 3:  # joints with as much room on both sides follow the others
-            signs = np.array([s * np.sign(d.xaxis[j] @ d.xaxis[distal]) for s, j in zip(closes, flexion, strict=True)])
-            lean = np.array([abs(m.jnt_range[j].sum()) / max(np.ptp(m.jnt_range[j]), 1e-9) for j in flexion])
-            if lean.max() > 0.2:
-                main = np.sign((signs * lean).sum()) or 1.0
-                closes = [
-                    s if lean[k] > 0.2 else int(main * np.sign(d.xaxis[j] @ d.xaxis[distal]))
-                    for k, (s, j) in enumerate(zip(closes, flexion, strict=True))
-                ]
     points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0]
     world = d.xmat[finger.tip].reshape(3, 3)
     points = points @ world.T + d.xpos[finger.tip]
+    axis = d.xaxis[last] if m.jnt_type[last] == HINGE else np.zeros(3)
     along = points.mean(0) - d.xanchor[distal]
-    hinge = m.jnt_type[flexion[-1]] == 3
-    axis = d.xaxis[flexion[-1]] if hinge else np.zeros(3)
     along = unit(along - axis * (axis @ along))
     reach = (points - d.xanchor[distal]) @ along
     low, high = reach.min(), reach.max()
     outer = points[reach >= high - 0.5 * (high - max(low, 0.0))]
     middle = 0.5 * (outer.min(0) + outer.max(0))
     tip = middle + along * (max(low, 0.0) + 0.75 * (high - max(low, 0.0)) - (middle - d.xanchor[distal]) @ along)
-    closing = closes[-1] * (np.cross(axis, tip - d.xanchor[flexion[-1]]) if hinge else d.xaxis[flexion[-1]])
+    return world.T @ (tip - d.xpos[finger.tip])
+
+
+def _moved(
+    m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, flexion: list[int], closes: list[int], position: np.ndarray
+) -> Motion:
+    """A finger's motion; d: at `neutral`."""
+    distal, last = finger.joints[-1], flexion[-1]
+    world = d.xmat[finger.tip].reshape(3, 3)
+    tip = tip_at(d, finger.tip, position)
+    hinge = m.jnt_type[last] == HINGE
+    axis = d.xaxis[last] if hinge else np.zeros(3)
+    points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0] @ world.T + d.xpos[finger.tip]
+    along = points.mean(0) - d.xanchor[distal]
+    along = unit(along - axis * (axis @ along))
+    closing = closes[-1] * (np.cross(axis, tip - d.xanchor[last]) if hinge else d.xaxis[last])
     normal = unit(closing - along * (along @ closing))
-    position = world.T @ (tip - d.xpos[finger.tip])
     straight, longest = _stretched(m, finger, flexion, position)
-    return Motion(finger, list(flexion), list(closes), position, world.T @ normal, longest, straight)
+    for k, (j, close) in enumerate(zip(flexion, closes, strict=True)):
+        if m.jnt_type[j] != HINGE:  # a slide is no longer stretched than bent: it is open
+            straight[k] = m.jnt_range[j, 0 if close > 0 else 1]
+    return Motion(finger, list(flexion), closes, position, world.T @ normal, longest, straight)
 
 
 def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: np.ndarray) -> tuple[np.ndarray, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -76,6 +78,11 @@ def seen(m: mujoco.MjModel, body: int) -> list[int]:
 def solid(m: mujoco.MjModel, body: int) -> list[int]:
     """Geoms that say where a body's surface is: those that collide, or else those that are drawn."""
     return colliding(m, body) or _geoms(m, body)
+
+
+def solid_geoms(body: Any) -> list[Any]:
+    """As `solid`, of a body of a model that is still being edited."""
+    return [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
 
 
 def _geoms(m: mujoco.MjModel, body: int) -> list[int]:

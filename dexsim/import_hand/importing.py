@@ -13,7 +13,21 @@ import yaml
 
 from dexsim import yaml_text
 from dexsim.errors import UserError
-from dexsim.import_hand import build, corrections, figures, folder, frame, geometry, poses, shapes, source, taxels, tree
+from dexsim.hand import Hand, load_hand
+from dexsim.import_hand import (
+    build,
+    corrections,
+    figures,
+    folder,
+    frame,
+    geometry,
+    moves,
+    poses,
+    shapes,
+    source,
+    taxels,
+    tree,
+)
 from dexsim.import_hand.corrections import Corrections
 from dexsim.import_hand.text import yaml_text as hand_text
 
@@ -24,18 +38,20 @@ SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's
 @dataclass
 class Settings:
     """packages: where package:// is looked for; palm: body to take for the palm; coupled: "refuse" or "independent";
-    density: kg/m3 of links without inertia; effort N m, speed rad/s: of joints whose file says none; pads: (rows,
-    columns), None for none, or a CSV file; holes: "refuse" or "hull"; drops: objects let fall to find where the hand
+    density: kg/m3 of links without inertia; inertia: "shapes" or "balance", where one is none; effort
+    N m, speed rad/s: of joints whose file says none; pads: (rows,
+    columns), None for none, or a CSV file; holes: "hull" or "refuse"; drops: objects let fall to find where the hand
     holds them, 0: its cupped pose alone tells; name of the hand; said: places of hand.yaml and their values."""
 
     packages: Sequence[Path] = ()
     palm: str | None = None
     coupled: str = "refuse"
     density: float | None = None
+    inertia: str | None = None
     effort: float | None = None
     speed: float | None = None
     pads: tuple[int, int] | Path | None = (8, 6)
-    holes: str = "refuse"
+    holes: str = "hull"
     drops: int = field(default_factory=lambda: DROPS)
     name: str | None = None
     said: dict[str, Any] = field(default_factory=dict)
@@ -69,9 +85,11 @@ def import_hand(
         lines.append(text)
         say(text)
 
-    robot = source.read(model, settings.packages, settings.coupled, settings.density)
+    robot = source.read(model, settings.packages, settings.coupled, settings.density, settings.inertia)
     where, m = f"model {model}", robot.model
     found = tree.find(m, where, settings.palm)
+    figures.mesh_sizes(robot, found)
+    mended = figures.mended(robot, found, settings.inertia)
     fixes = _corrections(out, note, found, m, settings)
     guessed: list[str] = []
 
@@ -81,14 +99,14 @@ def import_hand(
             guessed.append(place)
         return value
 
-    for text in robot.notes:
+    for text in [*robot.notes, *mended]:
         tell(text)
     for text in robot.coupled:
         tell(f"taken apart: {text}: each of these joints has a motor of its own here")
     if found.left:
         tell(f"fixed: {', '.join(found.left)} (before the palm '{m.body(found.palm).name}')")
 
-    motions = [_motion(m, f, fixes, pick) for f in found.fingers]
+    motions, doubts = _motions(m, found.fingers, fixes, pick)
     said = fixes.pick("opposing", None)
     names = [f.name for f in found.fingers]
     if said is not None and (not isinstance(said, list) or not said or any(n not in names for n in said)):
@@ -106,6 +124,8 @@ def import_hand(
         tell(f"finger   {x.finger.name + ('*' if k in thumbs else ''):<9}tip {m.body(x.finger.tip).name}, bends:"
              f" {' '.join(bend)}{'; turns: ' + ' '.join(side) if side else ''}; {1e3 * x.reach:.0f} mm")  # fmt: skip
     tell(f"         * presses against the others: {', '.join(names[k] for k in thumbs)}")
+    for text in doubts:
+        tell(f"check:   {text}")
 
     known = figures.check(robot, found, motions, settings.effort, settings.speed)
     for what, missing, guess, unit in (
@@ -122,6 +142,8 @@ def import_hand(
             f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2"
             " per N m"
         )
+    if known.guessed_damping:
+        tell(f"missing: damping of {len(known.guessed_damping)} joints: put at {figures.DAMPING:g} N m s/rad per N m")
     if known.massless:
         tell(f"no mass: {', '.join(known.massless)}")
     for text in known.warnings:
@@ -141,7 +163,7 @@ def import_hand(
     tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
          f" corners at most; {1e3 * made.error[0]:.1f} mm off the links; {meet} pairs of links can meet")  # fmt: skip
 
-    order = [str(j) for j in fixes.pick("joint order", [m.joint(j).name for j in found.joints])]
+    order = [str(j) for j in fixes.pick(corrections.ORDER, [m.joint(j).name for j in found.joints])]
     closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
     own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text)
 
@@ -160,16 +182,17 @@ def import_hand(
         if pads:
             for finger, skin in zip(names, made.skins, strict=True):
                 (stage / f"skin_{finger}.obj").write_text(build.hull_obj(skin), encoding="ascii")
-        (stage / "servo.yaml").write_text(_servo(name, hand), encoding="utf-8")
+        (stage / "servo.yaml").write_text(_servo(name, hand, robot), encoding="utf-8")
         (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         if settings.drops and not fixes.has("places.catch"):
             _drop_region(stage, hand, settings.drops, tell)
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+        loaded = _loads(stage)
+        for line in moves.faults(moves.moves(loaded)):
+            tell(f"check:   {line}")
         if picture:
-            _picture(stage, tell)
-        else:
-            _loads(stage)
-        folder.write_note(stage, hand, sorted(p for p in fixes.used if " " not in p))
+            _picture(loaded, stage, tell)
+        folder.write_note(stage, hand, sorted(fixes.used - {corrections.ORDER}))
     return Result(out, hand, lines, kept, sorted(fixes.used))
 
 
@@ -198,7 +221,7 @@ def _corrections(
         wire = [j["name"] for j in now["joints"]]
         theirs = [m.joint(j).name for j in found.joints]
         if set(wire) == set(theirs) and wire != theirs:
-            fixes.values["joint order"] = wire
+            fixes.values[corrections.ORDER] = wire
     fixes.values |= settings.said
     return fixes
 
@@ -212,23 +235,29 @@ def _renamed(place: str, names: dict[str, str]) -> str:
     )
 
 
-def _motion(m: mujoco.MjModel, finger: tree.Finger, fixes: Corrections, pick: Callable[..., Any]) -> frame.Motion:
-    base = f"fingers.{finger.name}"
-    flexion = fixes.pick(f"{base}.flexion", None)
-    if flexion is not None:
+def _motions(
+    m: mujoco.MjModel, fingers: list[tree.Finger], fixes: Corrections, pick: Callable[..., Any]
+) -> tuple[list[frame.Motion], list[str]]:
+    """How each finger moves, with what a person said of it, and what is not sure of its closing side."""
+    bends: list[list[int] | None] = []
+    for finger in fingers:
+        place = f"fingers.{finger.name}.flexion"
+        flexion = fixes.pick(place, None)
         theirs = [m.joint(j).name for j in finger.joints]
-        if not isinstance(flexion, list) or not flexion or any(j not in theirs for j in flexion):
-            raise UserError(f"{base}.flexion ({flexion}): must name joints of the finger: {', '.join(theirs)}")
-        flexion = [m.joint(j).id for j in flexion]
-    closes = fixes.pick(f"{base}.closes", None)
-    if closes is not None and flexion is not None and len(closes) != len(flexion):
-        closes = None
-    x = frame.motion(m, finger, flexion, closes)
-    pick(f"{base}.flexion", None)
-    pick(f"{base}.closes", None)
-    x.position = _vector(pick(f"{base}.tip.position", x.position), f"{base}.tip.position")
-    x.normal = frame.unit(_vector(pick(f"{base}.tip.normal", x.normal), f"{base}.tip.normal"))
-    return x
+        if flexion is not None and (
+            not isinstance(flexion, list) or not flexion or any(j not in theirs for j in flexion)
+        ):
+            raise UserError(f"{place} ({flexion}): must name joints of the finger: {', '.join(theirs)}")
+        bends.append([m.joint(j).id for j in flexion] if flexion is not None else None)
+    closes = [fixes.pick(f"fingers.{finger.name}.closes", None) for finger in fingers]
+    motions, doubts = frame.motions(m, fingers, bends, closes)
+    for x in motions:
+        base = f"fingers.{x.finger.name}"
+        pick(f"{base}.flexion", None)
+        pick(f"{base}.closes", None)
+        x.position = _vector(pick(f"{base}.tip.position", x.position), f"{base}.tip.position")
+        x.normal = frame.unit(_vector(pick(f"{base}.tip.normal", x.normal), f"{base}.tip.normal"))
+    return motions, doubts
 
 
 def _vector(value: Any, place: str) -> np.ndarray:
@@ -316,10 +345,7 @@ def _poses(
         if any(not fixes.has(f"poses.{pose}.{j}") for j in order):
             pick(f"poses.{pose}", None)
         result.append({j: round(float(q[k]), 4) for j, k in ids.items()})
-    tips = s.tips(closed)[0]
-    others = [k for k in range(len(s.motions)) if k not in s.thumbs]
-    gap = np.linalg.norm(tips[s.thumbs].mean(0) - tips[others].mean(0))
-    wide = np.linalg.norm((t := s.tips(opened)[0])[s.thumbs].mean(0) - t[others].mean(0))
+    wide, gap = poses.gap(s, opened), poses.gap(s, closed)
     tell(f"poses    fingertips {1e3 * wide:.0f} mm apart open, {1e3 * gap:.0f} mm cupped; no link in another")
     return result[0], result[1]
 
@@ -349,13 +375,14 @@ def _pads(
         mujoco.mj_comPos(m, d)
         for x, skin in zip(motions, made.skins, strict=True):
             surface = geometry.joined([geometry.geom_surface(m, g) for g in x.finger.geoms])
-            if settings.holes == "hull" or len(x.finger.geoms) > 1:
+            if len(x.finger.geoms) > 1:
                 surface = taxels._hull(skin)
             anchor = d.xmat[x.finger.tip].reshape(3, 3).T @ (d.xanchor[x.finger.joints[-1]] - d.xpos[x.finger.tip])
             axis = d.xmat[x.finger.tip].reshape(3, 3).T @ d.xaxis[x.flexion[-1]]
             along = x.position - anchor
             along -= axis * (axis @ along)
-            pads[x.finger.name] = taxels.paint(x.finger.name, surface, x.position, x.normal, along, settings.pads)
+            pads[x.finger.name] = taxels.paint(x.finger.name, surface, x.position, x.normal, along, settings.pads,
+                                                  settings.holes)  # fmt: skip
     for (finger, pad), skin in zip(((x.finger.name, pads[x.finger.name]) for x in motions), made.skins, strict=True):
         taxels.check(finger, pad, skin, where)
         note = f"; {pad.note}" if pad.note else ""
@@ -413,21 +440,32 @@ def _list(v: np.ndarray) -> list[float]:
     return [round(float(x), 6) + 0.0 for x in v]
 
 
-def _servo(name: str, hand: dict[str, Any]) -> str:
-    """A servo table from efforts and speeds alone."""
-    head = (
-        f"# The drives of {name}, from efforts and speeds of hand.yaml alone. Guesses, until a diagnosis of the real\n"
-        f"# hand replaces them: kp (full torque at {SWEEP:g} rad of error), kd, delay (100 Hz), friction (2 % of the\n"
-        "# torque).\n"
-    )
-    joints = {
-        j["name"]: {
-            "kp": float(f"{j['effort'] / SWEEP:.3g}"), "kd": float(f"{0.025 * j['effort'] / SWEEP:.3g}"),
-            "torque_limit": j["effort"], "no_load_speed": j["speed"], "delay": 0.01,
-            "coulomb_friction": float(f"{0.02 * j['effort']:.2g}"),
-        }
-        for j in hand["joints"]
+def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
+    """A servo table: what the file says of its drives, the rest from efforts and speeds."""
+    m, said = robot.model, robot.drives
+    friction = {m.joint(j).name: float(m.dof_frictionloss[m.jnt_dofadr[j]]) for j in range(m.njnt)}
+    joints, guessed = {}, {"kp": 0, "kd": 0, "coulomb_friction": 0}
+    for j in hand["joints"]:
+        guess = {"kp": j["effort"] / SWEEP, "kd": 0.025 * j["effort"] / SWEEP, "coulomb_friction": 0.02 * j["effort"]}
+        own = {"kp": said.kp.get(j["name"]), "kd": said.kd.get(j["name"]), "coulomb_friction": friction.get(j["name"])}
+        if own["kp"] and not own["kd"]:
+            guess["kd"] = 0.025 * own["kp"]
+        for key in guess:
+            guessed[key] += not own[key]
+        value = {key: float(f"{own[key] or guess[key]:.3g}") for key in guess}
+        joints[j["name"]] = {
+            "kp": value["kp"], "kd": value["kd"], "torque_limit": j["effort"], "no_load_speed": j["speed"],
+            "delay": 0.01, "coulomb_friction": value["coulomb_friction"],
+        }  # fmt: skip
+    rules = {
+        "kp": f"full torque at {SWEEP:g} rad of error", "kd": "a fortieth of kp",
+        "coulomb_friction": "2 % of the torque",
     }  # fmt: skip
+    text = "; ".join(f"{key} of {guessed[key]} joints ({rule})" for key, rule in rules.items() if guessed[key])
+    head = (
+        f"# The drives of {name}. Guesses, until a diagnosis of the real hand replaces them: delay (100 Hz)"
+        f"{'; ' + text if text else ''}.\n# All else is from the model's file and from hand.yaml.\n"
+    )
     data = {
         "drive": "torque",
         "joints": joints,
@@ -455,9 +493,7 @@ def _rank(hand: dict[str, Any]) -> Callable[[str], int]:
     return lambda place: order.index(place.split(".")[0]) if place.split(".")[0] in order else len(order)
 
 
-def _loads(stage: Path) -> Any:
-    from dexsim.hand import load_hand
-
+def _loads(stage: Path) -> Hand:
     try:
         return load_hand(stage)
     except UserError as error:  # the name of the folder that is only being written helps nobody
@@ -487,11 +523,10 @@ def _drop_region(stage: Path, hand: dict[str, Any], drops: int, tell: Callable[[
          f" {y:.0f}) mm are held, {than}")  # fmt: skip
 
 
-def _picture(stage: Path, tell: Callable[[str], None]) -> None:
+def _picture(hand: Hand, stage: Path, tell: Callable[[str], None]) -> None:
     from dexsim.import_hand import picture
     from dexsim.view.video import NoRenderer
 
-    hand = _loads(stage)
     try:
         picture.draw(hand, stage / "picture.png")
     except NoRenderer as error:

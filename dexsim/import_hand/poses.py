@@ -140,18 +140,31 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
 
 def opened(s: Search, closed: np.ndarray) -> np.ndarray:
     """The cupped hand with its fingers let go: OPEN of the way from stretched, farther or nearer where links would
-    overlap; an opposing finger stays turned as it is."""
+    overlap; bent back where stretched fingertips are nearer to each other than cupped ones, as a claw's are. An
+    opposing finger stays turned as it is."""
     bent = [j for k, x in enumerate(s.motions) for j in (x.flexion if k in s.thumbs else x.finger.joints)]
-    best, least = closed, np.inf
-    for share in (OPEN, 0.4, 0.2, 0.5, 0.1, 0.6, 0.0, 0.7):
-        q = closed.copy()
-        q[bent] = s.rest[bent] + share * (closed[bent] - s.rest[bent])
-        worst = max((d for _, _, d in s.overlaps(q)), default=0.0)
-        if worst <= TOUCH:
-            return q
-        if worst < least:
-            best, least = q, worst
+    back = s.rest.copy()
+    for x in s.motions:
+        for j, close in zip(x.flexion, x.closes, strict=True):
+            back[j] = np.clip(back[j] - 0.25 * close * s.span[j], *s.m.jnt_range[j])
+    best, least, wide = closed, np.inf, gap(s, closed)
+    for rest in (s.rest, back):
+        for share in (OPEN, 0.4, 0.2, 0.5, 0.1, 0.6, 0.0, 0.7):
+            q = closed.copy()
+            q[bent] = rest[bent] + share * (closed[bent] - rest[bent])
+            worst = max((d for _, _, d in s.overlaps(q)), default=0.0)
+            if worst <= TOUCH and gap(s, q) > wide:
+                return q
+            if worst < least:
+                best, least = q, worst
     return best
+
+
+def gap(s: Search, q: np.ndarray) -> float:
+    """Distance [m] between the opposing fingertips, their mean, and the others'."""
+    tips = s.tips(q)[0]
+    others = [k for k in range(len(s.motions)) if k not in s.thumbs]
+    return float(np.linalg.norm(tips[s.thumbs].mean(0) - tips[others].mean(0)))
 
 
 def span(s: Search, open_: np.ndarray, closed: np.ndarray) -> float:

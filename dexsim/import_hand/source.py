@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,46 +14,61 @@ import numpy as np
 
 from dexsim import files, model_file
 from dexsim.errors import UserError
-from dexsim.import_hand import urdf
+from dexsim.import_hand import drives, inertias, urdf
+from dexsim.import_hand.drives import Drives
+from dexsim.import_hand.inertias import Moments
 
 ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 @dataclass
 class Source:
-    """model: of the hand alone. efforts, speeds: by joint, where the file says them (N m, rad/s). bare: moving bodies
-    whose inertia the file does not give. notes: what was left out, a line each. coupled: what was taken apart. limits:
-    [rad, m] by joint, as a URDF says them: MuJoCo leaves out what is none."""
+    """model: of the hand alone. drives: what the file's actuators say; speeds: by joint, where the file says them
+    (rad/s). bare: moving bodies whose inertia the file does not give. notes: what was left out, a line each. coupled:
+    what was taken apart. limits: [rad, m] by joint, as a URDF says them: MuJoCo leaves out what is none. mended: by
+    body, the moments that no body has, for which the model has others."""
 
     path: Path
     model: mujoco.MjModel
-    efforts: dict[str, float]
+    drives: Drives
     speeds: dict[str, float]
     bare: list[str]
     notes: list[str] = field(default_factory=list)
     coupled: list[str] = field(default_factory=list)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    mended: dict[str, Moments] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         return self.path.stem
 
 
-def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", density: float | None = None) -> Source:
+def read(
+    path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", density: float | None = None,
+    inertia: str | None = None,
+) -> Source:  # fmt: skip
     """The robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "refuse" joints that move
-    together, or "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia.
+    together, or "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia. inertia:
+    "shapes" takes one that is none from the link's shapes; else it is balanced, and stands in `Source.mended`.
 
-    Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints, coupled joints,
-    links without inertia, limits that are none.
+    Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
+    coupled joints, links without inertia, limits that are none.
     """
     files.check(path, urdf.MAX_MODEL, "model")
-    with model_file.warned() as said, tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch:
-        out = _read(path, packages, coupled, density, Path(scratch))
+    with (
+        model_file.warned() as said,
+        warnings.catch_warnings(),
+        tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch,
+    ):
+        warnings.simplefilter("ignore")  # of textures, which are left out
+        out = _read(path, packages, coupled, density, inertia, Path(scratch))
     out.notes += [f"MuJoCo warns: {text}" for text in dict.fromkeys(said)]
     return out
 
 
-def _read(path: Path, packages: Sequence[Path], coupled: str, density: float | None, scratch: Path) -> Source:
+def _read(
+    path: Path, packages: Sequence[Path], coupled: str, density: float | None, inertia: str | None, scratch: Path
+) -> Source:
     speeds: dict[str, float] = {}
     bare: list[str] = []
     limits: dict[str, tuple[float, float]] = {}
@@ -62,12 +78,14 @@ def _read(path: Path, packages: Sequence[Path], coupled: str, density: float | N
         spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
     else:
         model_file.check(path, f"model {path}")
-        spec = _parsed(path, lambda: mujoco.MjSpec.from_file(str(path)))
+        spec = _parsed(path, lambda: model_file.parsed(path))
         _meshes_there(spec, path)
     notes: list[str] = []
     _one_tree(spec, path, notes)
     taken = _coupled(spec, path, coupled)
-    efforts = _strip(spec, path, notes)
+    said = drives.read(spec)
+    notes += said.notes + drives.contacts(spec) + drives.joints(spec)
+    _strip(spec, path, notes)
     if bare and density is None:
         first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
         raise UserError(
@@ -75,16 +93,18 @@ def _read(path: Path, packages: Sequence[Path], coupled: str, density: float | N
             " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
         )
     for body in spec.bodies:
-        if body.name in bare:
-            geoms = [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
-            for geom in body.geoms:  # what is drawn and what collides is one body, not two
-                geom.density = density if geom in geoms else 0.0
+        if body.name in bare and density is not None:
+            inertias.fill(body, density)
+    mended = inertias.balanced(spec)
+    if inertia == "shapes":
+        inertias.from_shapes(spec, mended, path)
     model = _compiled(spec, path, notes)
     _finite(model, path)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
-            efforts.setdefault(model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max()))
-    return Source(path, model, efforts, speeds, bare, notes, taken, limits)
+            name, most = model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max())
+            said.effort[name] = min(said.effort.get(name, most), most)
+    return Source(path, model, said, speeds, bare, notes, taken, limits, mended)
 
 
 def _finite(m: mujoco.MjModel, path: Path) -> None:
@@ -115,8 +135,6 @@ def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
 
 FIXES = (
     ("repeated name", "every link and joint needs a name of its own"),
-    ("positive eigenvalues", "ixx, iyy and izz are kg m2 above 0, and ixy, ixz, iyz smaller than they"),
-    ("A + B >= C", "no body's inertia about one axis is above the sum of those about the other two: check its figures"),
     ("axis too small", "<axis> must not be 0 0 0"),
     ("URDF body not found", "the links must be one tree: the chain of parents of one of them comes back to it"),
     ("parent or child missing", "<parent link=> and <child link=> must name links of the file"),
@@ -143,11 +161,8 @@ def _meshes_there(spec: mujoco.MjSpec, path: Path) -> None:
 def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     """Leave one tree with hinges: objects, floors and tables are not the hand."""
 
-    def joints(body: Any) -> list[Any]:
-        return [*body.joints, *(j for b in body.bodies for j in joints(b))]
-
-    trees = {b.name or f"body {k}": (b, joints(b)) for k, b in enumerate(spec.worldbody.bodies)}
-    hands = [n for n, (_, js) in trees.items() if sum(j.type in ONE_DOF for j in js) >= 2]
+    trees = {b.name or f"body {k}": b for k, b in enumerate(spec.worldbody.bodies)}
+    hands = [n for n, b in trees.items() if _hinges(b) >= 2]
     if not hands:
         raise UserError(
             f"model {path}: has no tree of bodies with two hinges or more; "
@@ -157,7 +172,7 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
         raise UserError(
             f"model {path}: {len(hands)} trees with hinges ({', '.join(hands)}): leave one hand in the file"
         )
-    for name, (body, _) in trees.items():
+    for name, body in trees.items():
         if name != hands[0]:
             notes.append(f"left out: '{name}' (another tree)")
             spec.delete(body)
@@ -201,13 +216,9 @@ def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str) -> list[str]:
     return found
 
 
-def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> dict[str, float]:
-    """Take out what is not the hand's body; the largest torques [N m] that its actuators say."""
-    efforts: dict[str, float] = {}
+def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
+    """Take out what is not the hand's body, and what moves its base: that is held."""
     for actuator in list(spec.actuators):
-        reach = np.abs(actuator.forcerange).max() * max(abs(actuator.gear[0]), 1e-9)
-        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.forcelimited != 0 and reach > 0:
-            efforts[actuator.target] = max(efforts.get(actuator.target, 0.0), float(reach))
         spec.delete(actuator)
     for group in (
         spec.sensors,
@@ -227,17 +238,29 @@ def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> dict[str, float
         spec.delete(texture)
     if list(spec.flexes):
         raise UserError(f"model {path}: has soft bodies (flex); only rigid links are simulated")
+    hinges = _hinges(spec.worldbody)
     for k, body in enumerate(spec.bodies):
         if not body.name:
             body.name = f"body_{k}"
-        for n, joint in enumerate(body.joints):
+        for n, joint in enumerate(list(body.joints)):
             if joint.type not in ONE_DOF:
                 kind = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
-                raise UserError(f"model {path}: joint '{joint.name}' is a {kind} joint; a hand has hinges and slides")
+                if _hinges(body) == hinges:  # the hand's base
+                    notes.append(f"left out: {kind} joint '{joint.name}' of '{body.name}': the hand's base is held")
+                    spec.delete(joint)
+                    continue
+                raise UserError(
+                    f"model {path}: joint '{joint.name}' of '{body.name}' is a {kind} joint inside the hand, whose"
+                    " joints are hinges and slides: put hinges in its place, or take it out"
+                )
             if not joint.name:
                 joint.name = f"{body.name}_joint{n or ''}"
                 notes.append(f"joint without a name on '{body.name}': called '{joint.name}'")
-    return efforts
+
+
+def _hinges(body: Any) -> int:
+    """Hinges and slides on a body and below it."""
+    return sum(j.type in ONE_DOF for j in body.joints) + sum(_hinges(b) for b in body.bodies)
 
 
 def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjModel:

@@ -52,19 +52,21 @@ def paint(
     normal: np.ndarray,
     along: np.ndarray,
     size: tuple[int, int],
+    holes: str = "hull",
 ) -> Pad:
     """A grid of size (rows, columns) on the side of `surface` that `normal` looks out of.
 
     surface: the tip's, tip body's frame; position [3] m: the middle of the pad, about; along [3]: from the joint to
     the tip: rows run that way. The grid covers three quarters of the tip's width and of its length beyond the middle,
     and shrinks until every ray meets a face that is not too steep. Taxels lie on the convex hull that presses objects;
-    where the surface itself is hollow there, `note` says so. Raises UserError: a hole, a side without a face.
+    where the surface itself is hollow there, or has a hole, `note` says so. Raises UserError: a hole where holes is
+    "refuse", a side without a face.
     """
     rows, columns = size
-    holes = geometry.open_edges(surface)
-    if holes:
+    edges = geometry.open_edges(surface)
+    if edges and holes == "refuse":
         raise UserError(
-            f"finger {finger}: the mesh of its tip is not closed, {holes} edges border a hole; close it (Blender: Mesh"
+            f"finger {finger}: the mesh of its tip is not closed, {edges} edges border a hole; close it (Blender: Mesh"
             " > Clean Up > Fill Holes), or holes=hull takes its convex hull"
         )
     hull = _hull(surface[0])
@@ -99,8 +101,8 @@ def paint(
     if rows * columns == 1 or 1 in size:
         cell = (2 * shrink * half[0] / columns) * (2 * shrink * half[1] / rows)
     area = cell / np.maximum(facing @ normal, STEEPEST)
-    note = ""
-    if hollow > OFF:
+    note = "its mesh is not closed: taxels lie on its convex hull, which touches" if edges else ""
+    if not edges and hollow > OFF:
         note = f"the tip is hollow there by up to {1e3 * hollow:.1f} mm: taxels lie on its convex hull, which touches"
     return Pad(point, facing, tangent, area, rows, note)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 HEAD = """\
@@ -33,6 +34,7 @@ def yaml_text(hand: dict[str, Any], guessed: list[str]) -> str:
 
 def _entry(key: str, value: Any, place: str, depth: int, guessed: set[str]) -> str:
     pad = "  " * depth
+    key = _flow(key)
     mark = "  # guess" if place in guessed else ""
     if isinstance(value, dict) and not _small(value):
         return f"{pad}{key}:{mark}\n" + "".join(
@@ -81,4 +83,4 @@ def _flow(value: Any) -> str:
     text = str(value)
     plain = text and all(c.isalnum() or c in "_-./" for c in text) and not text[0].isdigit() and text[0] not in "-."
     words = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
-    return text if plain and text.lower() not in words else '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return text if plain and text.lower() not in words else json.dumps(text, ensure_ascii=False)

@@ -34,16 +34,24 @@ def is_urdf(path: Path) -> bool:
     return _root(path).tag == "robot"
 
 
-def _root(path: Path) -> ET.Element:
-    text = files.text(path, MAX_MODEL, "model")
+def _root_of_any(path: Path, what: str = "mesh") -> ET.Element:
+    text = files.text(path, MAX_MODEL, what)
     if "<!ENTITY" in text:  # nothing that a robot needs, and a few of them can fill the memory
-        raise UserError(f"model {path}: defines XML entities; write their values out")
+        raise UserError(f"{what} {path}: defines XML entities; write their values out")
+    return ET.fromstring(text)
+
+
+def _root(path: Path) -> ET.Element:
     try:
-        root = ET.fromstring(text)
+        root = _root_of_any(path, "model")
     except ET.ParseError as error:
         what = "a xacro program's input? run xacro on it first" if path.suffix == ".xacro" else "URDF or MJCF is needed"
         raise UserError(f"model {path}: is not XML ({error}); {what}") from None
-    if root.tag not in ("robot", "mujoco", "mujocoinclude"):
+    if root.tag == "mujocoinclude":
+        raise UserError(
+            f"model {path}: its root element is <mujocoinclude>: a part of a model; give the file that includes it"
+        )
+    if root.tag not in ("robot", "mujoco"):
         raise UserError(
             f"model {path}: its root element is <{root.tag}>; a robot's is <robot> (URDF) or <mujoco> (MJCF)"
         )
@@ -150,6 +158,8 @@ def _convert(path: Path, to: Path) -> Path:
         mesh: Any = trimesh.load(path, force="mesh")  # a Trimesh, or what has no faces
         if not len(mesh.faces):
             raise ValueError("it holds no triangles")
+        if path.suffix.lower() == ".dae":  # trimesh leaves its <unit> alone
+            mesh.apply_scale(_collada_unit(path))
         mesh.export(to, include_texture=False)
     except Exception as error:  # trimesh raises whatever its reader for the format does
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -157,6 +167,15 @@ def _convert(path: Path, to: Path) -> Path:
             f"mesh {path}: cannot be read ({reason[:120]}); save it as .stl or .obj (Blender: File > Export)"
         ) from None
     return to
+
+
+def _collada_unit(path: Path) -> float:
+    """Metres a unit of a COLLADA file."""
+    unit = _root_of_any(path).find("{*}asset/{*}unit")
+    metres = float((unit.get("meter") if unit is not None else None) or 1.0)
+    if not 0 < metres < math.inf:
+        raise ValueError(f"its <unit meter=> is {metres:g}")
+    return metres
 
 
 def _number(what: str, text: str | None, allowed: str = "a finite number", low: float = -math.inf) -> float:
