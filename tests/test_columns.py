@@ -44,6 +44,15 @@ def plain(scale=1.0, start=0.0):
         ("quality", None),
         ("index", None),
         ("q.elbow", ("position", "elbow", "")),
+        ("desired.positions[0]", ("command", "0", "")),
+        ("/arm_controller/state/actual/positions[2]", ("position", "2", "")),
+        ("/hand_controller/controller_state/reference.positions.elbow", ("command", "elbow", "")),
+        ("feedback.velocities[1]", ("velocity", "1", "")),
+        ("desired.velocities[1]", None),
+        ("error.positions[1]", None),
+        ("elbow_position_ticks", ("position", "elbow", "")),
+        ("goal_position_raw.elbow", ("command", "elbow", "")),
+        ("target_value", ("command", "", "")),
     ],
 )
 def test_what_a_column_is(name, role):
@@ -72,7 +81,7 @@ def test_units_stand_in_a_name_or_in_meta_and_are_converted_once(tmp_path):
         assert np.allclose(x.commands.value[:, 1], Q["wrist"], atol=1e-6)
     assert r.effort_is == "current_A" and np.allclose(r.states.effort.value[:, 0], Q["elbow"], atol=1e-6)
     assert r.start_ns == pytest.approx(1.7e18) and np.allclose(r.states.position.t, T, atol=1e-3)
-    assert any(f.kind == "unit" and "position_unit=deg" in f.text for f in s.findings)
+    assert any(f.kind == "unit" and "position in deg" in f.text for f in s.findings)
 
 
 def test_an_npz_with_arrays_is_the_same_recording(tmp_path):
@@ -128,7 +137,7 @@ def test_missing_cells_are_missing_samples(tmp_path):
         ("x,position.a\n0,1\n0,1\n", "no column of time"),
         ("time,position,position.a,command.b\n" + "0,1,1,1\n" * 9, "names no joint"),
         ("time,position.a [furlong]\n0,1\n", None),
-        ("time,position.a\n" + "".join(f"{10 * i},1\n" for i in range(30)), "meta.time_unit"),
+        ("time,position.a\n" + "".join(f"{10 * i},1\n" for i in range(30)), "units.time"),
         ("time,torque.a,current.b,position.a\n0,1,1,1\n", "current in one"),
         ("time,position.a [rpm]\n0,1\n", "not read"),
     ],
@@ -191,3 +200,125 @@ def test_columns_without_a_name_are_the_model_s_one_joint(tmp_path, suffix):
     named.write_text("time,command.knee,position.knee\n" + "".join(f"{a:.3f},0,{a:.3f}\n" for a in t))
     with pytest.raises(UserError, match="none of its joints"):  # a name that is another's
         read(named, joints=["elbow"])
+
+
+def text_of(names, rows, separator=","):
+    return "\n".join([separator.join(names), *(separator.join(map(str, r)) for r in rows)]) + "\n"
+
+
+def test_decimal_commas_and_dates_are_numbers(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [(f"2026-03-03T17:37:{t:09.6f}Z", f"{q:.6f}".replace(".", ","), f"{1000 + q:.4f}".replace(".", ","))
+            for t, q in zip(T, Q["elbow"], strict=True)]  # fmt: skip
+    path.write_text(text_of(("timestamp", "position.elbow", "temperature.elbow"), rows, ";"))
+    r = read(path, audit=False)
+    assert r.start_ns == 1_772_559_420 * 10**9 and np.allclose(r.states.position.t, T, atol=1e-6)
+    assert np.allclose(r.states.position.value[:, 0], Q["elbow"], atol=1e-6)
+    assert np.allclose(r.temperature.value[:, 0], 1000 + Q["elbow"], atol=1e-4)
+    path.write_text(text_of(("timestamp", "position.elbow"), [("yesterday", 1.0)] * 9))
+    with pytest.raises(UserError, match="column 'timestamp' is neither a number nor a date"):
+        read(path)
+
+
+def test_a_column_is_looked_up_before_its_values_are_judged(tmp_path):
+    path = tmp_path / "a.csv"
+    names = ("when", "state", "note", "position.elbow", "command.elbow")
+    rows = [(f"17:37:{t:05.2f}", "open", "x", q, q) for t, q in zip(T, Q["elbow"], strict=True)]
+    path.write_text(text_of(names, rows))
+    r = read(path, {"time": "when"}, audit=False)
+    assert np.allclose(r.states.position.t, T, atol=1e-9) and len(r.findings) < 20
+    with pytest.raises(UserError, match="column 'note' holds no numbers"):
+        read(path, {"time": "when", "position.elbow": "note"})
+
+
+def test_a_time_by_another_name_is_the_one_that_never_goes_back(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [(t % 0.5, t, 1.7e9 + t, q, q) for t, q in zip(T, Q["elbow"], strict=True)]
+    path.write_text(text_of(("Trial_Elapsed_s", "Experiment_Elapsed_s", "Epoch", "position", "command"), rows))
+    r = read(path, audit=False)
+    assert np.allclose(r.states.position.t, T) and any("Experiment_Elapsed_s" in f.text for f in r.findings)
+
+
+def test_one_joint_a_line(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [x for k, t in enumerate(T) for x in ((t, "elbow", Q["elbow"][k], Q["elbow"][k]),
+                                                 (t + 0.003, "wrist", Q["wrist"][k], Q["wrist"][k]))]  # fmt: skip
+    path.write_text(text_of(("time", "joint", "goal_position", "present_position"), rows))
+    r = read(path)
+    assert r.joints == ("elbow", "wrist") and r.states.position.carried is not None
+    part = next(p for p in r.parts() if p.joints == ("wrist",))
+    assert np.allclose(part.states.position.t, T + 0.003) and np.allclose(part.commands.value[:, 0], Q["wrist"])
+    assert not [f for f in r.findings if f.kind in ("nan", "gap", "burst", "dropped")]
+
+
+def test_a_controllers_columns_by_number_are_the_stated_joints(tmp_path):
+    path = tmp_path / "a.csv"
+    names = ["time", *(f"desired.positions[{k}]" for k in (0, 1)), *(f"actual.positions[{k}]" for k in (0, 1)),
+             *(f"desired.velocities[{k}]" for k in (0, 1))]  # fmt: skip
+    rows = zip(T, Q["elbow"], Q["wrist"], np.roll(Q["elbow"], 3), np.roll(Q["wrist"], 3), T, T, strict=True)
+    path.write_text(text_of(names, rows))
+    r = read(path, meta={"joint_names": "elbow,wrist"}, audit=False)
+    assert r.joints == ("elbow", "wrist") and r.states.velocity is None
+    assert np.allclose(r.commands.value[:, 1], Q["wrist"])
+
+
+LIMITS = {"elbow": (-0.5, 1.5), "wrist": (-1.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("unit", "of"),
+    [
+        ("ticks:4096", lambda q: q * 4096 / (2 * np.pi)),
+        ("ticks:4096@2048", lambda q: 2048 + q * 4096 / (2 * np.pi)),
+        ("percent", lambda q: 100 * (q + 0.5) / 2.0),
+        ("signed_percent", lambda q: 100 * (q - 0.5)),
+        ("normalized", lambda q: q - 0.5),
+        ("registers", lambda q: 1000 * (q + 0.5) / 2.0),
+        ("registers=1.5..-0.5", lambda q: 1000 * (1.5 - q) / 2.0),
+        ("range:0..255=-0.5..1.5", lambda q: 255 * (q + 0.5) / 2.0),
+    ],
+)
+def test_units_of_a_drives_own_numbers(tmp_path, unit, of):
+    q, names = Q["elbow"], ("command.elbow", "position.elbow", "velocity.elbow")
+    path = csv(tmp_path / "a.csv", {"time": T} | {name: of(q) for name in names})
+    r = read(path, meta={"units.position": unit}, limits=LIMITS, audit=False)
+    assert np.allclose(r.commands.value[:, 0], q) and np.allclose(r.states.position.value[:, 0], q)
+    slope = float(of(np.array(1.0)) - of(np.array(0.0)))
+    assert np.allclose(r.states.velocity.value[:, 0], of(q) / slope)
+    one = read(path, meta={"units": {"position.elbow": unit}}, limits=LIMITS, audit=False)
+    assert np.array_equal(one.states.position.value, r.states.position.value)
+
+
+def test_what_a_unit_lacks_is_said(tmp_path):
+    path = csv(tmp_path / "a.csv", plain())
+    with pytest.raises(UserError, match="its range is not known here; say it: percent=LOW..HIGH"):
+        read(path, meta={"units.position": "percent"})
+    with pytest.raises(UserError, match="units.position=furlong: is not read.* ticks:4096"):
+        read(path, meta={"units.position": "furlong"})
+    with pytest.raises(UserError, match="units.positoin: no such quantity. Did you mean"):
+        read(path, meta={"units.positoin": "rad"})
+
+
+def test_whole_numbers_of_both_sides_are_a_drives_own(tmp_path):
+    """A guess, said as such: of ticks, of registers where the range is known; never of one side alone, which is a
+    fault."""
+    q, ticks = Q["elbow"] * 3, lambda x: np.round(2048 + x * 4096 / (2 * np.pi))
+    both = csv(tmp_path / "a.csv", {"time": T, "command.elbow": ticks(q), "position.elbow": ticks(np.roll(q, 3))})
+    r = read(both)
+    said = [f for f in r.findings if f.kind == "unit"]
+    assert all(f.severity == "warning" and "ticks:4096@2048" in f.text for f in said) and len(said) == 2
+    assert np.abs(r.commands.value[:, 0] - q).max() < 1e-3
+    one = csv(tmp_path / "b.csv", {"time": T, "command.elbow": q, "position.elbow": ticks(np.roll(q, 3))})
+    assert {f.severity for f in read(one).findings if f.kind == "unit"} == {"error"}
+    registers = np.round(1000 * (Q["elbow"] + 0.5) / 2)
+    path = csv(tmp_path / "c.csv", {"time": T, "command.elbow": registers, "position.elbow": registers})
+    assert np.abs(read(path, limits=LIMITS).commands.value[:, 0] - Q["elbow"]).max() < 2e-3
+    stated = read(both, meta={"units.position": "ticks:4096"})
+    assert not [f for f in stated.findings if "by its values" in f.text]
+
+
+def test_a_current_of_hundreds_is_in_milliamperes(tmp_path):
+    table = {"time": T, "command.elbow": Q["elbow"], "position.elbow": Q["elbow"], "current.elbow": 300.25 + 50 * T}
+    r = read(csv(tmp_path / "a.csv", table))
+    assert np.allclose(r.states.effort.value[:, 0], 0.30025 + 0.05 * T)
+    assert any(f.kind == "unit" and f.severity == "warning" and "effort" in f.text for f in r.findings)

@@ -26,7 +26,7 @@ KEYS = (
     "object_friction",
 )
 RESULTS = ("metrics.json", "simulated.mcap", "position.png", "effort.png", "force.png", "video.mp4")
-USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
+USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE, units.QUANTITY=UNIT"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
         key, equals, value = argument.partition("=")
         if equals and key in KEYS:
             own[key] = value
-        elif equals and key.partition(".")[0] in ("remap", "meta"):
+        elif equals and key.partition(".")[0] in ("remap", "meta", "units"):
             rest.append(argument)
         else:
             raise UserError(f"'{argument}' does not go with replay=FILE; {USAGE}")
@@ -118,8 +118,9 @@ def run(play: dict[str, Any]) -> int:
     path = Path(play["replay"]).expanduser()
     model, hand = play["model"], play["hand"]
     known = model is not None or hand is not None
-    joints = mechanism.mechanism(model, play["servo"] or {}, hand=hand).joints if known else None
-    recording = read(path, play["remap"], play["meta"], joints=joints, hand=hand)
+    of = mechanism.mechanism(model, play["servo"] or {}, hand=hand) if known else None
+    joints, ranges = (None, None) if of is None else (of.joints, of.ranges)
+    recording = read(path, play["remap"], play["meta"], joints=joints, hand=hand, limits=ranges)
     print(audit.summary(recording))
     if recording.findings:
         print(audit.table(recording.findings))

@@ -68,6 +68,8 @@ settings (key=default):
                               or backlash, compliance, coulomb_friction, deadband, load_friction, stribeck_friction
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
+  units.QUANTITY=             the unit of what is recorded: units.position=deg, ticks:4096, percent, normalized,
+                              registers (0 to 1000); units.position.JOINT= of one joint
   remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state,
                               remap.position.elbow=enc1
 """
@@ -102,13 +104,15 @@ def parse(argv: list[str]) -> dict:
             hint = f"write {argument.lstrip('-')}=..." if argument.startswith("-") else "write it as key=value"
             raise UserError(f"'{argument}' is not a setting: {hint} (--help lists them)")
         group, dot, name = key.partition(".")
+        if group == "units":
+            group, name = "meta", key
         if dot and group in ("meta", "remap") and name:
             out[group][name] = text
             continue
         if key not in KEYS:
             raise UserError(
                 f"setting '{key}' does not exist.{did_you_mean(key, KEYS)} Valid: {', '.join(KEYS)}, meta.KEY, "
-                "remap.OURS"
+                "units.QUANTITY, remap.OURS"
             )
         if key in ("recordings", "held_out", "effects", "joints"):
             text = text.strip()

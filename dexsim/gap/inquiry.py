@@ -293,7 +293,7 @@ def read_files(w: Inquiry) -> None:
             unread.append(w.names[path])
             continue
         try:
-            r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints, hand=w.m.hand)
+            r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints, hand=w.m.hand, limits=w.m.ranges)
             r.path = Path(w.names[path])
             w.recordings[i] = r
         except UserError as error:

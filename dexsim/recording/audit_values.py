@@ -530,9 +530,11 @@ def units(r: Recording) -> Iterator[Finding]:
                     joint,
                 )
             elif not limits and is_integer(x) and top > 100:
-                yield finding(series, f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts?", joint)
+                text = f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts, or registers? State"
+                yield finding(series, f"{text} units.position=ticks:4096, or registers=LOW..HIGH [rad]", joint)
             elif not limits and 4 * np.pi < top < 400 and _jumpless(x):
-                yield finding(series, f"{name} of {joint} reaches {top:.4g} rad: degrees?", joint, "warning")
+                text = f"{name} of {joint} reaches {top:.4g} rad: degrees? percent? State units.position=deg or percent"
+                yield finding(series, text, joint, "warning")
     for j, joint in enumerate(r.joints):  # one against the other
         if len(c) > 20 and len(s.position) > 20:
             drive, q = _drive(r, j, s.position.t), s.position.value[:, j]

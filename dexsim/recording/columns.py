@@ -3,7 +3,9 @@
 Columns are named `QUANTITY.JOINT`, `JOINT.QUANTITY`, `QUANTITY_JOINT`, `JOINT_QUANTITY` (also with / : or a blank
 between), or `QUANTITY` alone where there is one joint; a unit may follow: `position.elbow [deg]`, `elbow_position_deg`,
 `time_ms`. An NPZ file may hold arrays [T, J] with `joint_names`. `remap.QUANTITY.JOINT=COLUMN` (`remap.time=COLUMN`)
-names columns that are called otherwise.
+names columns that are called otherwise. A trajectory controller's columns (`desired.positions[0]`,
+`actual.positions[0]`) are known, and a table with a column of joint names and one joint a line. Times may be dates
+(ISO 8601), numbers may have a decimal comma.
 """
 
 from __future__ import annotations
@@ -12,14 +14,17 @@ import csv
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dexsim import files
 from dexsim.errors import UserError
-from dexsim.recording import schema
+from dexsim.recording import schema, units
 from dexsim.recording.schema import Finding
+from dexsim.recording.units import UNITS
 
 SUFFIXES = (".csv", ".tsv", ".npz")
 MAX_BYTES = 1 << 30  # of a file, unpacked
@@ -42,9 +47,14 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
         "desired_position",
         "q_des",
         "q_cmd",
+        "target_value",
+        "commanded",
     ),
-    "position": ("position", "pos", "angle", "measured", "measured_position", "present_position", "q"),
-    "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq"),
+    "position": (
+        "position", "pos", "angle", "measured", "measured_position", "measured_value", "present_position", "q",
+        "actual", "actual_position", "encoder", "qpos",
+    ),
+    "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel"),
     "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
     "temperature": ("temperature", "temp", "present_temperature"),
     "duty": ("duty", "pwm", "duty_cycle", "present_pwm"),
@@ -52,29 +62,15 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
     "supply_voltage": ("supply_voltage", "supply", "voltage", "bus_voltage", "input_voltage"),
 }
 """Quantity -> the names that columns may give it."""
-UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "position": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3, "turn": 2 * np.pi, "rev": 2 * np.pi},
-    "velocity": {
-        "rad/s": 1.0,
-        "rads": 1.0,
-        "rad_s": 1.0,
-        "deg/s": np.pi / 180,
-        "degs": np.pi / 180,
-        "deg_s": np.pi / 180,
-        "rpm": 2 * np.pi / 60,
-        "m/s": 1.0,
-        "mm/s": 1e-3,
-    },
-    "effort": {"a": 1.0, "ma": 1e-3, "nm": 1.0, "n.m": 1.0, "n": 1.0, "mnm": 1e-3, "mn.m": 1e-3},
-    "temperature": {"degc": 1.0, "c": 1.0},
-    "duty": {"1": 1.0, "%": 0.01, "percent": 0.01},
-    "enabled": {},
-    "supply_voltage": {"v": 1.0, "mv": 1e-3},
-}
-UNITS["command"] = UNITS["position"]
 _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=lambda x: -len(x[0]))
 _CURRENT = ("current", "present_current", "motor_current")
+_CLOCKS = ("elapsed", "epoch", "timestamp", "time", "stamp", "datetime", "date")
+"""Words in the name of a column that may be a time where none is called so."""
+_NAMED = ("joint", "joint_name", "name", "motor", "motor_name", "servo", "joint_id", "motor_id", "servo_id")
+"""Columns that say which joint a line is of."""
+_NOT_POSITIONS = {w for q in ("velocity", "effort", "duty") for w in QUANTITIES[q]} | {"force", "acceleration"}
+_OWN = ("ticks", "counts", "raw", "register", "registers", "value")
+"""Ends of a column's name that say no more than that its numbers are the drive's own."""
 _CLOCK_STEP = 0.5  # s between samples from which on a time without a unit is not believed to be in seconds
 
 
@@ -83,7 +79,8 @@ class Table:
     """A file's columns by quantity and joint, in SI units: time [T] s by topic, value[quantity][joint] [T].
 
     meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
-    left out; unnamed: whether no column names the one joint."""
+    left out; unnamed: whether no column names the one joint; si: (quantity, joint) in SI units, by their own unit;
+    told: by quantity and joint, which lines tell of it (all where it is not there)."""
 
     joints: list[str]
     time: dict[str, np.ndarray]
@@ -92,6 +89,20 @@ class Table:
     start_ns: int
     findings: list[Finding] = field(default_factory=list)
     unnamed: bool = False
+    si: set[tuple[str, str]] = field(default_factory=set)
+    told: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+
+    def carried(self, quantity: str) -> np.ndarray | None:
+        """[T, J] of which joints each of the quantity's samples tells; None: of all."""
+        if quantity not in self.told:
+            return None
+        lines = len(self.time[quantity])
+        out = np.stack([self.told[quantity].get(j, np.ones(lines, bool)) for j in self.joints], 1)
+        return out[self._any(quantity)]
+
+    def _any(self, quantity: str) -> np.ndarray:
+        columns = self.value.get(quantity, {})
+        return np.any([np.isfinite(columns[j]) for j in self.joints if j in columns], axis=0)
 
     def samples(self, quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """(t [T] s, value [T, J]) of one quantity, rows without any number left out."""
@@ -101,23 +112,46 @@ class Table:
             if columns
             else np.zeros((len(t), 0))
         )
-        keep = np.isfinite(rows).any(1)
+        keep = self._any(quantity) if columns else np.zeros(len(t), bool)
         return t[keep], rows[keep]
 
 
-def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) -> Table:
+def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str], time_unit: str = "") -> Table:
     """The table in a CSV, TSV or NPZ file. remap: see the module, and our joint name -> theirs (left to the caller).
 
-    meta: position_unit, effort_unit and time_unit hold for columns without a unit of their own. Raises UserError naming
-    what is missing."""
-    named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
+    meta: what is stated of it; time_unit: of a time without a unit of its own. Raises UserError naming what is
+    missing."""
     raw, findings = _npz(path) if path.suffix.lower() == ".npz" else _csv(path)
+    return of_columns(path, raw, findings, remap, meta, time_unit)
+
+
+def of_columns(
+    path: Path,
+    raw: Mapping[str, Any],
+    findings: list[Finding],
+    remap: Mapping[str, str],
+    meta: Mapping[str, str],
+    time_unit: str = "",
+) -> Table:
+    """The table in columns by name: numbers [T], or texts [T] (of a text file) that only the columns' names tell how to
+    read."""
+    named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
     if not raw:
         raise UserError(f"recording {path}: holds no column of numbers")
+    raw = _lines_of_joints(raw)
     roles = _roles(path, list(raw), named)
+    raw, told = _numbers(path, raw, roles, findings, set(named.values()))
+    roles = {c: r for c, r in roles.items() if c in raw}
+    if not any(r[0] == "time" and not r[1] for r in roles.values()):
+        roles |= _some_clock(raw, roles, findings)
     found: dict[str, dict[str, np.ndarray]] = {}
     joints: list[str] = []
     effort: set[str] = set()
+    si: set[tuple[str, str]] = set()
+    of = schema.joint_names(meta.get("joint_names", ""))
+    listed = {j for q, j, _, _ in roles.values() if q not in ("time", "supply_voltage") and j}
+    if of and listed and all(x.isdecimal() and int(x) < len(of) for x in listed):  # columns by number
+        roles = {c: (q, of[int(j)] if j and q != "time" else j, u, w) for c, (q, j, u, w) in roles.items()}
     for column, (quantity, joint, unit, word) in roles.items():
         if joint in found.get(quantity, {}):
             other = next(c for c, r in roles.items() if r[:2] == (quantity, joint))
@@ -134,7 +168,10 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
                 if word != "effort" or unit
                 else ""
             )
-        scale = _scale(path, quantity, unit, meta)
+        scale = 1.0
+        if unit or quantity == "time":
+            scale = units.parse(unit or time_unit or "s", quantity, f"recording {path}: {column}").scale
+            si.add((quantity, joint))
         found.setdefault(quantity, {})[joint] = raw[column] * scale
         if joint and quantity not in ("time", "supply_voltage"):
             joints.append(joint)
@@ -150,6 +187,7 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
                 f" ({', '.join(joints)}); say whose it is with remap.{q}.JOINT='{_column(roles, q, '')}'"
             )
         found[q] = {joints[0]: found[q].pop("")} | found[q]
+        si |= {(q, joints[0])} if (q, "") in si else set()
     if not {"position", "command"} & set(found):
         raise UserError(
             f"recording {path}: no column of position or command; columns: {_list(raw)}. Name them like "
@@ -167,9 +205,100 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
             f"recording {path}: effort is a current in one column and a torque in another; keep one of them with "
             "remap.effort.JOINT=COLUMN"
         )
-    time, start = _clock(path, found, roles, meta, list(raw))
+    time, start = _clock(path, found, roles, time_unit, list(raw))
     value = {q: c for q, c in found.items() if q != "time"}
-    return Table(joints, time, value, stated, start, findings, nameless)
+    lines: dict[str, dict[str, np.ndarray]] = {}
+    for column, on in told.items():
+        quantity, joint = roles[column][:2]
+        lines.setdefault(quantity, {})[joint or joints[0]] = on
+    return Table(joints, time, value, stated, start, findings, nameless, si, lines)
+
+
+def _lines_of_joints(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Columns as they are; where a column says which joint each line is of, one for each of its joints, empty in the
+    lines of others."""
+    which = next((c for c in raw if c.lower().strip() in _NAMED and isinstance(raw[c], list)), None)
+    if which is None:
+        return dict(raw)
+    names = [x.strip() for x in raw[which]]
+    joints = dict.fromkeys(x for x in names if x)
+    if not 1 <= len(joints) <= len(names) / 5 or any(_role(c) and _role(c)[1] for c in raw if c != which):  # type: ignore[index]
+        return dict(raw)
+    out: dict[str, Any] = {}
+    for column, cells in raw.items():
+        role = _role(column)
+        if column == which:
+            continue
+        if role is None or role[0] in ("time", "supply_voltage"):
+            out[column] = cells
+        else:
+            unit = f" [{role[2]}]" if role[2] else ""
+            out |= {
+                f"{role[3]}.{j}{unit}": [x if n == j else "" for x, n in zip(cells, names, strict=True)] for j in joints
+            }
+    return out
+
+
+def _numbers(
+    path: Path,
+    raw: Mapping[str, Any],
+    roles: Mapping[str, tuple[str, str, str, str]],
+    findings: list[Finding],
+    named: set[str],
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """(columns as numbers, those without any left out; of columns with empty places, where there is a value [T]). Texts
+    that are none are found, but in columns that no role asks for. named: columns that the user named."""
+    out: dict[str, np.ndarray] = {}
+    told: dict[str, np.ndarray] = {}
+    words, example = 0, ""
+    for column, cells in raw.items():
+        if not isinstance(cells, list):
+            out[column] = np.asarray(cells, float)
+            continue
+        clock = column in roles and roles[column][0] == "time"
+        values, bad = _floats(cells)
+        if clock and np.isnan(values).all():
+            values, bad = _dates(cells)
+            if np.isnan(values).all():
+                raise UserError(
+                    f"recording {path}: time '{cells[0][:40]}' in column '{column}' is neither a number nor a date as "
+                    "ISO 8601 writes it (2026-03-03T17:37:58.123)"
+                )
+        if np.isnan(values).all():
+            if column in named and any(x.strip() for x in cells):
+                raise UserError(
+                    f"recording {path}: column '{column}' holds no numbers ('{cells[0][:40]}'); name another with "
+                    f"remap.{roles[column][0]}=COLUMN"
+                )
+            continue
+        out[column] = values
+        if column in roles:
+            if bad and not words:
+                example = next(x for x, v in zip(cells, values, strict=True) if np.isnan(v) and x.strip())
+            words += bad
+            empty = np.array([not x.strip() for x in cells])
+            if empty.any() and not clock:
+                told[column] = ~empty
+    if words:
+        text = f"{words} entries are not numbers ('{example[:20]}'; a number is like 1.5e-3); taken as missing"
+        findings.append(Finding("unreadable", "", np.nan, words, text, "error"))
+    return out, told
+
+
+def _some_clock(
+    raw: Mapping[str, np.ndarray], roles: Mapping[str, Any], findings: list[Finding]
+) -> dict[str, tuple[str, str, str, str]]:
+    """The role of the first column that seems to be a time and never goes back; {} where there is none."""
+    for column, x in raw.items():
+        name, unit = _unit(column)
+        words = re.split(r"[^a-z]+", name.lower())
+        if column in roles or not any(w in words for w in _CLOCKS) or len(x) < 2 or not np.isfinite(x).all():
+            continue
+        if (np.diff(x) >= 0).all() and x[-1] > x[0]:
+            text = f"time is read from column '{column}' (say otherwise with remap.time=COLUMN)"
+            findings.append(Finding("topic", "", np.nan, 1, text, "info"))
+            return {column: ("time", "", unit, "time")}
+    return {}
 
 
 def _roles(path: Path, columns: list[str], named: Mapping[str, str]) -> dict[str, tuple[str, str, str, str]]:
@@ -190,6 +319,12 @@ def _roles(path: Path, columns: list[str], named: Mapping[str, str]) -> dict[str
 
 
 def _role(column: str) -> tuple[str, str, str, str] | None:
+    if (controller := _CONTROLLER.search(column)) is not None:
+        role, what, joint = controller["role"].lower(), controller["what"].lower(), controller["joint"] or ""
+        quantity = {"p": "position", "v": "velocity", "e": "effort"}.get(what[0], "")
+        if role in ("desired", "reference"):
+            quantity = "command" if quantity == "position" else ""
+        return (quantity, joint, "", quantity) if quantity and role not in ("error", "output") else None
     name, unit = _unit(column)
     name = re.sub(r"^/?joint_states/", "", name)
     if name.lstrip("/").startswith("joint_commands/"):  # topics as plotting tools write them out
@@ -211,13 +346,25 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
         if quantity == "time":
             of = next((q for q, words in QUANTITIES.items() if joint.lower() in words), None)
             return ("time", of, unit, word) if of else None
+        if quantity == "command" and joint.lower() in _NOT_POSITIONS:  # a target of another kind
+            return None
         return quantity, joint, unit, word
     return None
 
 
+_CONTROLLER = re.compile(
+    r"(?:^|[./_])(?P<role>desired|actual|error|reference|feedback|output)[./_]"
+    r"(?P<what>positions?|velocit(?:y|ies)|accelerations?|efforts?)(?:[./_\[]+(?P<joint>[^\]]+?)\]?)?$", re.I
+)  # fmt: skip
+"""Columns of control_msgs/JointTrajectoryControllerState, old and new."""
+
+
 def _unit(column: str) -> tuple[str, str]:
-    """(the name without its unit, the unit in lower case or "")."""
-    known = {u for us in UNITS.values() for u in us}
+    """(the name without its unit, the unit in lower case or ""). Of a drive's own numbers the unit is not named."""
+    bare = re.sub(rf"([\s_.]+|\s*[\[(])({'|'.join(_OWN)})[\])]?(?=$|[./:])", "", column, flags=re.I)
+    if bare != column and _known(bare):
+        return bare, ""
+    known = {u for us in UNITS.values() for u in us} - {"percent"}
     match = re.search(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$", column)
     if match and match.group(2).lower() in known and match.group(1).strip():
         return match.group(1), match.group(2).lower()
@@ -238,28 +385,8 @@ def _known(name: str) -> bool:
     )
 
 
-def _scale(path: Path, quantity: str, unit: str, meta: Mapping[str, str]) -> float:
-    key = {
-        "command": "position_unit",
-        "position": "position_unit",
-        "velocity": "position_unit",
-        "effort": "effort_unit",
-        "time": "time_unit",
-    }.get(quantity, "")
-    if not unit:
-        stated = meta.get(key)
-        if stated is None:
-            return 1.0
-        return UNITS["time"][stated] if quantity == "time" else schema.UNIT_KEYS[key][stated]
-    if unit not in UNITS[quantity]:
-        raise UserError(
-            f"recording {path}: {quantity} in '{unit}' is not read; units: {', '.join(UNITS[quantity]) or 'none'}"
-        )
-    return UNITS[quantity][unit]
-
-
 def _clock(
-    path: Path, found: dict, roles: dict, meta: Mapping[str, str], columns: list[str]
+    path: Path, found: dict, roles: dict, time_unit: str, columns: list[str]
 ) -> tuple[dict[str, np.ndarray], int]:
     """Time [s] since the start by quantity, and the start in ns of the epoch (0 where the file counts from zero)."""
     clocks = found.get("time", {})
@@ -284,11 +411,11 @@ def _clock(
                 )
         steps = np.diff(t[np.isfinite(t)])
         step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-        unit = any(r[0] == "time" and r[2] for r in roles.values()) or "time_unit" in meta
+        unit = any(r[0] == "time" and r[2] for r in roles.values()) or bool(time_unit)
         if step > _CLOCK_STEP and not unit and len(t) > 5:
             raise UserError(
                 f"recording {path}: time steps by {step:g}, which seconds hardly do; say its unit with "
-                "meta.time_unit=s, ms, us or ns"
+                "units.time=s, ms, us or ns"
             )
         out[quantity] = t
         if np.isfinite(t).any():
@@ -297,15 +424,15 @@ def _clock(
         raise UserError(f"recording {path}: its time holds no number")
     if abs(first) > 9e9:
         raise UserError(
-            f"recording {path}: time begins at {first:.4g} s, beyond any date; say its unit with meta.time_unit=s, "
+            f"recording {path}: time begins at {first:.4g} s, beyond any date; say its unit with units.time=s, "
             "ms, us or ns"
         )
     return {q: t - first for q, t in out.items()}, round(first * 1e9) if first > 1e6 else 0
 
 
-def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Columns of a text file: separated by commas, semicolons or tabs, a line of names before the numbers; lines from #
-    on are left out."""
+def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
+    """Columns of a text file, as texts: separated by commas, semicolons or tabs, a line of names before the numbers;
+    lines from # on are left out."""
     text = files.text(path, MAX_BYTES, "recording")
     lines = text.lstrip("\ufeff").splitlines()
     body = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
@@ -349,24 +476,7 @@ def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         if bad
         else []
     )
-    out, words = {}, 0
-    for k, name in enumerate(names):
-        column, unread = _floats([r[k] for r in rows])
-        if name and not np.isnan(column).all():
-            out[name] = column
-            words += unread
-    if words:
-        findings.append(
-            Finding(
-                "unreadable",
-                "",
-                np.nan,
-                words,
-                f"{words} entries are not numbers (a number is like 1.5e-3); taken as missing",
-                "error",
-            )
-        )
-    return out, findings
+    return {name: [r[k] for r in rows] for k, name in enumerate(names) if name}, findings
 
 
 def _floats(cells: list[str]) -> tuple[np.ndarray, int]:
@@ -381,9 +491,35 @@ def _floats(cells: list[str]) -> tuple[np.ndarray, int]:
         if cell in ("", "nan", "null", "none", "na", "n/a"):
             continue
         try:
-            out[i] = {"true": 1.0, "false": 0.0}.get(cell) if cell in ("true", "false") else float(cell)
+            out[i] = {"true": 1.0, "false": 0.0}.get(cell) if cell in ("true", "false") else float(_point(cell))
         except ValueError:
             bad += 1
+    return out, bad
+
+
+def _point(cell: str) -> str:
+    """A number with a decimal comma as one with a point; thousands may be set apart by points."""
+    if cell.count(",") != 1:
+        return cell
+    whole, rest = cell.split(",")
+    return (whole.replace(".", "") if re.fullmatch(r"[-+]?\d{1,3}(\.\d{3})+", whole) else whole) + "." + rest
+
+
+def _dates(cells: list[str]) -> tuple[np.ndarray, int]:
+    """(s since 1970, or of the day where only hours are given, NaN where there is none; how many entries are something
+    else)."""
+    out, bad = np.full(len(cells), np.nan), 0
+    for i, cell in enumerate(cells):
+        text = cell.strip().replace(",", ".")
+        try:
+            if re.match(r"\d{1,2}:\d\d(:|$)", text):
+                parts = [float(x) for x in text.split(":")]
+                out[i] = 3600 * parts[0] + 60 * parts[1] + (parts[2] if len(parts) > 2 else 0.0)
+            else:
+                at = datetime.fromisoformat(text)
+                out[i] = (at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp()
+        except (ValueError, OverflowError):
+            bad += bool(text)
     return out, bad
 
 

@@ -64,6 +64,11 @@ class Mechanism:
         rows = [model.joint(j) for j in self.joints]
         return np.array([model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in rows])
 
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Position limits by joint, where the model has them."""
+        return {j: (float(a), float(b)) for j, (a, b) in zip(self.joints, self.limits, strict=True) if np.isfinite(a)}
+
     def column(self, name: str) -> np.ndarray:
         """A servo column's nominal value [J]."""
         from dexsim.actuator.columns import INDEX

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import msgspec
@@ -24,6 +25,7 @@ from dexsim.recording.schema import (
     numbers,
     shown,
 )
+from dexsim.recording.units import split
 
 VALID = (*KEYS, *UNIT_KEYS)
 WORDS = {"effort_is": EFFORT_IS, "tactile_unit": TACTILE_UNIT, "schema": ("1",), "source": ("real", "sim")}
@@ -35,14 +37,18 @@ Written = dict[str, str | bool | float | dict[str, Any] | list[Any] | None]
 NAN = float("nan")
 
 
-def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tuple[dict[str, str], list[Finding]]:
-    """Stated metadata (no defaults yet): `given` wins over the file beside the recording, that over its own record.
+def collect(
+    path: Path, own: Mapping[str, str], given: Mapping[str, Any], units: Mapping[str, str] = MappingProxyType({})
+) -> tuple[dict[str, str], dict[str, str], list[Finding]]:
+    """Stated metadata (no defaults yet) and units: `given` and `units` win over the file beside the recording, that
+    over its own record.
 
     Each key that one source overrides in another is a finding. Raises UserError for unknown keys or a bad file.
     """
     beside_path = path.with_name(path.name + ".yaml")
     # not Path's, which raises where a recording's name leaves no room for the ending
     beside = _read(beside_path) if os.path.isfile(beside_path) else {}
+    beside, beside_units = split(beside)
     stated = {k: str(v) for k, v in own.items() if k in VALID}
     findings = [
         Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
@@ -70,7 +76,8 @@ def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tup
                 )
             stated[key] = text
     _check(path, stated)
-    return stated, findings
+    old = {key.removesuffix("_unit"): stated.pop(key) for key in UNIT_KEYS if key in stated}
+    return stated, old | beside_units | dict(units), findings
 
 
 def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> list[Finding]:

@@ -17,11 +17,14 @@ from dexsim.recording import attached, columns, decode, metadata, names, schema,
 from dexsim.recording.container import BAGS, Container, open_container
 from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
+from dexsim.recording.units import Unit, Units, split
 
 NAN = float("nan")
 MAX_JOINTS = 1000
 STARTED, PLANNED = 0.5, 60.0
 """s before and after its receipt in which the header.stamp of a trajectory says when it begins."""
+MOST_CURRENT = 100.0
+"""A: what no joint takes."""
 LINE = 0.1
 """s: points of a trajectory that lie further apart get targets between them (cubic where speeds are given)."""
 MAX_START = 1 << 62
@@ -36,6 +39,7 @@ def read(
     joints: Sequence[str] | None = None,
     audit: bool = True,
     hand: Hand | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> Recording:
     """The recording in an MCAP file, in a folder that `ros2 bag record` wrote, or in a CSV or NPZ file with
     named columns (`columns.py`).
@@ -45,30 +49,33 @@ def read(
             -> theirs ("index_joint1": "finger2_mcp"). A topic that differs only by a namespace, and joint names that
             differ only by a prefix, are found without. Of a CSV or NPZ file: "position.elbow" (or "time") -> the
             column.
-        meta: metadata values that win over what the recording says.
+        meta: metadata values that win over what the recording says; units as "units.position" (`units.py`).
         joints: names of the model's joints: their order, and others are left out. None: the hand's where the names
             fit, else those of the recording.
         audit: also look for faults of the signals (`audit.py`).
         hand: whose joints, limits and pads it is likely to hold. None: the xHand.
+        limits: range of each joint [rad or m], for units along it. None: the hand's.
 
     Everything readable is returned; what is lost, assumed or suspicious is in `findings`. Nothing is repaired but what
     a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
     """
     path = Path(path).expanduser()
-    remap, meta = dict(remap or {}), dict(meta or {})
+    remap, (meta, units) = dict(remap or {}), split(dict(meta or {}))
     if path.suffix.lower() in columns.SUFFIXES:
-        stated, findings = metadata.collect(path, {}, meta)
-        table = _TableReading(path, columns.read_table(path, remap, stated), remap, hand)
+        stated, units, findings = metadata.collect(path, {}, meta, units)
+        table = _TableReading(path, columns.read_table(path, remap, stated, units.get("time", "")), remap, hand)
         reading: _Reading = table
-        stated = table.stated(stated)
+        stated = table.table.meta | stated
     else:
         containers = [open_container(p) for p in _files(path)]
         reading = _Reading(path, containers, remap, hand)
-        stated, findings = metadata.collect(
-            path, metadata.own_record([m for c in containers for m in c.metadata]), meta
-        )
+        own = metadata.own_record([m for c in containers for m in c.metadata])
+        stated, units, findings = metadata.collect(path, own, meta, units)
     reading.findings += findings
-    recording = reading.build(stated, joints)
+    if hand is not None or limits is None:
+        known = hand or load_hand()
+        limits = dict(zip(known.joints, known.limits.tolist(), strict=True)) | dict(limits or {})
+    recording = reading.build(stated, joints, Units(units, limits, str(path)))
     if audit:
         # here, so that `python -m dexsim.recording.audit` does not find its module loaded by the package
         from dexsim.recording.audit import audit as find_faults
@@ -101,6 +108,7 @@ class _Reading:
     def __init__(self, path: Path, containers: list[Container], remap: dict[str, str], hand: Hand | None = None):
         self.path, self.hand = path, hand or load_hand()
         self.findings: list[Finding] = []
+        self.si: set[tuple[str, str]] = set()  # (quantity, their joint) whose values are in SI already
         self.breaks: list[tuple[float, float]] = []
         self.streams: dict[str, list[_Stream]] = {}
         for c in containers:
@@ -318,8 +326,8 @@ class _Reading:
         return t, out
 
     # -- values -------------------------------------------------------------------
-    def build(self, stated: dict[str, str], joints: Sequence[str] | None) -> Recording:
-        """The recording, with metadata complete."""
+    def build(self, stated: dict[str, str], joints: Sequence[str] | None, units: Units) -> Recording:
+        """The recording, with metadata complete, in SI."""
         t_command, commands, lines = self._points(*self._decode(schema.COMMANDS, decode.joint_reader))
         t_state, states = self._decode(schema.STATES, decode.joint_reader)
         given = set(stated)
@@ -334,7 +342,6 @@ class _Reading:
         # where each of their unnamed columns goes
         place_of = {j: k for k, j in enumerate(ours)}
         column = np.array([place_of[mapping[n]] if n in mapping else -1 for n in theirs])
-        scale = self._units(stated)
         has_effort = any(len(s.effort) for s in _unlike(states))
         has_tactile = schema.TACTILE in self.sources
         self.findings += metadata.complete(stated, has_effort, has_tactile)
@@ -356,7 +363,7 @@ class _Reading:
 
         self._unnamed(theirs, commands, states, "joint_names" in given)
         place = _Placer(theirs, column, len(ours))
-        command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place, scale["position"])
+        command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place)
         if command is not None:
             command.lines = lines
         out = Recording(
@@ -365,10 +372,10 @@ class _Reading:
             joints=ours,
             commands=command if command is not None else Series.empty(schema.COMMANDS, len(ours)),
             states=States(
-                self._joint_series(schema.STATES, t_state, states, "position", place, scale["position"])
+                self._joint_series(schema.STATES, t_state, states, "position", place)
                 or Series.empty(schema.STATES, len(ours)),
-                self._joint_series(schema.STATES, t_state, states, "velocity", place, scale["position"]),
-                self._joint_series(schema.STATES, t_state, states, "effort", place, scale["effort"]),
+                self._joint_series(schema.STATES, t_state, states, "velocity", place),
+                self._joint_series(schema.STATES, t_state, states, "effort", place),
             ),
             start_ns=self.start_ns,
             config=self.config,
@@ -376,6 +383,7 @@ class _Reading:
         )
         for topic, name in ((schema.TEMPERATURES, "temperature"), (schema.DUTY, "duty"), (schema.ENABLED, "enabled")):
             setattr(out, name, self._joint_array(topic, place))
+        self._convert(out, units, {ours[c]: theirs[i] for i, c in enumerate(column) if c >= 0})
         out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
         out.tactile = self._array(schema.TACTILE, self._tactile_shape)
         for topic, name in (
@@ -472,19 +480,49 @@ class _Reading:
             )
         return mapping
 
-    def _units(self, stated: dict[str, str]) -> dict[str, float]:
-        out = {"position": 1.0, "effort": 1.0}
-        for key in schema.UNIT_KEYS:
-            unit = stated.get(key)
-            if unit is not None:
-                out[key.removesuffix("_unit")] = schema.UNIT_KEYS[key][unit]
-                if schema.UNIT_KEYS[key][unit] != 1.0:
-                    self.findings.append(Finding("unit", "", NAN, 1, f"{key}={unit}: converted to SI", "info"))
-                    del stated[key]  # the values returned are SI
-        return out
+    def _convert(self, r: Recording, units: Units, theirs: Mapping[str, str]) -> None:
+        """The values of each joint in SI: by the unit that is stated, else by what whole numbers of both its command
+        and its position must be, with a warning. theirs: their name of each joint."""
+        s, used, guessed = r.states, dict[Any, Unit | None](), dict[Any, Unit | None]()
+        parts = {"command": r.commands, "position": s.position, "velocity": s.velocity, "effort": s.effort,
+                 "temperature": r.temperature, "duty": r.duty}  # fmt: skip
+        for k, joint in enumerate(r.joints):
+            for quantity, series in parts.items():
+                if series is None or not len(series) or (quantity, theirs[joint]) in self.si:
+                    continue
+                unit = units.of(quantity, joint) or units.of(quantity, theirs[joint])
+                if unit is None and quantity == "command" and ("position", theirs[joint]) not in self.si:
+                    unit = guessed.setdefault(joint, units.guess(joint, series.value[:, k], s.position.value[:, k]))
+                elif unit is None and quantity in ("position", "velocity"):
+                    unit = guessed.get(joint)
+                elif unit is None and quantity == "effort" and self.milliamperes(r, series.value[:, k]):
+                    unit = Unit(1e-3, 0.0, "ma", False)
+                if unit is None:
+                    continue
+                series.value[:, k] = unit(series.value[:, k], quantity == "velocity")
+                if unit.text.lower() not in ("rad", "m", "a", "nm", "n.m", "n", "rad/s"):
+                    (used if units.of(quantity, joint) else guessed)[joint, quantity] = unit
+        for found, sure in ((used, True), (guessed, False)):
+            texts: dict[tuple[str, str], list[str]] = {}
+            for key, unit in found.items():
+                if isinstance(key, tuple) and unit is not None:
+                    texts.setdefault((key[1], unit.text), []).append(key[0])
+            for (quantity, text), joints in texts.items():
+                who = "" if len(joints) == len(r.joints) else f" of {', '.join(joints)}"
+                said = (
+                    f"{quantity}{who} in {text}: converted to SI"
+                    if sure
+                    else f"{quantity}{who}: no unit is stated; taken for {text} by its values, and converted: say "
+                    f"units.{quantity}={text}, or what it is"
+                )
+                self.findings.append(Finding("unit", "", NAN, len(joints), said, "info" if sure else "warning"))
+
+    def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
+        """Whether a current of no stated unit [S] can only be in mA; never of messages, whose effort is in SI."""
+        return False
 
     def _joint_series(
-        self, topic: str, t: np.ndarray, samples: Sequence, name: str, place: _Placer, scale: float
+        self, topic: str, t: np.ndarray, samples: Sequence, name: str, place: _Placer
     ) -> Series | None:
         if not len(samples) or (name != "position" and not any(len(getattr(s, name)) for s in _unlike(samples))):
             return None
@@ -505,7 +543,7 @@ class _Reading:
             )
         stamp = self._stamps(samples)
         partly = not carried[:, carried.any(0)].all()
-        return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp,
+        return Series(t, value, topic, None if np.isnan(stamp).all() else stamp,
                       carried=carried if partly else None)  # fmt: skip
 
     def _points(self, t: np.ndarray, samples: Sequence[Any]) -> tuple[np.ndarray, Sequence[Any], bool]:
@@ -620,18 +658,11 @@ class _TableReading(_Reading):
                 f" {', '.join(columns.QUANTITIES)}"
             )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
-        self.start_ns, self.config, self.sources = table.start_ns, None, {}
+        self.start_ns, self.config, self.sources, self.si = table.start_ns, None, {}, table.si
 
-    def stated(self, stated: dict[str, str]) -> dict[str, str]:
-        """The metadata, with what the columns' names tell; the values are SI already."""
-        for key in schema.UNIT_KEYS:
-            if key in stated:
-                self.findings.append(
-                    Finding(
-                        "unit", "", NAN, 1, f"{key}={stated[key]}: of columns without a unit, converted to SI", "info"
-                    )
-                )
-        return self.table.meta | {k: v for k, v in stated.items() if k not in schema.UNIT_KEYS}
+    def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
+        size = np.abs(effort[np.isfinite(effort)])
+        return r.effort_is == "current_A" and len(size) > 5 and float(np.quantile(size, 0.9)) > MOST_CURRENT
 
     def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, Sequence[Any]]:
         table, empty = self.table, np.zeros(0)
@@ -646,14 +677,15 @@ class _TableReading(_Reading):
                 same = len(own) == len(t) and np.array_equal(own, t)
                 rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
             out: Sequence[Any] = JointRows(
-                table.joints, rows, rest.get("velocity", absent), rest.get("effort", absent), np.zeros(len(t), np.int64)
-            )
+                table.joints, rows, rest.get("velocity", absent), rest.get("effort", absent),
+                np.zeros(len(t), np.int64), table.carried("position"),
+            )  # fmt: skip
         elif ours == schema.COMMANDS:
             if "command" not in table.value:
                 return empty, []
             t, rows = table.samples("command")
             absent = np.zeros((len(rows), 0))
-            out = JointRows(table.joints, rows, absent, absent, np.zeros(len(t), np.int64))
+            out = JointRows(table.joints, rows, absent, absent, np.zeros(len(t), np.int64), table.carried("command"))
         else:
             quantity = {
                 schema.TEMPERATURES: "temperature",
@@ -728,7 +760,7 @@ def _placed(
             return list(range(len(samples)))
         for source, column in zip(*to, strict=True):  # in order: of a name that comes twice, the last counts
             value[:, column] = rows[:, source]
-            carried[:, column] = True
+            carried[:, column] = True if samples.carried is None else samples.carried[:, source]
         return []
     bad = []
     for i, s in enumerate(samples):

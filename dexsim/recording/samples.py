@@ -35,12 +35,14 @@ class Trajectory:
 
 class JointRows(Sequence[JointSample]):
     """Joint samples of the same names and numbers of values: position, velocity, effort [T, n], each with n = 0 where
-    not given, stamp [T] int64 ns, 0 for None."""
+    not given, stamp [T] int64 ns, 0 for None; carried [T, n]: of which joints each sample tells (None: of all)."""
 
     def __init__(
-        self, names: Sequence[str], position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, stamp: np.ndarray
-    ):
+        self, names: Sequence[str], position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, stamp: np.ndarray,
+        carried: np.ndarray | None = None,
+    ):  # fmt: skip
         self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
+        self.carried = carried
 
     def __len__(self) -> int:
         return len(self.stamp)
@@ -61,7 +63,9 @@ class JointRows(Sequence[JointSample]):
 
     def take(self, which: np.ndarray | slice) -> JointRows:
         """These samples, in this order."""
-        return JointRows(self.names, self.position[which], self.velocity[which], self.effort[which], self.stamp[which])
+        carried = None if self.carried is None else self.carried[which]
+        position, velocity, effort, stamp = (x[which] for x in (self.position, self.velocity, self.effort, self.stamp))
+        return JointRows(self.names, position, velocity, effort, stamp, carried)
 
 
 class Reader(Generic[T]):

@@ -52,13 +52,12 @@ DEFAULTS: dict[str, str] = {
     "servo": "", "notes": "",
 }  # fmt: skip
 """What holds where nothing is stated; joint_names and effort_is follow from the messages."""
-UNIT_KEYS: dict[str, dict[str, float]] = {
-    "position_unit": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3},
-    "effort_unit": {"A": 1.0, "mA": 1e-3, "N.m": 1.0, "N": 1.0, "mN.m": 1e-3},
-    "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+UNIT_KEYS: dict[str, tuple[str, ...]] = {
+    "position_unit": ("rad", "deg", "m", "mm"),
+    "effort_unit": ("A", "mA", "N.m", "N", "mN.m"),
+    "time_unit": ("s", "ms", "us", "ns"),
 }
-"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported (time_unit: of a
-CSV or NPZ file)."""
+"""Optional keys, the same as `units.QUANTITY` (`recording/units.py`), which knows more."""
 
 _HEADER = """std_msgs/Header header
 """
