@@ -30,6 +30,14 @@ def stop_signals() -> dict[int, str]:
     return found
 
 
+def hand_signals() -> dict[int, str]:
+    """All signals that end or halt a program and that it can handle, with their names: each lets go of a hand."""
+    names = "QUIT USR1 USR2 XCPU TSTP TTIN TTOU ALRM VTALRM PROF IO PWR".split()
+    found = {getattr(signal, f"SIG{name}", None): f"SIG{name}" for name in names}
+    found |= {getattr(signal, "SIGTSTP", None): "Ctrl-Z", getattr(signal, "SIGQUIT", None): "SIGQUIT (Ctrl-\\)"}
+    return stop_signals() | {int(number): name for number, name in found.items() if number is not None}
+
+
 def terminal_gone(number: int) -> bool:
     """Return whether a signal says that nobody reads what is printed any more."""
     return number in (getattr(signal, "SIGHUP", None), getattr(signal, "SIGBREAK", None))

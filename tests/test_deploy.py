@@ -247,7 +247,7 @@ def test_homing_comes_first_slow_and_at_reduced_current(made):
 
 def test_a_blocked_homing_ends_with_the_joints_name(made):
     def block(hand, now):
-        hand.stuck = True
+        hand.stuck, hand.current = True, np.full(12, -120.0)  # what is blocked draws current
 
     hand, loop = play(made, block)
     with pytest.raises(UserError, match="homing: thumb_bend_joint is 0.95 rad from its home"):

@@ -21,8 +21,11 @@ clear of a real hand, and try driver=sim first. On a machine that does other wor
 
 settings (key=default):
   bundle=             folder of dexsim export
-  driver=sim          sim, or xhand (the vendor's package) with port=
-  port=               serial port of the hand (/dev/ttyUSB0), or ethercat
+  driver=sim          sim, or xhand (the vendor's package)
+  port=auto           driver=xhand: auto asks every serial port for the hand; a port (/dev/ttyACM1), ethercat or
+                      ethercat:INTERFACE; fake: the simulated hand behind a fake of the vendor's package, with faults
+                      as in fake:crc=0.005,board=2 (dexsim/deploy/fake_xhand.py)
+  serial=             driver=xhand: the hand with this serial number, of several
   seconds=10          of the policy, after homing
   command=0.5         grasp: commanded force, 0..1 of F_max
   calibration=        calibration.yaml instead of the bundle's
@@ -42,12 +45,12 @@ safety (key=default):
   margin=0            rad kept free at the joint limits
   home_speed=0.5      rad/s of the homing
   wait=3              rotate: s that the open hand then waits for the cube; grip=1: s its fingers take to close on it
-  stale=0.1           s: a reading older than this relaxes the hand; late=0.1, hang=0.3, overruns=10 likewise
+  stale=0.12          s: a reading older than this relaxes the hand; late=0.1, hang=0.15, overruns=10 likewise
   seen=               s: so does what was last seen of the object (default: 0.5 of a camera, 0.1 of an IMU)
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
-OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "imu", "shape", "seed")
+OWN = ("bundle", "driver", "port", "serial", "calibration", "record", "vision", "place", "imu", "shape", "seed")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -79,7 +82,7 @@ def main(argv: Sequence[str]) -> int:
             f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
             " commanded force"
         )
-    driver, eye = _hand(given, b, calibration)
+    driver, eye = _hand(given, b, calibration, settings.hang)
     for text in calibration.assumed:
         print(f"note     {text}")
     loop = Loop(b, driver, eye, calibration, settings, say=lambda text: print(text, flush=True))
@@ -103,14 +106,15 @@ def main(argv: Sequence[str]) -> int:
 
 
 class _Stop:
-    """Ctrl-C, SIGTERM and SIGHUP: the first ends the run, which relaxes the hand; those after it change nothing."""
+    """Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and all others that a process can handle: the first ends the run, which
+    relaxes the hand; those after it change nothing."""
 
     def __init__(self) -> None:
         self.status, self.ending = 0, False  # ending: the hand is relaxed, and what is left to do is done to its end
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> _Stop:
-        self._names = system.stop_signals()
+        self._names = system.hand_signals()
         for number in self._names:
             self._before[number] = signal.signal(number, self._handle)
         return self
@@ -130,6 +134,7 @@ def _ending(report: Any, recorder: Any) -> None:
     if report.not_relaxed:
         print(f"\nDANGER   the hand could not be relaxed ({report.not_relaxed}): cut its power", flush=True)
     hand = "the hand may still drive" if report.not_relaxed else "the hand is relaxed"
+    hand += f" ({report.limp})" if report.limp else ""
     print(f"\nended    {report.ended or 'failed'} after {report.acts} actions; {hand}")
     print(report.timing.table())
     print("counts   " + (", ".join(f"{k} {v}" for k, v in sorted(report.counts.items())) or "none"))
@@ -139,7 +144,7 @@ def _ending(report: Any, recorder: Any) -> None:
         print(f"mcap     {what if recorder.written or lost else 'none: there was nothing to record'}", flush=True)
 
 
-def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
+def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple[Any, Any]:
     import numpy as np
 
     from dexsim.deploy.vision import FixedPlace
@@ -157,43 +162,50 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
         if at.shape != (3,) or not (np.abs(at) < 0.5).all():
             raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
         place = FixedPlace(at)
-    if kind == "sim":
-        from dexsim.deploy.simulated_hand import SimulatedXHand
-
-        vision = given.get("vision", "truth")
-        if vision not in ("truth", "camera"):
-            raise UserError(f"vision={vision}: must be truth or camera")
-        seed = whole("seed", given.get("seed", "0"))
-        if "imu" in given:
-            raise UserError("imu=: driver=sim has its own")
-        config = b.config
-        shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
-        if given.get("shape", shapes[0]) not in shapes:
-            raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
-        driver = SimulatedXHand(config, calibration, seed=seed, camera=vision == "camera",
-                                shape=given.get("shape"),
-                                grip=b.manifest.get("grip"))  # fmt: skip
-        return driver, place or driver
+    fake = given.get("port", "").split(":")[0] == "fake"
+    if kind not in ("sim", "xhand"):
+        raise UserError(f"driver={kind}: must be sim or xhand")
     if kind == "xhand" and b.hand.name != "xhand":
         raise UserError(
             f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
             " hand (dexsim/deploy/driver.py)"
         )
-    if kind == "xhand":
+    wrong = [k for k in ("port", "serial") if kind == "sim" and k in given]
+    wrong += [k for k in ("vision", "shape", "seed") if kind == "xhand" and not fake and k in given]
+    wrong += [k for k in ("imu",) if (kind == "sim" or fake) and k in given]
+    if wrong:
+        raise UserError(f"{wrong[0]}={given[wrong[0]]}: driver={kind} does not use it{' with port=fake' * fake}")
+    if kind == "xhand" and not fake:
         from dexsim.deploy.vendor import VendorXHand
 
-        if "port" not in given:
-            raise UserError("driver=xhand: say port=/dev/ttyUSB0 (or port=ethercat)")
-        if task == "rotate":
-            return VendorXHand(given["port"]), _imu(given, b)
-        if place is None:
+        if task == "grasp" and place is None:
             raise UserError(
                 'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your'
-                " own"
-                " HeightSource (dexsim.deploy.vision)"
+                " own HeightSource (dexsim.deploy.vision)"
             )
-        return VendorXHand(given["port"]), place
-    raise UserError(f"driver={kind}: must be sim or xhand")
+        side = b.hand.handedness
+        driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
+        return driver, _imu(given, b) if task == "rotate" else place
+    vision = given.get("vision", "truth")
+    if vision not in ("truth", "camera"):
+        raise UserError(f"vision={vision}: must be truth or camera")
+    config = b.config
+    shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
+    if given.get("shape", shapes[0]) not in shapes:
+        raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
+    seed, grip = whole("seed", given.get("seed", "0")), b.manifest.get("grip")
+    simulated: Any = None
+    if fake:
+        from dexsim.deploy.simulated_hand import faked
+
+        simulated = faked(config, calibration, given["port"].partition(":")[2], seed, vision == "camera",
+                          given.get("shape"), grip, hang, given.get("serial"))  # fmt: skip
+    else:
+        from dexsim.deploy.simulated_hand import SimulatedXHand
+
+        simulated = SimulatedXHand(config, calibration, seed=seed, camera=vision == "camera",
+                                   shape=given.get("shape"), grip=grip, hang=hang)  # fmt: skip
+    return simulated, place or simulated
 
 
 def _imu(given: dict[str, str], b: Any) -> Any:
@@ -237,7 +249,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     new(path, "record=")
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
     meta = {
-        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": b.hand.robot,
+        "source": "sim" if given.get("driver", "sim") == "sim" or given.get("port", "")[:4] == "fake" else "real", "robot": b.hand.robot,
         "effort_is": "current_A", "effort_sign": sign,
         "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}",
         "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),

@@ -24,7 +24,8 @@ class HandState:
     time: host clock [s] at which it arrived (the SDK has no hardware stamp); sequence: counts readings.
     position [J] rad; current [J] mA, + opening, - closing; temperature [J] degC; error [J] codes (0 ok), None for
     either: not measured. tactile [P, T, 3] counts: fx, fy int8, fz uint8; taxels as in the pad's file; None: nothing is
-    felt. velocity [J] rad/s, None where the firmware does not say.
+    felt. velocity [J] rad/s, None where the firmware does not say. silent [P]: pads that give nothing for now, whose
+    counts are zeros; None: all answer.
     """
 
     time: float
@@ -35,6 +36,7 @@ class HandState:
     error: np.ndarray = None  # type: ignore[assignment]
     tactile: np.ndarray = None  # type: ignore[assignment]
     velocity: np.ndarray | None = None
+    silent: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         joints = np.shape(self.position)

@@ -23,7 +23,18 @@ from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.measure import ORIENTATION, TurnMeasure, for_bundle
-from dexsim.deploy.readings import bad_orientation, bad_place, bad_stamp, implausible
+from dexsim.deploy.readings import (
+    Frozen,
+    Lasting,
+    bad_orientation,
+    bad_place,
+    bad_sequence,
+    bad_stamp,
+    copied,
+    implausible,
+    overwritten,
+    refused,
+)  # fmt: skip
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
@@ -35,8 +46,10 @@ HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relax
 SEEN: dict[str, float] = {ORIENTATION: 0.1, "place": 0.5}
 """s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second;
 a camera's thirty, and fingers hide an object for a moment."""
-RELAX_TRIES, RELAX_EVERY = 100, 0.01
+RELAX_TRIES, RELAX_EVERY = 200, 0.005
 """How often, and s apart, the hand is told to relax where its driver fails to."""
+CONFIRM = 1.0
+"""s that a driver may take to say whether the hand is limp."""
 LIMITS: dict[str, tuple[float, float, str]] = {
     "seconds": (0, 1e7, "s"), "command": (0, 1, ""), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
     "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"),
@@ -56,13 +69,13 @@ class LoopSettings:
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
     home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task
     starts with one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: relaxes when the
-    last good reading is older than this (one that cannot be true is none), when every reading since has an error code,
-    or the policy's actions since are not finite; seen s: so does what was last seen of the object (default: `SEEN`);
-    late s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading
-    period after they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed:
-    targets' largest, over the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the
-    firmware's current limit, [J] or one;
-    kp: its gain.
+    last good reading is older than this (one that cannot be true is none), or when for 0.1 s every second reading has
+    an error code, the hand refuses what is sent or the policy's actions are not finite; seen s: so does what was last
+    seen of the object (default: `SEEN`); late s: so does a turn that is later than this; overruns: so do as many turns
+    in a row that end more than a reading period after they were due; hang s: so does a loop that does not turn at all
+    (seen by a thread of its own, and by the process that holds the bus). speed: targets' largest, over the joints'
+    no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [J] or one; kp:
+    its gain.
     recover: after letting go, home again once readings have been good for recover_s; else the run ends.
     """
 
@@ -76,11 +89,11 @@ class LoopSettings:
     wait: float = 3.0
     grip: float = 1.0
     read_hz: float = 100.0
-    stale: float = 0.1
+    stale: float = 0.12
     seen: float | None = None
     late: float = 0.1
     overruns: int = 10
-    hang: float = 0.3
+    hang: float = 0.15
     speed: float = 0.6
     margin: float = 0.0
     tor_max: float | tuple[float, ...] | None = None
@@ -102,10 +115,12 @@ class LoopSettings:
 @dataclass
 class Report:
     """What a run was: how it ended (`done`, or why the hand was relaxed), counts, timing; observations, actions and
-    targets of every act if kept. not_relaxed: what the driver said when the hand could not be relaxed, else empty."""
+    targets of every act if kept. not_relaxed: what the driver said when the hand could not be relaxed, else empty.
+    limp: by what it is known that the hand is limp; empty where the driver cannot tell."""
 
     ended: str = ""
     not_relaxed: str = ""
+    limp: str = ""
     acts: int = 0
     counts: Counter = field(default_factory=Counter)
     timing: Timing = field(default_factory=Timing)
@@ -185,8 +200,11 @@ class Loop:
         self._sequence: int | None = None  # of the last reading that the driver gave, taken or not
         self._felt = False  # the first reading had taxels
         self._wrong: str | None = None  # why readings since the last good one were not taken
-        self._coded_since: float | None = None  # since when every reading has an error code
-        self._nonsense_since: float | None = None  # since when no action was finite
+        self._given: HandState | None = None  # the driver's own object of the last reading
+        self._sent: HandCommand | None = None
+        self._broken: str | None = None  # what a driver may not do
+        self._coded, self._refused, self._nonsense = Lasting(), Lasting(), Lasting()
+        self._frozen = Frozen()
         self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs or "", 0.5)
 
     # -- the run
@@ -216,12 +234,16 @@ class Loop:
         except KeyboardInterrupt as error:
             self.report.ended = str(error) or "stopped by Ctrl-C"
             self.report.counts["interrupted"] += 1
+        except SystemExit as error:
+            self.report.ended = f"failed: SystemExit: {error.code}, raised inside the run"
+            raise UserError(self.report.ended) from None
         except Exception as error:
             self.report.ended = f"failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
             raise
         finally:
             try:
                 _to_its_end(lambda: self._relax(self.report.ended or "the loop failed"))
+                _to_its_end(self._confirm)
             finally:
                 _to_its_end(lambda: self._shut(interval, watch))
         if isinstance(self.measure, TurnMeasure) and self.measure.goals:
@@ -261,7 +283,9 @@ class Loop:
                 )
             self._beat = now
             self.clock.sleep_until(now + self.read_period)
-        self.state, self._sequence, self._good_at, self._checked = state, state.sequence, now, now
+        if (why := bad_sequence(state.sequence, None)) is not None:
+            raise UserError(f"{self.driver.name}: {why}")
+        self.state, self._sequence, self._good_at, self._checked = copied(state), state.sequence, now, now
         self._felt = np.size(state.tactile) > 0
         self.target = np.asarray(state.position, float).copy()
         if self.settings.home:
@@ -323,18 +347,26 @@ class Loop:
         """What forbids going on: an old reading, or none that can be true; error codes, actions that are no numbers; a
         late turn; too much current or heat."""
         s = self.settings
+        why = self._broken or getattr(self.driver, "problem", str)()
+        if why:
+            return why
         age = now - min(self.state.time, self._good_at)  # a stamp may be wrong; when it came is known
         if age > s.stale:
             why = f": the readings since cannot be true, {self._wrong}" if self._wrong else ""
             return f"the hand's state is {1e3 * age:.0f} ms old, allowed {1e3 * s.stale:.0f}{why}"
-        if self._coded_since is not None and now - self._coded_since > s.stale:
-            j = int(np.argmax(np.asarray(self.state.error) != 0))
+        for lasting, what in (
+            (self._coded, "{} for {:.0f} ms"), (self._refused, "{} for {:.0f} ms"),
+            (self._nonsense, "the policy's actions are not finite for {1:.0f} ms"),
+        ):  # fmt: skip
+            if lasting.since is not None and now - lasting.since > min(s.stale, 0.1):
+                return what.format(lasting.what, 1e3 * (now - lasting.since))
+        if (frozen := self._frozen.problem(now, self.target, self.state, self.tor_max)) is not None:
+            j, long = frozen
             return (
-                f"{self.bundle.hand.joints[j]} reports error code {self.state.error[j]}"
-                f" for {1e3 * (now - self._coded_since):.0f} ms"
+                f"no bit of the readings has changed for {1e3 * long:.0f} ms, while the target of"
+                f" {self.bundle.hand.joints[j]} moved and it drew no current: the bus is dead, or the driver repeats"
+                " itself"
             )
-        if self._nonsense_since is not None and now - self._nonsense_since > s.stale:
-            return f"the policy's actions are not finite for {1e3 * (now - self._nonsense_since):.0f} ms"
         if self.phase == RUN and self.measure.needs is not None:
             seen_at = self._began if self._seen_at is None else self._seen_at
             limit = s.stale if self._seen_at is None else self._seen_limit + self.period  # looked for once a period
@@ -360,14 +392,22 @@ class Loop:
 
     def _take(self, now: float) -> bool:
         """The newest state becomes ours if it can be true; whether it is a new one. Recorded once."""
-        state = self.driver.read()
-        if state is None or state.sequence == self._sequence:
+        given = self.driver.read()
+        if self._given is not None and (name := overwritten(self._given, self.state)) is not None:
+            self._broken = f"{self.driver.name}: changed the {name} of a reading that it had given; it must give copies"
+        if given is None:
             return False
-        self._sequence = state.sequence
+        if (wrong := bad_sequence(given.sequence, self._sequence)) is not None:
+            self._broken = f"{self.driver.name}: {wrong}"
+            return False
+        if given.sequence == self._sequence:
+            return False
+        state, self._given, self._sequence = copied(given), None, given.sequence
         self._wrong = implausible(state, now, self.bundle.hand, self._taxels, self._felt)
         if self._wrong is not None:
             self.report.counts["bad_readings"] += 1
             return False
+        self._given = given
         self.state, self.fresh_for, self._good_at = state, self.fresh_for + 1, now
         if self.recorder is not None:
             r = self.recorder
@@ -378,11 +418,16 @@ class Loop:
                 r.put("temperature", now, state.temperature)
             if np.any(state.error):
                 r.put(ERRORS, now, state.error)
-        if np.any(state.error):
-            self.report.counts["error_codes"] += 1
-            self._coded_since = now if self._coded_since is None else self._coded_since
-        else:
-            self._coded_since = None
+        coded = np.asarray(state.error) != 0
+        j = int(np.argmax(coded))
+        self.report.counts.update({"error_codes": int(coded.any())} if coded.any() else {})
+        self._coded.note(bool(coded.any()), now, f"{self.bundle.hand.joints[j]} reports error code {state.error[j]}")
+        for i in np.flatnonzero(state.silent) if state.silent is not None else ():
+            name = self.bundle.hand.finger_names[i]
+            if not self.report.counts[f"silent_{name}"]:
+                self.say(f"the taxels of {name} give nothing: they count as untouched, and the run goes on")
+            self.report.counts[f"silent_{name}"] += 1
+        self._frozen.note(now, state, self.target)
         return True
 
     fresh_for = 0
@@ -459,11 +504,10 @@ class Loop:
         state, command = self.state, self.settings.command
         observation, touch = self.measure.observe(state, self._seen, command, self.target, self._action)
         action = self.bundle.act(observation)[0]
-        if np.isfinite(action).all():
-            self._nonsense_since = None
-        else:
+        nonsense = not np.isfinite(action).all()
+        self._nonsense.note(nonsense, now)
+        if nonsense:
             self.report.counts["actions_not_finite"] += 1
-            self._nonsense_since = now if self._nonsense_since is None else self._nonsense_since
         target = self.rule.target(action, self.target, np.asarray(state.position, np.float32))
         self._send(now, target, 1.0)
         self._action = action
@@ -497,9 +541,13 @@ class Loop:
         self.target = safe.astype(np.float32)
         with self._lock:  # the watchdog relaxes from its own thread
             if self._tripped is None:
-                self.driver.send(
-                    HandCommand(self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION)
+                self._sent = HandCommand(
+                    self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION
                 )
+                answer = refused(self.driver.send(self._sent))
+                self._refused.note(bool(answer), now, f"{self.driver.name} refuses what is sent: {answer}")
+                if self._tripped is not None:  # the watchdog came in between: its word is the last
+                    self.driver.relax()
         if self.recorder is not None:
             self.recorder.put("command", now, self.target)
 
@@ -507,6 +555,7 @@ class Loop:
     # ------------------------------------------------------------------------------------------------------------------
     def _begin_homing(self, now: float) -> None:
         self.phase, self._began = HOMING, now
+        self._broken, self._coded, self._refused, self._frozen = None, Lasting(), Lasting(), Frozen()
         self._from = np.asarray(self.state.position, float).copy()
         self.target = self._from.astype(np.float32)
         # the peak of a minimum-jerk path is 15/8 of its mean speed
@@ -529,7 +578,7 @@ class Loop:
     def _begin_run(self, now: float) -> None:
         self.phase, self._began = RUN, now
         self.measure.reset()
-        self._unseen, self._nonsense_since = None, None
+        self._unseen, self._nonsense = None, Lasting()
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:
@@ -566,6 +615,20 @@ class Loop:
             except BaseException:
                 continue
 
+    def _confirm(self) -> None:
+        """What the hand shows of being limp, from a driver that can tell; waited for a second at most."""
+        released, limit = getattr(self.driver, "released", None), self.clock.now() + CONFIRM
+        while released is not None and not self.report.not_relaxed:
+            self.driver.read()
+            proof = released()
+            if proof is not None or self.clock.now() > limit:
+                ok, text = proof or (False, f"the hand has not said within {CONFIRM:g} s that it let go")
+                self.report.limp, self.report.not_relaxed = (text, "") if ok else ("", text)
+                break
+            self.clock.sleep_until(self.clock.now() + RELAX_EVERY)
+        if self.report.not_relaxed:
+            self.say(f"DANGER   the hand may still drive ({self.report.not_relaxed}): cut its power")
+
     def _watch(self) -> None:
         """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""
         limit = self.settings.hang
@@ -575,6 +638,8 @@ class Loop:
             if silent > limit and self._tripped is None and self.phase != RELAXED:
                 self._tripped = f"the loop did not turn for {1e3 * silent:.0f} ms, allowed {1e3 * limit:.0f}"
                 self.report.counts["watchdog"] += 1
+                if (sent := self._sent) is not None:  # one that hangs in the driver delivers nothing any more
+                    sent.mode, sent.kp, sent.tor_max = PASSIVE, 0, np.zeros_like(self.tor_max)
                 self._let_go(lock=False)  # whoever holds it hangs
 
 

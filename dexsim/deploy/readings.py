@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,6 +78,86 @@ def bad_stamp(stamp: Any, now: float) -> str | None:
     if stamp > now + AHEAD:
         return f"its stamp lies {stamp - now:.3g} s ahead"
     return None
+
+
+def bad_sequence(number: Any, before: Any) -> str | None:
+    """Why the count of a reading cannot be one after `before` (None: the first), or None."""
+    if not isinstance(number, (int, float, np.integer, np.floating)) or not np.isfinite(number):
+        return f"the count of its readings is {number}, no number"
+    back = before is not None and number < before
+    return f"the count of its readings went back from {before} to {number}" if back else None
+
+
+_ARRAYS = ("position", "current", "temperature", "error", "tactile", "velocity", "silent")
+
+
+def copied(state: HandState) -> HandState:
+    """A reading whose arrays nobody else writes."""
+    return dataclasses.replace(
+        state, **{n: x.copy() for n in _ARRAYS if isinstance(x := getattr(state, n), np.ndarray)}
+    )
+
+
+def overwritten(given: HandState, mine: HandState) -> str | None:
+    """The array of a reading that has been changed since `mine` was copied of it, or None."""
+    for name in _ARRAYS:
+        theirs, ours = getattr(given, name), getattr(mine, name)
+        if isinstance(theirs, np.ndarray) and isinstance(ours, np.ndarray) and theirs.tobytes() != ours.tobytes():
+            return name
+    return None
+
+
+def refused(answer: Any) -> str:
+    """What a driver's `send` said of a command that the hand did not take; empty where it took it."""
+    code = getattr(answer, "error_code", 0)
+    if code:
+        return f"{getattr(answer, 'error_message', '') or 'an error'} (code {code})"
+    return answer if isinstance(answer, str) else "no reason given" if answer is False else ""
+
+
+class Lasting:
+    """Since when something is so [s], None: it is not. Two in a row that are not so end it, one between does not."""
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+        self.what, self._not = "", 0
+
+    def note(self, so: bool, now: float, what: str = "") -> None:
+        """It is so, or not, at time now [s]."""
+        self._not = 0 if so else self._not + 1
+        if so:
+            self.since, self.what = now if self.since is None else self.since, what
+        elif self._not > 1:
+            self.since = None
+
+
+class Frozen:
+    """Readings that count on and say the same to the last bit, while a hand could not stand still."""
+
+    LONG, MOVED, LOAD = 0.3, 0.05, 0.3
+    """s; rad that a joint's target has moved since; share of its current limit, below which it is under no load."""
+
+    def __init__(self) -> None:
+        self._bits, self._since, self._target = b"", 0.0, np.zeros(0)
+
+    def note(self, now: float, state: HandState, target: np.ndarray | None) -> None:
+        """A new reading, and the targets [J] rad that stand."""
+        parts = (state.position, state.current, state.temperature, state.tactile, state.velocity)
+        bits = b"".join(np.asarray(x).tobytes() for x in parts if x is not None)
+        if bits != self._bits or target is None:
+            self._bits, self._since = bits, now
+            self._target = np.zeros(0) if target is None else np.array(target, float)
+
+    def problem(
+        self, now: float, target: np.ndarray | None, state: HandState, limit: np.ndarray
+    ) -> tuple[int, float] | None:
+        """The joint that should have moved, and for how long [s] nothing has; None. limit [J] mA."""
+        if target is None or len(self._target) != len(target) or now - self._since < self.LONG:
+            return None
+        idle = np.abs(np.asarray(state.current, float)) < self.LOAD * limit
+        moved = np.where(idle, np.abs(target - self._target), 0.0)
+        j = int(np.argmax(moved))
+        return (j, now - self._since) if moved[j] > self.MOVED else None
 
 
 def bad_place(place: Any) -> str | None:

@@ -8,10 +8,8 @@ place.
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
 import os
-import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,9 @@ import numpy as np
 from dexsim import system
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
+from dexsim.deploy.fake_xhand import FakeXHand, Faults
+from dexsim.deploy.process import HANG, BusDriver
+from dexsim.deploy.vendor import VendorXHand
 from dexsim.errors import UserError
 from dexsim.tactile.layout import touch_shape
 from dexsim.tasks.env import hand_of
@@ -342,24 +343,68 @@ def choose_gl() -> str:
 
 # -- the driver
 # -----------------------------------------------------------------------------------------------------------------
-_PLACE, _TURNED = slice(-9, -5), slice(-5, None)
-"""The end of a state: place, its time; orientation, its time. Before it: time, sequence; position, current,
-temperature, error, speed of every joint."""
-_PRESENT, _RELEASE = 1.0, 2.0
+class SimulatedBody:
+    """The hand's side of `SimulatedXHand`: a bus cycle every `BUS_PERIOD`, whose state is there `latency` [s] later."""
+
+    def __init__(self, clock: Clock, args: tuple, latency: float):
+        self.clock, self.latency, self.hand = clock, latency, _physics(args)
+        self._last: HandCommand | None = None
+
+    def open(self) -> dict[str, str]:
+        if type(self.clock) is Clock:
+            for k in range(1, 4):
+                self.hand.advance(k * BUS_PERIOD)  # compiles what is left
+        self._zero = self.clock.now() - self.hand.time
+        self._cycle = round(self.hand.time / BUS_PERIOD)
+        return {
+            "driver": "simulated",
+            "serial": "sim",
+            "bus": f"{1 / BUS_PERIOD:g} Hz",
+            "latency_s": f"{self.latency:g}",
+        }
+
+    @property
+    def due(self) -> float:
+        """When the next state is there [s]."""
+        return self._zero + self._cycle * BUS_PERIOD + self.latency
+
+    def cycle(self, command: HandCommand | None) -> HandState:
+        """The command acts, the hand is simulated to the next cycle's time; its state, when it is there."""
+        if command is not None and command is not self._last:
+            self.hand.command(command)
+            self._last = command
+        late = self.clock.now() - self.due
+        if late > 0.25 and type(self.clock) is Clock:  # too slow a machine: time stands still rather than jump
+            self._zero += late
+        self.hand.advance(self._cycle * BUS_PERIOD)
+        if type(self.clock) is Clock:
+            self.clock.sleep_until(self.due)
+        state = self.hand.state(max(self.due, self.clock.now()) if type(self.clock) is Clock else self.due)
+        self._cycle += 1
+        return state
+
+    def problem(self) -> str:
+        return ""
+
+    def released(self) -> tuple[bool, str] | None:
+        return (True, "limp: simulated motors are off") if self._last and self._last.mode == PASSIVE else None
+
+    def seen(self) -> np.ndarray:
+        """Place, its time; orientation, its time."""
+        out = np.full(9, np.nan)
+        for part, look in ((slice(0, 4), self.hand.place()), (slice(4, 9), self.hand.orientation())):
+            if look is not None:
+                out[part] = np.append(look[0], look[1] + self._zero)
+        return out
+
+    def handle(self, what: int) -> None:
+        (self.hand.present if what == 1 else self.hand.release)()
+
+    def close(self) -> None:
+        pass
 
 
-def _shared(context: Any, joints: int, taxels: tuple[int, int]) -> tuple:
-    """Two slots of state (the newest by its count) and two of commands: one writer each, no locks. A command: number,
-    mode, position, tor_max, kp, what is done with the object."""
-    touch = 3 * int(np.prod(taxels))
-    state, command = 2 + 5 * joints + 9, 2 + 2 * joints + 2
-    return (context.RawArray(ctypes.c_double, 2 * state), context.RawArray(ctypes.c_int16, 2 * max(touch, 1)),
-            context.RawValue(ctypes.c_int64, -1),
-            context.RawArray(ctypes.c_double, 2 * command), context.RawValue(ctypes.c_int64, -1),
-            context.RawValue(ctypes.c_int, 0))  # fmt: skip
-
-
-class SimulatedXHand:
+class SimulatedXHand(BusDriver):
     """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step.
 
     latency [s]: from a state's measurement until `read` gives it, on top of the bus period.
@@ -377,195 +422,57 @@ class SimulatedXHand:
         shape: str | None = None,
         latency: float = 0.002,
         grip: dict[str, Any] | None = None,
+        hang: float = HANG,
     ):
-        self.clock, self.latency = clock or Clock(), latency
-        self._args = (config, calibration, seed, camera, shape, grip)
-        hand = hand_of(config)
-        self.joints, self.taxels = len(hand.joints), touch_shape(hand)
-        self._process: multiprocessing.context.SpawnProcess | None = None
-        self.hand: SimulatedHand | None = None
-        self._queue: list[tuple[float, Any]] = []
+        self._camera, hand = camera, hand_of(config)
+        make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip), latency=latency)
+        super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
 
     def open(self) -> dict[str, str]:
-        info = {
-            "driver": "simulated",
-            "serial": "sim",
-            "bus": f"{1 / BUS_PERIOD:g} Hz",
-            "latency_s": f"{self.latency:g}",
-        }
-        if type(self.clock) is not Clock:
-            self.hand = SimulatedHand(*self._args)
-            self._zero, self._cycle = self.clock.now(), 0
-            self._state: HandState | None = None
-            self._commands: list[HandCommand] = []
-            return info
-        if self._args[3]:
+        if self._camera and type(self.clock) is Clock:
             choose_gl()
-        context = multiprocessing.get_context("spawn")
-        shared = _shared(context, self.joints, self.taxels)
-        self._views = _views(shared)
-        self._number, self._object = 0, 0.0
-        process = context.Process(target=_live, args=(self._args, shared, self.latency), daemon=True)
-        process.start()
-        self._process = process
-        limit = time.monotonic() + 180.0
-        while self._views["newest"].value < 0:  # kernels compile on a first start
-            if not process.is_alive():
-                raise UserError("the simulated hand's process ended at its start; its message stands above")
-            if time.monotonic() > limit:
-                raise UserError("the simulated hand did not start within 180 s")
-            time.sleep(0.02)
-        return info
-
-    def read(self) -> HandState | None:
-        if self.hand is not None:
-            return self._step(self.hand)
-        v = self._views
-        while True:
-            k = v["newest"].value
-            if k < 0:
-                return None
-            row, touch = v["state"][k % 2].copy(), v["touch"][k % 2].copy()
-            if v["newest"].value - k < 2:
-                break  # else the slot was written over while it was copied
-        part = row[2:-9].reshape(5, self.joints)
-        return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2],
-                         part[3].astype(np.int64),
-                         touch[: 3 * int(np.prod(self.taxels))].reshape(*self.taxels, 3), part[4])  # fmt: skip
-
-    def place(self, now: float) -> tuple[np.ndarray, float] | None:
-        """HeightSource: the object as the simulated camera last saw it."""
-        return self._object_seen("place", _PLACE)
-
-    def orientation(self, now: float) -> tuple[np.ndarray, float] | None:
-        """OrientationSource: as the object's IMU last said."""
-        return self._object_seen("orientation", _TURNED)
-
-    def _object_seen(self, what: str, part: slice) -> tuple[np.ndarray, float] | None:
-        if self.hand is not None:
-            seen = getattr(self.hand, what)()
-            return None if seen is None else (seen[0], seen[1] + self._zero)
-        v = self._views
-        row = v["state"][v["newest"].value % 2, part].copy()
-        return None if not np.isfinite(row[-1]) else (row[:-1], float(row[-1]))
-
-    def send(self, command: HandCommand) -> None:
-        if self.hand is not None:
-            self._commands.append(command)
-        else:
-            self._post(command.mode, command.position, command.tor_max, command.kp)
-
-    def relax(self) -> None:
-        if self.hand is not None:
-            self._commands = [HandCommand(self.hand.target, np.zeros(self.joints), mode=PASSIVE)]
-            self.hand.relax()
-        elif self._process is not None:
-            self._post(PASSIVE, np.zeros(self.joints), np.zeros(self.joints), 0)
-
-    def present(self) -> None:
-        """The object is held out."""
-        if self.hand is not None:
-            self.hand.present()
-        else:
-            self._object = _PRESENT
-
-    def started(self) -> None:
-        """The policy begins: the object is let go."""
-        if self.hand is not None:
-            self.hand.release()
-        else:
-            self._object = _RELEASE
-
-    def close(self) -> None:
-        self.relax()
-        if self._process is not None:
-            self._views["stop"].value = 1
-            self._process.join(5.0)
-            if self._process.is_alive():
-                self._process.terminate()
-            self._process = None
-
-    def _post(self, mode: int, position: np.ndarray, tor_max: np.ndarray, kp: float) -> None:
-        v = self._views
-        self._number += 1
-        row, end = v["command"][self._number % 2], 2 + self.joints
-        row[:2], row[2:end], row[end:-2], row[-2:] = (self._number, mode), position, tor_max, (kp, self._object)
-        v["sent"].value = self._number
-
-    def _step(self, hand: SimulatedHand) -> HandState | None:
-        """In place: the bus cycles that have passed since the last call."""
-        passed = int((self.clock.now() - self.latency - self._zero) / BUS_PERIOD + 1e-6)
-        while self._cycle <= passed:
-            for c in self._commands:
-                hand.command(c)
-            self._commands = []
-            t = self._cycle * BUS_PERIOD
-            hand.advance(t)
-            self._state = hand.state(self._zero + t + self.latency)
-            self._cycle += 1
-        return self._state
+        return super().open()
 
 
-def _views(raw: tuple) -> dict[str, Any]:
-    states, touches, newest, commands, sent, stop = raw
-    return {
-        "state": np.frombuffer(states, np.float64).reshape(2, -1),
-        "touch": np.frombuffer(touches, np.int16).reshape(2, -1), "newest": newest,
-        "command": np.frombuffer(commands, np.float64).reshape(2, -1), "sent": sent, "stop": stop,
-    }  # fmt: skip
+def faked(
+    config: dict[str, Any],
+    calibration: Calibration,
+    faults: str = "",
+    seed: int = 0,
+    camera: bool = False,
+    shape: str | None = None,
+    grip: dict[str, Any] | None = None,
+    hang: float = HANG,
+    serial: str | None = None,
+    clock: Clock | None = None,
+) -> VendorXHand:
+    """The xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
+    `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
+    hand = hand_of(config)
+    side = hand.handedness
+    text = faults if "side=" in faults else f"side={side[0].upper()}," + faults
+    make = partial(_physics, args=(config, calibration, seed, camera, shape, grip))
+    package = partial(FakeXHand, make=make, faults=Faults.parse(text))
+    if camera and clock is None:
+        choose_gl()
+    driver = VendorXHand("auto", clock, package, serial, side, hang)
+    driver.start = 180.0  # kernels compile on a first start
+    return driver
 
 
-def _live(args: tuple, raw: tuple, latency: float) -> None:
-    """The hand's own process: one bus cycle after the other until it is told to stop or its parent is gone."""
-    import signal
+def _physics(args: tuple) -> SimulatedHand:
+    _one_thread()
+    return SimulatedHand(*args)
+
+
+def _one_thread() -> None:
+    """In a process of the hand's own."""
+    import multiprocessing
 
     import torch
 
     from dexsim.sim.quiet import quiet_warp
 
-    for number in set(system.stop_signals()) - {signal.SIGTERM}:  # the loop's to handle: it relaxes first
-        signal.signal(number, signal.SIG_IGN)
-    lives = multiprocessing.parent_process().is_alive  # type: ignore[union-attr]  # this is a child
-    torch.set_num_threads(1)
-    quiet_warp("cpu")
-    v = _views(raw)
-    try:
-        hand = SimulatedHand(*args)
-    except UserError as error:
-        print(f"error: {error}", flush=True)
-        os._exit(2)
-    for k in range(1, 4):
-        hand.advance(k * BUS_PERIOD)  # compiles what is left
-    zero, taken, count = time.monotonic() - hand.time, 0, -1
-    due = time.monotonic()
-    while not v["stop"].value and lives():
-        number = v["sent"].value
-        if number > taken:
-            row = v["command"][number % 2].copy()
-            taken = number
-            end = 2 + hand.env.num_actions
-            hand.command(HandCommand(row[2:end], row[end:-2], kp=int(row[-2]), mode=int(row[1])))
-            if row[-1] == _PRESENT:
-                hand.present()
-            elif row[-1] == _RELEASE:
-                hand.release()
-        now = time.monotonic()
-        if now - zero - hand.time > 0.25:  # too slow a machine: simulated time stands still rather than jump
-            zero = now - hand.time - BUS_PERIOD
-        hand.advance(now - zero)
-        wait = due + latency - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
-        state = hand.state(time.monotonic())
-        count += 1
-        slot = v["state"][count % 2]
-        slot[0], slot[1] = state.time, state.sequence
-        slot[2:-9] = np.concatenate([state.position, state.current, state.temperature, state.error, state.velocity])
-        for part, seen in ((_PLACE, hand.place()), (_TURNED, hand.orientation())):
-            slot[part] = np.append(seen[0], seen[1] + zero) if seen is not None else np.nan
-        v["touch"][count % 2, : state.tactile.size] = state.tactile.reshape(-1)
-        v["newest"].value = count
-        due = max(due + BUS_PERIOD, time.monotonic() - BUS_PERIOD)
-        wait = due - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
+    if multiprocessing.parent_process() is not None:
+        torch.set_num_threads(1)
+        quiet_warp("cpu")

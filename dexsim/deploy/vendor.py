@@ -1,163 +1,451 @@
-"""The vendor's driver as a `HandDriver`: an adapter for the Python package `xhand_controller`, imported only when
-opened.
+"""The xHand by the vendor's Python package `xhand_controller`, which the user installs; imported only when opened.
 
-Not run on a hand by us: written from the SDK's published fields (see the table below); check signs and limits at low
-current first. The bus blocks for about 9.6 ms a round trip, so a thread of this driver's own talks to it, and the
-newest state waits for `read`.
+Not run on a hand by us. How the package behaves is taken from drivers that run real hands: every call returns an error
+object and raises nothing; `send_command` is one round trip of about 9.6 ms on RS485; `read_state(id, True)` sends the
+last command once more, `read_state(id, False)` gives the cache that a thread of the package fills, without a stamp. The
+package may print, hang or abort: it lives in a process of its own (`dexsim.deploy.process`).
 
     theirs                                          ours (`HandState`)
     finger_state[i].position        rad             position
-    finger_state[i].torque          mA, + opening   current
+    finger_state[i].torque          mA, + opening   current (uint16 in package 0.10.3, int16 in newer ones)
     finger_state[i].default5        1000 rad/s      velocity (newer firmware; older leaves every joint's 0: none then)
     finger_state[i].temperature     low byte degC   temperature
-    finger_state[i].commboard_err, jonitboard_err, tipboard_err   error (the first that is not 0)
+    finger_state[i].commboard_err, jonitboard_err   error (`tipboard_err` is of the taxels, not of the joint)
     sensor_data[f].raw_force[k].fx, fy (int8), fz (uint8)         tactile counts
     HandCommand_t.finger_command[i]: id, kp, ki, kd, position rad, tor_max mA, mode (0 passive, 3 position)
 """
 
 from __future__ import annotations
 
-import threading
+import contextlib
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from dexsim.deploy.driver import PASSIVE, Clock, HandCommand, HandState
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
+from dexsim.deploy.process import HANG, BusDriver
 from dexsim.errors import UserError
 
 BAUD = 3_000_000
 JOINTS, TAXELS = 12, (5, 120, 3)
 """Of the only hand that this package drives."""
-CLOSE = 1.0  # s that the bus has to carry the command to relax
+NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT, CRC = 1501018, 1501019, 1501020, 1501035, 1501070
+TOO_WARM, REFUSED, BOOT = 1501028, (1501029, 1501030), 1501036
+ACCEPTED = frozenset((0, NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT))
+"""Codes with which a command has reached the hand; `AT_LIMIT`: its current is at its limit, as in a grasp."""
+GOOD_JOINTS = ACCEPTED | {CRC}
+"""Codes with which a whole frame's joints are good. Its touch is with 0, `AT_LIMIT` and `NO_TAXEL_TEMPERATURES`."""
+GOOD_TOUCH = frozenset((0, AT_LIMIT, NO_TAXEL_TEMPERATURES))
+PAUSE = 0.06
+"""s of silence after a CRC error: a retry at once sends the firmware into its boot mode for 4.2 s, 50 to 80 ms do
+not."""
+TRIES, BETWEEN = 3, {"serial": 2.0, "ethercat": 3.0}
+"""Tries to open a bus, and s between them."""
+SEED = 3
+"""Forced readings before the first command, 20 ms apart: until then the cache holds zeros."""
+LOST = 0.1
+"""s without an answer of all taxel boards, or of one: silent; without an accepted command: refused."""
+LIMP, YIELD, WATCH = 30.0, 0.02, 0.1
+"""mA that motors may draw in a limp hand; rad by which a joint that gives way shows that it is; s that a hand is
+watched for each way to let go."""
 
 
-class VendorXHand:
-    """An xHand over RS485 (port, e.g. /dev/ttyUSB0) or EtherCAT (port="ethercat")."""
+class XHandBus:
+    """The hand's side: the package, one round trip a cycle. Runs where the package may block and abort.
+
+    port: "auto" (every RS485 port is asked), a serial port, "ethercat" or "ethercat:INTERFACE". serial: the hand's
+    serial number, of several; side: "right" or "left", another hand is refused. package: gives the module.
+    """
+
+    def __init__(
+        self, clock: Clock, port: str, serial: str | None, side: str | None, package: Callable[[Clock], Any] | None
+    ):
+        self.clock, self.port, self.serial, self.side = clock, port, serial, side
+        self._sdk = package(clock) if package is not None else _import()
+        self.counts: Counter = Counter()
+        self._pause_until = self._refused_at = clock.now()
+        self._sent: HandCommand | None = None
+        self._frame: list[Any] = []
+        self._sequence, self._fast = 0, False
+        self._last_bits, self._stirred, self._restless = ([], []), clock.now(), False
+        self._steps = np.zeros(JOINTS)
+        self._boards = [b""] * TAXELS[0]
+        self._touch = np.zeros(TAXELS, np.int16)
+        self._touched = np.full(TAXELS[0], -np.inf)
+        self._touch_worked, self._why, self._refusal = False, "", ""
+        self._state: HandState | None = None
+        self._letting_go: dict[str, Any] | None = None
+
+    @property
+    def due(self) -> float:
+        """When the next round trip may begin [s]."""
+        return self.clock.now()
+
+    # -- opening
+    # ---------------------------------------------------------------------------------------------------------------
+    def open(self) -> dict[str, str]:
+        """Find the hand and read it; nothing moves. Returns what to log. Raises UserError."""
+        kind = "ethercat" if self.port.startswith("ethercat") else "serial"
+        wrong: list[str] = []
+        for attempt in range(TRIES):
+            if attempt:
+                self.clock.sleep_until(self.clock.now() + BETWEEN[kind])
+            wrong, missing = [], False
+            for port in self._ports(kind, wrong):
+                device = self._sdk.XHandControl()
+                code, message = _error(
+                    device.open_serial(port, BAUD) if kind == "serial" else device.open_ethercat(port)
+                )
+                if code != 0:
+                    wrong.append(f"{port} does not open: {message or code}")
+                    missing = True
+                elif info := self._take(device, port, wrong):
+                    return info
+                with contextlib.suppress(Exception):
+                    device.close_device()
+            if wrong and not missing:
+                break  # what opens and is not the hand that is asked for stays so
+        hint = (
+            "EtherCAT needs cap_net_raw (setcap cap_net_raw+ep on the python that runs this), and 3 s after a session"
+            " that broke off"
+            if kind == "ethercat"
+            else "check power and cable; a hand has two ports, /dev/ttyACM*, whose numbers change when it is plugged"
+            " in, and its auxiliary one lists no hand: port=auto finds the other"
+        )
+        raise UserError(f"no hand to drive ({'; '.join(wrong) or 'no port is there'}): {hint}")
+
+    def _ports(self, kind: str, wrong: list[str]) -> list[str]:
+        name, _, interface = self.port.partition(":")
+        if kind == "ethercat":
+            return [interface] if interface else list(_enumerate(self._sdk, "EtherCAT"))
+        return list(_enumerate(self._sdk, "RS485")) if name == "auto" else [self.port]
+
+    def _take(self, device: Any, port: str, wrong: list[str]) -> dict[str, str] | None:
+        """The hand that is asked for, on an open port; None, with the reason in `wrong`, where it is not there."""
+        hands = list(device.list_hands_id() or ())
+        if not hands:
+            wrong.append(f"{port} opens and lists no hand (the auxiliary port?)")
+        for hand in hands:
+            serial, side = _value(device, "get_serial_number", hand), _side(_value(device, "get_hand_type", hand))
+            if self.serial and serial.strip() != self.serial.strip():
+                wrong.append(f"{port} has hand {serial or hand}, not {self.serial}")
+            elif self.side and side and side != self.side:
+                wrong.append(f"{port} has a {side} hand, the policy is for a {self.side} one")
+            else:
+                self._device, self._id = device, hand
+                self._wire = self._sdk.HandCommand_t()
+                self._seed(port)
+                return {
+                    "driver": "xhand_controller", "port": port, "hand_id": str(hand), "serial": serial,
+                    "side": side or "not said", "sdk": _value(device, "get_sdk_version"),
+                    "firmware": _value(device, "read_version", hand, 0),
+                }  # fmt: skip
+        return None
+
+    def _seed(self, port: str) -> None:
+        """Whole frames until the cache holds what the hand reads: what was there before are zeros."""
+        limit, whole = self.clock.now() + 6.0, 0
+        while whole < SEED:
+            whole += self.cycle(None) is not None
+            if whole < SEED:
+                self.clock.sleep_until(self.clock.now() + 0.02)
+            if self.clock.now() > limit:
+                raise UserError(f"{port}: the hand gives no whole reading ({self._why or 'no answer'})")
+
+    # -- a cycle
+    # ---------------------------------------------------------------------------------------------------------------
+    def cycle(self, command: HandCommand | None) -> HandState | None:
+        """Send, one round trip; then the state that it brought. None where it brought nothing that is new and whole."""
+        self.clock.sleep_until(self._pause_until)
+        code = 0
+        if command is None:
+            error, raw = self._call(lambda: self._device.read_state(self._id, True), (None, None))
+        else:
+            self._sent = command
+            if command.mode != PASSIVE:
+                self._letting_go = None
+            code = self._send(self._letting(command) if command.mode == PASSIVE else command)
+            error, raw = self._call(lambda: self._device.read_state(self._id, False), (None, None))
+        state = self._state_of(error, raw, code)
+        if state is not None:
+            self._state = state
+        if self._letting_go is not None:
+            self._watch_limp(code, state)
+        return state
+
+    def _call(self, work: Callable[[], Any], default: Any) -> Any:
+        """What the package answers; what it raises is counted, and is no answer."""
+        try:
+            return work()
+        except Exception as error:
+            self.counts["raised"] += 1
+            self._why = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+            self.clock.sleep_until(self.clock.now() + 0.002)
+            return default
+
+    def _send(self, c: HandCommand) -> int:
+        """One round trip; the code of its answer."""
+        for i in range(JOINTS):
+            f = self._wire.finger_command[i]
+            f.id, f.kp, f.ki, f.kd = i, int(c.kp), int(c.ki), int(c.kd)
+            f.position, f.tor_max, f.mode = float(c.position[i]), int(c.tor_max[i]), int(c.mode)
+        answer = self._call(lambda: self._device.send_command(self._id, self._wire), None)
+        code, message = _error(answer)
+        now = self.clock.now()
+        if code in ACCEPTED:
+            self._refusal = ""
+            return code
+        if not self._refusal:
+            self._refused_at = now
+        self.counts[f"code {code}"] += 1
+        if code == CRC:
+            self._pause_until = now + PAUSE
+        if code == TOO_WARM:
+            self._refusal = f"a motor is too warm (code {code})"
+        elif code == BOOT:
+            self._refusal = f"the firmware is in its boot mode (code {code}), for about 4 s after errors of the bus"
+            self._pause_until = now + PAUSE
+        else:
+            self._refusal = f"the hand refuses commands: {message or self._why or 'no answer'} (code {code})"
+        return code
+
+    def _state_of(self, error: Any, raw: Any, sent: int) -> HandState | None:
+        now = self.clock.now()
+        code, message = _error(error)
+        if code == CRC:
+            self.counts["crc"] += 1
+            self._pause_until = max(self._pause_until, now + PAUSE)
+        if raw is None or code not in GOOD_JOINTS:
+            self._why = f"{message or self._why or 'no answer'} (code {code})"
+            self.counts["no reading"] += 1
+            if code == BOOT:
+                self._pause_until = max(self._pause_until, now + PAUSE)
+            return None
+        joints = _whole(raw)
+        if joints is None and code != CRC:  # the package's thread is writing it: look again, the bus is not needed
+            self.clock.sleep_until(now + 0.002)
+            error, raw = self._call(lambda: self._device.read_state(self._id, False), (error, None))
+            joints = _whole(raw)
+        if joints is None:
+            self.counts["torn"] += 1
+            self._why = "a torn frame: its joints are not 0 to 11, each once"
+            return None
+        frame = [(j.position, j.torque, j.temperature, getattr(j, "raw_position", 0)) for j in joints]
+        if sent not in ACCEPTED and frame == self._frame:
+            return None  # the cache of before; nothing says that the hand has answered
+        self._frame = frame
+        self._feel(raw, code, now)
+        speed = _int16([getattr(j, "default5", 0) for j in joints]).astype(np.float32) * 1e-3
+        self._fast = self._fast or bool(speed.any())
+        self._stir(now, code)
+        error_codes = [0 if code == CRC else (j.commboard_err or j.jonitboard_err) for j in joints]
+        self._sequence += 1
+        silent = now - self._touched > LOST
+        return HandState(
+            now, self._sequence, np.array([j.position for j in joints], np.float32),
+            _int16([j.torque for j in joints]), np.array([j.temperature & 0xFF for j in joints], float),
+            np.array(error_codes, np.int64), np.where(silent[:, None, None], 0, self._touch).astype(np.int16),
+            speed if self._fast else None, silent if silent.any() else None)  # fmt: skip
+
+    def _feel(self, raw: Any, code: int, now: float) -> None:
+        """The taxels of boards that answer: of all with a good code, else of those whose content changes."""
+        if code == CRC:
+            return
+        for f in range(TAXELS[0]):
+            board = raw.sensor_data[f]
+            touch = np.array([(t.fx, t.fy, t.fz) for t in board.raw_force], np.int16)
+            content = touch.tobytes() + bytes(int(x) & 0xFF for x in getattr(board, "temperature", ()))
+            if code in GOOD_TOUCH or (content != self._boards[f] and any(content)):
+                self._touch[f], self._touched[f] = touch, now
+            self._boards[f] = content
+        self._touch_worked = self._touch_worked or code in GOOD_TOUCH
+
+    def _stir(self, now: float, code: int) -> None:
+        """Since when no bit of the cache has changed. Encoders that go to and fro while the hand stands still show that
+        its readings never stand."""
+        bits = (self._frame, list(self._boards))
+        if bits != self._last_bits:
+            if self._sent is None and self._last_bits[0]:
+                steps = np.array([a[0] - b[0] for a, b in zip(self._frame, self._last_bits[0], strict=True)])
+                self._restless = self._restless or int((steps * self._steps < 0).sum()) >= 3
+                self._steps = steps
+            self._last_bits, self._stirred = bits, now
+
+    def _dead(self) -> str:
+        """What is said of a bus whose cache alone answers; empty where it lives."""
+        still = self.clock.now() - self._stirred
+        return (
+            f"no bit of the readings has changed for {1e3 * still:.0f} ms, of a hand whose encoders never stand still:"
+            " the bus is dead, and the package's cache answers"
+            if self._restless and still > LOST
+            else ""
+        )
+
+    # -- what the loop asks
+    # ---------------------------------------------------------------------------------------------------------------
+    def problem(self) -> str:
+        """Why the hand cannot be driven any longer; empty while it can."""
+        now = self.clock.now()
+        if self._refusal and (self._refusal.startswith("a motor") or now - self._refused_at > LOST - 0.03):
+            return self._refusal
+        if self._touch_worked and (now - self._touched > LOST).all():
+            return f"no taxel board has answered for {1e3 * (now - self._touched.max()):.0f} ms"
+        return self._dead()
+
+    # -- letting go
+    # ---------------------------------------------------------------------------------------------------------------
+    def _letting(self, command: HandCommand) -> HandCommand:
+        """Passive, without stiffness and torque, where the joints are. Where the hand still draws current, the same in
+        position mode: a firmware may not know the passive one."""
+        if self._letting_go is None:
+            before = 0.0 if self._state is None else float(np.abs(self._state.current).max())
+            self._letting_go = {"mode": PASSIVE, "since": None, "before": before, "began": self.clock.now(),
+                                "from": None, "loads": {}}  # fmt: skip
+        at = command.position if self._state is None else self._state.position
+        return HandCommand(at, np.zeros(JOINTS), 0, 0, 0, self._letting_go["mode"])
+
+    def _watch_limp(self, code: int, state: HandState | None) -> None:
+        """What currents and joints do after the hand has taken the command; the second way where they do not end."""
+        go, now = self._letting_go, self.clock.now()
+        assert go is not None
+        if dead := self._dead():
+            go["proof"] = False, f"{dead}; cut the hand's power"
+            return
+        if go["since"] is None:
+            if code in ACCEPTED and state is not None:
+                go["since"], go["from"] = now, state.position
+                go["peak"] = 0.0
+            return
+        if state is None or now - go["since"] < 0.5 * WATCH:
+            return
+        go["peak"] = max(go["peak"], float(np.abs(state.current).max()))
+        if now - go["since"] < WATCH:
+            return
+        moved, name = float(np.abs(state.position - go["from"]).max()), int(np.abs(state.current).argmax())
+        how = "passive mode" if go["mode"] == PASSIVE else "a torque limit of 0 in position mode, not by passive mode"
+        if go["peak"] <= LIMP:
+            what = (
+                f"the largest current went from {go['before']:.0f} to {go['peak']:.0f} mA, joints moved {moved:.3f} rad"
+            )
+            shown = max(go["before"], *go["loads"].values(), 0.0) > LIMP or moved > YIELD
+            go["proof"] = True, (
+                f"limp by {how}: {what}"
+                if shown
+                else f"the hand took the command; {what}: that it is limp shows when somebody moves a joint"
+            )
+            return
+        go["loads"][go["mode"]] = go["peak"]
+        if len(go["loads"]) == 1:
+            go["mode"], go["since"] = POSITION, None
+            return
+        go["mode"] = min(go["loads"], key=go["loads"].get)
+        go["since"], go["peak"] = now, 0.0
+        go["proof"] = False, (
+            f"the hand took the command and still resists: joint {name} draws {abs(int(state.current[name]))} mA; its"
+            " torque limit is held at 0"
+        )
+
+    def released(self) -> tuple[bool, str] | None:
+        """Whether the hand is limp, and by what that is known; None while it is not known."""
+        go = self._letting_go
+        if go is None:
+            return None
+        if "proof" in go:
+            return go["proof"]
+        if self.clock.now() - go["began"] > 5.5:
+            return False, self._refusal or f"the hand does not say that it has let go ({self._why or 'no answer'})"
+        return None
+
+    def seen(self) -> np.ndarray:
+        """The object, of a simulated hand behind the package."""
+        look = getattr(self._sdk, "seen", None)
+        return np.full(9, np.nan) if look is None else look()
+
+    def handle(self, what: int) -> None:
+        """Held out or let go, of a simulated hand behind the package."""
+        if (act := getattr(self._sdk, "handle", None)) is not None:
+            act(what)
+
+    def close(self) -> None:
+        """Disconnect. EtherCAT is asked to go to INIT before: the next session finds it there."""
+        init = getattr(self._device, "set_firmware_state", None)
+        if self.port.startswith("ethercat") and init is not None:
+            self._call(lambda: init(self._id, 1, 1, 500_000), None)
+            self.clock.sleep_until(self.clock.now() + 0.2)
+        self._device.close_device()
+
+
+class VendorXHand(BusDriver):
+    """An xHand over RS485 or EtherCAT, in a child process; see `XHandBus` for the settings, `BusDriver` for the
+    rest."""
 
     name = "xHand"
 
-    def __init__(self, port: str, clock: Clock | None = None, package: Any = None):
-        self.port, self.clock, self._package = port, clock or Clock(), package
-        self._device = None
-        self._state: HandState | None = None
-        self._command: HandCommand | None = None
-        self._lock = threading.Lock()
-        self._stop, self._passive = threading.Event(), threading.Event()
-        self._thread: threading.Thread | None = None
-        self.bad_reads = 0
-        self.error = ""  # what the package said last when a bus cycle failed
-
-    def open(self) -> dict[str, str]:
-        sdk = self._package or self._import()
-        self._sdk = sdk
-        device = sdk.XHandControl()
-        if self.port == "ethercat":
-            ports = device.enumerate_devices("EtherCAT")
-            if not ports:
-                raise UserError("xHand: no EtherCAT device found; check cable and power")
-            answer = device.open_ethercat(ports[0])
-        else:
-            answer = device.open_serial(self.port, BAUD)
-        if getattr(answer, "error_code", 0) != 0:
-            raise UserError(f"xHand on {self.port}: {getattr(answer, 'error_message', answer)}")
-        hands = device.list_hands_id()
-        if not hands:
-            raise UserError(f"xHand on {self.port}: no hand answers on the bus")
-        self._device, self._id, self._sequence = device, hands[0], 0
-        self._wire = sdk.HandCommand_t()
-        self._thread = threading.Thread(target=self._run, name="xhand bus", daemon=True)
-        self._thread.start()
-        return {"driver": "xhand_controller", "port": self.port, "hand_id": str(self._id)}
-
-    def read(self) -> HandState | None:
-        return self._state
-
-    def send(self, command: HandCommand) -> None:
-        with self._lock:
-            self._passive.clear()
-            self._command = command
-
-    def relax(self) -> None:
-        self.send(HandCommand(np.zeros(12), np.zeros(12), kp=0, mode=PASSIVE))
-
-    def close(self) -> None:
-        if self._device is None:
-            return
-        self.relax()
-        self._passive.wait(CLOSE)  # until the bus has carried it
-        self._stop.set()
-        self._thread.join(1.0)
-        carried = self._passive.is_set()
-        try:
-            self._device.close_device()
-        finally:
-            self._device = None
-        if not carried:
-            raise UserError(
-                f"xHand on {self.port}: the bus did not carry the command to relax within {CLOSE:g} s"
-                f"{f' ({self.error})' if self.error else ''}; cut the hand's power"
-            )
-
-    @staticmethod
-    def _import() -> Any:
-        try:
-            from xhand_controller import xhand_control
-        except ImportError:
-            raise UserError(
-                "driver=xhand: the vendor's package xhand_controller is not installed; get it from the vendor of the"
-                " hand, or use driver=sim"
-            ) from None
-        return xhand_control
-
-    def _run(self) -> None:
-        """Bus cycles until the end; one that fails is counted, shows as no new state to the loop, and is tried
-        again."""
-        while not self._stop.is_set():
-            try:
-                self._cycle()
-            except Exception as error:  # whatever the package raises; a thread that ended could relax no more
-                self.bad_reads, self.error = (
-                    self.bad_reads + 1,
-                    f"{type(error).__name__}: {' '.join(str(error).split())[:160]}",
-                )
-                self._stop.wait(0.002)
-
-    def _cycle(self) -> None:
-        """Send the last command, read the state that comes back."""
-        device = self._device
-        if device is None:
-            return  # closed while this thread waited
-        with self._lock:
-            command = self._command
-        if command is not None:
-            for i in range(JOINTS):
-                f = self._wire.finger_command[i]
-                f.id, f.kp, f.ki, f.kd = i, int(command.kp), int(command.ki), int(command.kd)
-                f.position, f.tor_max, f.mode = float(command.position[i]), int(command.tor_max[i]), int(command.mode)
-            device.send_command(self._id, self._wire)
-            with self._lock:
-                if command.mode == PASSIVE and self._command is command:
-                    self._passive.set()
-        # True would send the last command again; False reads what the bus delivered
-        error, raw = device.read_state(self._id, command is not None)
-        if getattr(error, "error_code", 0) != 0:
-            self.bad_reads, self.error = self.bad_reads + 1, str(getattr(error, "error_message", error))[:160]
-            return
-        state = convert(raw, self.clock.now(), self._sequence + 1)
-        self._sequence, self._state = state.sequence, state
+    def __init__(
+        self,
+        port: str = "auto",
+        clock: Clock | None = None,
+        package: Any = None,
+        serial: str | None = None,
+        side: str | None = None,
+        hang: float = HANG,
+    ):
+        inside = hasattr(package, "XHandControl")  # the module itself, of this process
+        give = (lambda clock: package) if inside else package
+        make = partial(XHandBus, port=port, serial=serial, side=side, package=give)
+        super().__init__(make, JOINTS, TAXELS[:2], clock, hang, inside=inside)
 
 
-def convert(raw: Any, now: float, sequence: int) -> HandState:
-    """The SDK's state struct as ours; nothing scaled."""
-    joints = [raw.finger_state[i] for i in range(JOINTS)]
-    tactile = np.zeros(TAXELS, np.int16)
-    for f in range(TAXELS[0]):
-        force = raw.sensor_data[f].raw_force
-        tactile[f] = [(force[k].fx, force[k].fy, force[k].fz) for k in range(TAXELS[1])]
-    speed = np.array([getattr(j, "default5", 0) for j in joints], np.float32) * 1e-3
-    error = [next((e for e in (j.commboard_err, j.jonitboard_err, j.tipboard_err) if e), 0) for j in joints]
-    return HandState(
-        now, sequence, np.array([j.position for j in joints], np.float32),
-        np.array([j.torque for j in joints], np.int16),
-        np.array([j.temperature & 0xFF for j in joints], float), np.array(error, np.int64), tactile,
-        speed if speed.any() else None)  # fmt: skip
+def _import() -> Any:
+    try:
+        from xhand_controller import xhand_control
+    except ImportError as error:
+        raise UserError(
+            "the vendor's package xhand_controller is not installed; get it from the vendor of the hand, or use"
+            f" driver=sim ({error})"
+        ) from None
+    return xhand_control
+
+
+def _enumerate(sdk: Any, kind: str) -> list[str]:
+    return list(sdk.XHandControl().enumerate_devices(kind) or ())
+
+
+def _error(answer: Any) -> tuple[int, str]:
+    """Code and message of an error object; -1 for no answer."""
+    if answer is None:
+        return -1, ""
+    message = str(getattr(answer, "error_message", "") or "")
+    return int(getattr(answer, "error_code", 0)), " ".join(message.split())[:160]
+
+
+def _value(device: Any, name: str, *arguments: Any) -> str:
+    """What the hand says of itself; empty where it does not."""
+    try:
+        answer = getattr(device, name)(*arguments)
+    except Exception:
+        return ""
+    if isinstance(answer, (tuple, list)) and len(answer) == 2 and hasattr(answer[0], "error_code"):
+        return str(answer[1]).strip("\0 ") if answer[0].error_code == 0 else ""
+    return str(answer).strip("\0 ")
+
+
+def _side(said: str) -> str:
+    return {"L": "left", "R": "right"}.get(said[:1].upper(), "")
+
+
+def _whole(raw: Any) -> list[Any] | None:
+    """The joints in their order, None of a frame that is not whole."""
+    if raw is None:
+        return None
+    joints = list(raw.finger_state)
+    order = [int(j.id) for j in joints]
+    return sorted(joints, key=lambda j: int(j.id)) if sorted(order) == list(range(JOINTS)) else None
+
+
+def _int16(values: list[int]) -> np.ndarray:
+    """Two's complement, of packages that give either sign."""
+    return (np.array([int(x) for x in values], np.int64) & 0xFFFF).astype(np.uint16).view(np.int16)

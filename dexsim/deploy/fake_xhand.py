@@ -1,0 +1,384 @@
+"""A strict fake of the vendor's package `xhand_controller`, as far as public drivers of real hands show how it behaves:
+`dexsim deploy driver=xhand port=fake`.
+
+It is as unkind as the package: no call raises (but for arguments of another type, as a native binding does), every one
+returns an error object; a round trip takes 9.6 ms with the tail that was measured; readings come from a cache without a
+stamp, which holds zeros at first; a retry at once after a CRC error sends the firmware into its boot mode. Which hand
+stands behind it is the user's: `LaggingHand`, or the simulated one with its physics.
+
+No fake shows what nobody has published: what the hand does that no driver has met, how stiff the gears are, whether a
+torque limit of 0 makes it limp.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
+from dexsim.errors import UserError
+
+JOINTS, BOARDS, TAXELS = 12, 5, 120
+TRIP, TAIL, MOST, OUTLIER, RARE = 0.00945, 0.00017, 0.0107, 0.111, 1 / 1773
+"""s of a round trip: least, its exponential tail's mean (median 9.57 ms), most but for an outlier, which is so rare."""
+RETRY, BOOTING, REFUSING = 0.05, 4.2, 0.042
+"""s after a CRC error before which another transaction starts the boot mode; its length; s that a refusal takes."""
+CRC, BOOT, NO_SUMS, NO_TAXELS, NO_HAND, CLOSED = 1501070, 1501036, 1501018, 1501019, 1501003, 1501001
+ENCODER_JITTER = 0.0014
+"""rad, of the encoders of a real hand."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Faults that the fake has, times in s since it was opened: crc, torn: shares of frames; board: a taxel board that
+    is dead (-1: none) from board_s on; silent_s: all boards are silent from then on; freeze_s: the bus dies, the cache
+    answers on; abort_s: the native library aborts the process; hang_s: a call never returns; refuse_s: commands are
+    refused with the code `refuse`; unplug_s: the cable is out for two seconds, and the port's number is another then;
+    outlier: share of round trips of 111 ms; opens: how often opening fails first; limp: what makes the hand limp
+    (passive: mode 0, torque: a torque limit of 0, never); sdk: version, 0.10.3 has unsigned currents; side, serial;
+    jitter rad of the encoders; seed."""
+
+    crc: float = 0.0
+    torn: float = 0.0
+    board: int = -1
+    board_s: float = 0.0
+    silent_s: float = float("inf")
+    freeze_s: float = float("inf")
+    abort_s: float = float("inf")
+    hang_s: float = float("inf")
+    refuse_s: float = float("inf")
+    refuse: int = 1501029
+    unplug_s: float = float("inf")
+    outlier: float = RARE
+    opens: int = 0
+    limp: str = "passive"
+    sdk: str = "1.5.2"
+    side: str = "R"
+    serial: str = "FAKE0001"
+    jitter: float = ENCODER_JITTER
+    seed: int = 0
+
+    @classmethod
+    def parse(cls, text: str) -> Faults:
+        """From `crc=0.005,board=2`. Raises UserError."""
+        fields = {f.name: f for f in dataclasses.fields(cls)}
+        changes: dict[str, Any] = {}
+        for part in filter(None, text.split(",")):
+            key, _, value = part.partition("=")
+            if key not in fields:
+                raise UserError(f"port=fake:{text}: '{key}' must be one of {', '.join(fields)}")
+            kind = type(fields[key].default)
+            try:
+                changes[key] = kind(value)
+            except ValueError:
+                raise UserError(f"port=fake:{text}: {key}={value} must be a {kind.__name__}") from None
+        return cls(**changes)
+
+
+class LaggingHand:
+    """Twelve joints that follow their targets with a lag, and draw current as they do; nothing is touched."""
+
+    def __init__(self, start: float = 0.05, lag: float = 0.04):
+        self.q, self.target, self.time = np.full(JOINTS, start), np.full(JOINTS, start), 0.0
+        self.stiff = self.limit = 0.0
+        self.lag, self.push = lag, np.zeros(JOINTS)  # push: rad that somebody holds joints away from their targets
+
+    def command(self, c: HandCommand) -> None:
+        """Takes effect now."""
+        self.target, self.stiff, self.limit = np.array(c.position, float), float(c.kp), float(np.max(c.tor_max))
+
+    def relax(self) -> None:
+        """The motors are off."""
+        self.stiff = 0.0
+
+    def advance(self, t: float) -> None:
+        """Up to time t [s]."""
+        step, self.time = max(t - self.time, 0.0), t
+        if self.stiff > 0 and self.limit > 0:
+            self.q = self.q + (self.target - self.q) * (1 - np.exp(-step / self.lag))
+
+    def state(self, now: float) -> HandState:
+        """As the SDK would give it."""
+        drive = np.clip(20.0 * (self.target - self.q - self.push), -1, 1) * self.limit * (self.stiff > 0)
+        touch = np.zeros((BOARDS, TAXELS, 3), np.int16)
+        return HandState(now, 0, self.q + self.push, np.round(-drive), np.full(JOINTS, 33.0), tactile=touch)
+
+
+class FakeXHand:
+    """The module `xhand_controller.xhand_control`, over a hand (`LaggingHand`, `SimulatedHand`) and a clock."""
+
+    def __init__(self, clock: Clock, make: Callable[[], Any] = LaggingHand, faults: Faults = Faults()):
+        self.clock, self.hand, self.faults = clock, make(), faults
+        self.rng = np.random.default_rng(faults.seed)
+        for k in range(1, 4):
+            self.hand.advance(k * TRIP)  # compiles what is left
+        self.zero = clock.now()
+        self._slip = -self.hand.time
+        self.opened = 0
+        self.trips: list[tuple[float, tuple]] = []  # when a command went over the wire, and what
+        self.HandCommand_t, self.FingerCommand_t = _HandCommand, _FingerCommand
+
+    def XHandControl(self) -> _Control:
+        """A connection."""
+        return _Control(self)
+
+    def seen(self) -> np.ndarray:
+        """The object [9], NaN where the hand behind knows none (not of the package: the simulated world's)."""
+        out = np.full(9, np.nan)
+        for part, name in ((slice(0, 4), "place"), (slice(4, 9), "orientation")):
+            look = getattr(self.hand, name, lambda: None)()
+            if look is not None:
+                out[part] = np.append(look[0], look[1] + self.zero + self._slip)
+        return out
+
+    def handle(self, what: int) -> None:
+        """The object is held out (1) or let go (2), in the simulated world."""
+        if hasattr(self.hand, "present"):
+            (self.hand.present if what == 1 else self.hand.release)()
+
+    @property
+    def time(self) -> float:
+        """s since it was made."""
+        return self.clock.now() - self.zero
+
+    def move(self, t: float) -> HandState:
+        """The hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
+        if t - self._slip - self.hand.time > 0.25:
+            self._slip = t - self.hand.time - TRIP
+        self.hand.advance(t - self._slip)
+        return self.hand.state(t + self.zero)
+
+    def ports(self) -> dict[str, bool]:
+        """Serial ports now, and whether the hand's bus is on it: the other is its auxiliary one."""
+        if self.faults.unplug_s <= self.time < self.faults.unplug_s + 2.0:
+            return {}
+        first = 2 if self.time >= self.faults.unplug_s else 0
+        return {f"/dev/ttyACM{first}": False, f"/dev/ttyACM{first + 1}": True}
+
+
+class _FingerCommand:
+    """A struct of the binding: fields of a type, others are refused."""
+
+    _INTS = {"id": (0, 65535), "kp": (-32768, 32767), "ki": (-32768, 32767), "kd": (-32768, 32767),
+             "tor_max": (-32768, 32767), "mode": (0, 65535), "res0": (0, 65535), "res1": (0, 65535),
+             "res2": (0, 65535), "res3": (0, 65535)}  # fmt: skip
+    __slots__ = (*_INTS, "position")
+
+    def __init__(self, other: _FingerCommand | None = None) -> None:
+        for name in self.__slots__:
+            object.__setattr__(self, name, getattr(other, name, 0.0 if name == "position" else 0))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "position":
+            if not isinstance(value, (int, float)):
+                raise TypeError(f"position: {type(value).__name__} is no float")
+        else:
+            low, high = self._INTS[name]
+            if isinstance(value, float) or not low <= int(value) <= high:
+                raise TypeError(f"{name}: {value!r} is no integer of {low} to {high}")
+        object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, slots=True)
+class _Force:
+    fx: int = 0
+    fy: int = 0
+    fz: int = 0
+
+
+class _HandCommand:
+    def __init__(self, other: _HandCommand | None = None) -> None:
+        fingers = [None] * JOINTS if other is None else other.finger_command
+        self.finger_command = [_FingerCommand(f) for f in fingers]
+
+
+class _Control:
+    """A connection: see the module. One hand, of id 0."""
+
+    def __init__(self, fake: FakeXHand):
+        self._fake, self._port, self._id = fake, "", 0
+        self._last = _HandCommand()  # what is sent again: zeros at first
+        self._cache = self._zeros()
+        self._half: tuple[float, Any] | None = None  # until when the cache is torn, and the whole frame
+        self._code, self._crc_at, self._boot_until = 0, -np.inf, -np.inf
+
+    # -- the package's calls
+    # ---------------------------------------------------------------------------------------------------------------
+    def enumerate_devices(self, kind: str) -> list[str]:
+        """Ports of a kind: RS485."""
+        return list(self._fake.ports()) if kind == "RS485" else []
+
+    def open_serial(self, port: str, baud: int) -> SimpleNamespace:
+        """Error object."""
+        fake = self._fake
+        fake.opened += 1
+        known = fake.ports() | ({"fake": True} if fake.ports() else {})
+        if fake.opened <= fake.faults.opens or port not in known or baud != 3_000_000:
+            return _error(CLOSED, f"cannot open {port}")
+        self._port = port
+        return _error()
+
+    def open_ethercat(self, name: str) -> SimpleNamespace:
+        """Error object: there is none."""
+        return _error(CLOSED, f"no EtherCAT on {name}")
+
+    def list_hands_id(self) -> list[int]:
+        """Ids on the bus; none on the auxiliary port."""
+        return [self._id] if (self._fake.ports() | {"fake": True}).get(self._port) else []
+
+    def get_hand_type(self, hand: int) -> tuple:
+        """(error, L or R)."""
+        return self._said(hand, self._fake.faults.side)
+
+    def get_serial_number(self, hand: int) -> tuple:
+        """(error, text)."""
+        return self._said(hand, self._fake.faults.serial)
+
+    def read_version(self, hand: int, part: int) -> tuple:
+        """(error, text)."""
+        return self._said(hand, "1.3.9")
+
+    def get_sdk_version(self) -> str:
+        """Text alone."""
+        return self._fake.faults.sdk
+
+    def reset_sensor(self, hand: int, sensor: int) -> SimpleNamespace:
+        """Zero a board, 0x11 to 0x15."""
+        dead = self._fake.faults.board == sensor - 0x11
+        return _error() if 0x11 <= sensor <= 0x15 and not dead else _error(NO_TAXELS, f"sensor {sensor:#x}")
+
+    def send_command(self, hand: int, command: _HandCommand) -> SimpleNamespace:
+        """One round trip; error object."""
+        if not isinstance(command, _HandCommand):
+            raise TypeError("send_command(): incompatible function arguments")
+        if not self._port or hand != self._id:
+            return _error(NO_HAND, "no such hand")
+        self._last = _HandCommand(command)
+        return _error(self._trip())
+
+    def read_state(self, hand: int, force_update: bool = False) -> tuple:
+        """(error, state): forced, the last command goes out once more; the cache either way."""
+        if not self._port or hand != self._id:
+            return _error(NO_HAND, "no such hand"), self._zeros()
+        if force_update:
+            self._trip()
+        if self._half is not None and self._fake.clock.now() >= self._half[0]:
+            self._cache, self._half = self._half[1], None
+        return _error(self._code), self._cache  # a frame is not written again once it is there
+
+    def close_device(self) -> None:
+        """The hand keeps its last command."""
+        self._port = ""
+
+    # -- the wire
+    # ---------------------------------------------------------------------------------------------------------------
+    def _said(self, hand: int, value: str) -> tuple:
+        there = bool(self.list_hands_id()) and hand == self._id
+        return (_error(), value) if there else (_error(NO_HAND, "no such hand"), "")
+
+    def _trip(self) -> int:
+        """The command goes out, the state comes back; the code of it."""
+        fake, f = self._fake, self._fake.faults
+        clock, t = fake.clock, fake.time
+        if t >= f.abort_s:
+            os.abort()
+        while t >= f.hang_s:
+            clock.sleep_until(clock.now() + 3600.0)
+        now = clock.now()
+        if now < self._crc_at + RETRY:
+            self._boot_until, self._crc_at = now + BOOTING, -np.inf
+        if now < self._boot_until:
+            clock.sleep_until(now + REFUSING)
+            self._code = BOOT
+            return BOOT
+        if not fake.ports() or not (fake.ports() | {"fake": True}).get(self._port):
+            clock.sleep_until(now + REFUSING)
+            self._code = NO_HAND
+            return NO_HAND
+        dead = t >= f.freeze_s
+        refused = t >= f.refuse_s
+        if not dead and not refused:
+            self._carry()
+        long = OUTLIER if fake.rng.random() < f.outlier else min(TRIP + fake.rng.exponential(TAIL), MOST)
+        if dead:
+            clock.sleep_until(now + long)
+            return 0  # the cache answers on
+        broken = fake.rng.random() < f.crc
+        frame = self._frame(fake.move(t + long), broken)
+        clock.sleep_until(now + long)
+        self._store(frame)
+        if refused:
+            self._code = 0
+            return f.refuse
+        boards = t >= f.silent_s or (f.board >= 0 and t >= f.board_s)
+        self._code = CRC if broken else NO_TAXELS if boards else 0
+        if broken:
+            self._crc_at = clock.now()
+        return self._code
+
+    def _carry(self) -> None:
+        fake, fingers = self._fake, self._last.finger_command
+        mode, kp, limit = fingers[0].mode, fingers[0].kp, np.array([f.tor_max for f in fingers], float)
+        position = np.array([f.position for f in fingers])
+        fake.trips.append((fake.time, (mode, kp, position, limit)))
+        f = fake.faults
+        if mode == PASSIVE and f.limp == "passive" or mode != PASSIVE and not limit.any() and f.limp == "torque":
+            fake.hand.relax()
+        elif mode == POSITION and limit.any():
+            fake.hand.command(HandCommand(position, limit, kp))
+
+    def _frame(self, s: HandState, broken: bool) -> SimpleNamespace:
+        fake, f = self._fake, self._fake.faults
+        unsigned = f.sdk.startswith("0.10")
+        integer = (lambda x: int(round(x)) & 0xFFFF) if unsigned else (lambda x: int(round(x)))
+        frame = self._zeros()
+        speed = s.velocity if s.velocity is not None else np.zeros(JOINTS)
+        noise = f.jitter * fake.rng.standard_normal(JOINTS)
+        for i, j in enumerate(frame.finger_state):
+            j.id, j.position, j.torque = i, float(np.float32(s.position[i] + noise[i])), integer(s.current[i])
+            j.temperature, j.raw_position = 0x0100 | int(s.temperature[i]), int(s.position[i] * 652) & 0xFFF
+            j.default5 = integer(1e3 * speed[i])
+            j.tipboard_err = 307 if broken and i == 2 else 0
+        for k, board in enumerate(frame.sensor_data):
+            if fake.time >= f.silent_s or (k == f.board and fake.time >= f.board_s) or broken:
+                frame.sensor_data[k] = self._cache.sensor_data[k]
+                continue
+            touch = s.tactile[k] if k < len(s.tactile) else np.zeros(3)
+            if touch.any():
+                rows = np.clip(touch, [-128, -128, 0], [127, 127, 255]).astype(int).tolist()
+                total = np.clip(touch.sum(0), [-128, -128, 0], [127, 127, 255]).astype(int).tolist()
+                board.raw_force, board.calc_force = [_Force(*x) for x in rows], _Force(*total)
+            board.temperature = (30 + (fake.rng.random(20) < 0.5)).tolist()
+            board.calc_temperature = 30
+        return frame
+
+    def _store(self, frame: SimpleNamespace) -> None:
+        """The package's thread writes the cache: now, or, of a torn frame, to its end in 1.5 ms."""
+        fake = self._fake
+        self._cache, self._half = frame, None
+        if fake.rng.random() < fake.faults.torn:
+            joints = frame.finger_state[:7] + self._zeros().finger_state[7:]
+            self._cache = SimpleNamespace(finger_state=joints, sensor_data=frame.sensor_data)
+            self._half = fake.clock.now() + 0.0015, frame
+
+    def _zeros(self) -> SimpleNamespace:
+        names = ("id sensor_id position torque raw_position temperature commboard_err jonitboard_err tipboard_err"
+                 " default5 default6 default7").split()  # fmt: skip
+        nothing = [_Force()] * TAXELS
+        return SimpleNamespace(
+            finger_state=[SimpleNamespace(**(dict.fromkeys(names, 0) | {"position": 0.0})) for _ in range(JOINTS)],
+            sensor_data=[
+                SimpleNamespace(calc_force=nothing[0], raw_force=nothing, temperature=[0] * 20, calc_temperature=0)
+                for _ in range(BOARDS)
+            ],
+        )
+
+
+def _error(code: int = 0, message: str = "") -> SimpleNamespace:
+    return SimpleNamespace(error_code=code, error_message=message or ("" if not code else f"code {code}"))
