@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.simulated_hand import SimulatedXHand, choose_gl
 from dexsim.deploy.timing import Timing
-from dexsim.deploy.vendor import VendorXHand
 from dexsim.deploy.vision import CameraPose, FixedPlace, Frame, Vision, centroid
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
@@ -573,69 +571,6 @@ def test_lost_object_keeps_the_last_place():
     assert first[0][2] == pytest.approx(0.1 - behind) and v.place(1.0) is first and v.lost == 1
 
 
-class FakePackage:
-    """The shape of the vendor's module, as its header and samples show it."""
-
-    class _Joint:
-        def __init__(self, i):
-            self.position, self.torque, self.temperature = 0.1 * i, -100 - i, 0x0100 | 35
-            self.commboard_err = self.tipboard_err = 0
-            self.jonitboard_err = 7 if i == 3 else 0
-
-    class HandCommand_t:
-        def __init__(self):
-            self.finger_command = [SimpleNamespace() for _ in range(12)]
-
-    def __init__(self):
-        self.sent, self.closed = [], False
-
-    def XHandControl(self):
-        return self
-
-    def open_serial(self, port, baud):
-        assert baud == 3_000_000
-        return SimpleNamespace(error_code=0 if port == "/dev/good" else 5, error_message="no such port")
-
-    def list_hands_id(self):
-        return [0]
-
-    def send_command(self, hand, command):
-        self.sent.append([vars(f).copy() for f in command.finger_command])
-
-    def read_state(self, hand, again):
-        time.sleep(0.005)
-        taxel = [SimpleNamespace(fx=-k % 100, fy=1, fz=k) for k in range(120)]
-        sensors = [SimpleNamespace(raw_force=taxel) for _ in range(5)]
-        return SimpleNamespace(error_code=0), SimpleNamespace(
-            finger_state=[self._Joint(i) for i in range(12)], sensor_data=sensors
-        )
-
-    def close_device(self):
-        self.closed = True
-
-
-def test_vendor_adapter_passes_fields_on():
-    package = FakePackage()
-    hand = VendorXHand("/dev/good", package=package)
-    hand.open()
-    hand.send(HandCommand(np.arange(12) * 0.01, np.full(12, 300), kp=120))
-    time.sleep(0.1)
-    state = hand.read()
-    assert state.current[2] == -102 and state.position[4] == pytest.approx(0.4) and state.temperature[0] == 35
-    assert state.error[3] == 7 and state.tactile[2, 119].tolist() == [-119 % 100, 1, 119]
-    last = package.sent[-1][5]
-    assert last == {"id": 5, "kp": 120, "ki": 0, "kd": 0, "position": pytest.approx(0.05), "tor_max": 300, "mode": 3}
-    hand.close()
-    assert package.closed and package.sent[-1][5]["mode"] == 0
-    with pytest.raises(UserError, match="no such port"):
-        VendorXHand("/dev/bad", package=package).open()
-
-
-def test_vendor_package_is_only_imported_when_used():
-    with pytest.raises(UserError, match="xhand_controller is not installed"):
-        VendorXHand("/dev/ttyUSB0").open()
-
-
 def test_timing_percentiles():
     t = Timing(2000)
     t._rows[:1000, 0] = 1e-3
@@ -652,7 +587,9 @@ def test_timing_percentiles():
 def test_command_line(made, capsys):
     for arguments, says in (
         (["bundle=nowhere"], "manifest"),
-        ([f"bundle={made[0]}", "driver=xhand"], "port="),
+        ([f"bundle={made[0]}", "driver=xhand"], "place="),
+        ([f"bundle={made[0]}", "driver=xhand", "port=fake:crx=1"], "crx"),
+        ([f"bundle={made[0]}", "driver=xhand", "port=/dev/ttyACM0", "seed=1"], "seed=1: driver=xhand does not use it"),
         (["sedonds=3"], "sedonds"),
         ([f"bundle={made[0]}", "seconds=abc"], "seconds=abc"),
         ([f"bundle={made[0]}", "driver=x"], "driver=x"),

@@ -20,18 +20,17 @@ import numpy as np
 import pytest
 import torch
 from bundles import make_checkpoint
-from test_deploy import FakeHand, FakePackage, recorder_at
+from test_deploy import FakeHand, recorder_at
 
 from dexsim import export, system
 from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import _Stop
 from dexsim.deploy import bundle
-from dexsim.deploy.driver import PASSIVE, HandCommand, VirtualClock
+from dexsim.deploy.driver import PASSIVE, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import LIMITS, Loop, LoopSettings
 from dexsim.deploy.safety import Guard
-from dexsim.deploy.vendor import VendorXHand
 from dexsim.deploy.vision import FixedPlace
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
@@ -473,7 +472,7 @@ def test_a_signal_relaxes_and_those_after_it_change_nothing(b, number, tmp_path)
     rec = recorder_at(tmp_path / "run.mcap")
     with _Stop() as stop:
         report = run(b, hand, recorder=rec)
-    assert stop.status == 128 + number and report.ended == f"stopped by {system.stop_signals()[number]}"
+    assert stop.status == 128 + number and report.ended == f"stopped by {system.hand_signals()[number]}"
     assert hand.relaxed_at[0] - hand.hit < 0.02 and report.acts > 10 and not rec.writer._open
 
 
@@ -506,46 +505,6 @@ def test_a_terminal_that_goes_away_leaves_a_relaxed_hand_and_a_whole_recording(b
     out, _ = p.communicate(timeout=60)
     assert p.returncode == 129 and "stopped by SIGHUP" in out and "the hand is relaxed" in out
     assert not [f for f in read(path, audit=False).findings if f.kind == "damage"]
-
-
-# -- the vendor's bus
-# -------------------------------------------------------------------------------------------------------------
-def test_a_bus_that_fails_for_a_while_still_carries_the_command_to_relax():
-    package = FakePackage()
-    send, failing = package.send_command, threading.Event()
-
-    def broken(hand, command):
-        if failing.is_set():
-            raise OSError("bus")
-        send(hand, command)
-
-    package.send_command = broken
-    hand = VendorXHand("/dev/good", package=package)
-    hand.open()
-    hand.send(HandCommand(np.zeros(12), np.full(12, 300)))
-    time.sleep(0.05)
-    failing.set()
-    hand.relax()
-    time.sleep(0.05)
-    assert package.sent[-1][0]["mode"] == 3 and hand.bad_reads > 3
-    failing.clear()
-    hand.close()
-    assert package.sent[-1][0]["mode"] == 0 and package.closed
-
-
-def test_a_bus_that_never_carries_it_is_said(monkeypatch):
-    monkeypatch.setattr("dexsim.deploy.vendor.CLOSE", 0.1)
-    package = FakePackage()
-    hand = VendorXHand("/dev/good", package=package)
-
-    def broken(*_):
-        raise OSError("cable")
-
-    package.send_command = broken
-    hand.open()
-    with pytest.raises(UserError, match="did not carry the command to relax.*cable.*cut the hand's power"):
-        hand.close()
-    assert package.closed
 
 
 # -- the IMU's port

@@ -1,364 +1,402 @@
-"""The hand model against the measured figures (typed in here), its lattice, its hulls and its collision filter."""
+"""The xHand's driver against a strict fake of the vendor's package: one test for each thing that the package does and
+that a driver must know. In virtual time, but for what only processes show."""
 
 from __future__ import annotations
 
-import csv
-import shutil
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
 
-import mujoco
 import numpy as np
 import pytest
-import trimesh
+import torch
+from bundles import make_checkpoint
 
-from dexsim.assets import xhand
-from dexsim.assets.xhand import build
-from dexsim.assets.xhand.surface import PADS, Lattice, to_link, to_sensor
+from dexsim import export
+from dexsim.calibration.file import Calibration
+from dexsim.deploy import bundle
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, VirtualClock
+from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
+from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.vendor import VendorXHand, XHandBus
+from dexsim.deploy.vision import FixedPlace
+from dexsim.errors import UserError
 
-# Measured: mass (kg), com (m), ixx iyy izz ixy ixz iyz (kg m^2) of the moving links alone, link frame.
-LINKS = {
-    "right_hand_link": (0.53851506, (0.0100351, -0.0036684, 0.0582695),
-                        (6.4186e-4, 4.6434e-4, 2.7538e-4, 2e-8, -2.17e-6, 5.134e-5)),
-    "right_hand_thumb_bend_link": (0.01151453, (-0.0011653, 0.0144359, 0.0000541),
-                                   (1.55e-6, 6.2e-7, 1.57e-6, -3e-8, 1e-11, 7e-8)),
-    "right_hand_thumb_rota_link1": (0.1322853, (-0.0003618, 0.0287681, 0.0013393),
-                                    (3.665e-5, 1.694e-5, 4.358e-5, -7.88e-6, 1.98e-6, 1.85e-6)),
-    "right_hand_thumb_rota_link2": (0.03516871, (-0.0008816, 0.022534, 0.0006146),
-                                    (7.79e-6, 3.5e-6, 8.96e-6, -2e-8, 3.4e-7, -1.8e-7)),
-    "right_hand_index_bend_link": (0.068721, (-0.0007159, 0.000119, 0.0111903),
-                                   (1.643e-5, 1.707e-5, 3.43e-6, 1e-11, 1.3e-7, -1.1e-7)),
-    "right_hand_index_rota_link1": (0.06298297, (0.0006329, 0.000133, 0.0355869),
-                                    (1.686e-5, 1.738e-5, 3.2e-6, 1e-11, -1.9e-7, -2.8e-7)),
-    "right_hand_index_rota_link2": (0.01582395, (0.0011991, -0.0002484, 0.021379),
-                                    (2.83e-6, 2.77e-6, 8.5e-7, 1e-11, -7e-8, -1.2e-7)),
-}  # fmt: skip
-for _finger in ("mid", "ring", "pinky"):
-    LINKS[f"right_hand_{_finger}_link1"] = (0.06298297, (0.0005304, 0.0000358, 0.0332785),
-                                            (1.681e-5, 1.738e-5, 3.25e-6, 1e-11, -8.7e-7, -2.8e-7))  # fmt: skip
-    LINKS[f"right_hand_{_finger}_link2"] = (0.01582395, (0.0011991, -0.0002484, 0.021379),
-                                            (2.87e-6, 2.83e-6, 8.7e-7, -1e-8, -1.9e-7, -1.2e-7))  # fmt: skip
-CLUSTER_MASS = {
-    "right_hand_link": 0.53852073, "right_hand_thumb_bend_link": 0.01151453, "right_hand_thumb_rota_link1": 0.13228536,
-    "right_hand_thumb_rota_link2": 0.0351744, "right_hand_index_bend_link": 0.068721,
-    "right_hand_index_rota_link1": 0.06298299, "right_hand_index_rota_link2": 0.01582961,
-}  # fmt: skip
-# Measured tip positions at zero in the root link's frame (x out of the palm, y to the thumb, z along the fingers), m.
-TIPS = {
-    "palm": (0, 0, 0.065),
-    "tip_thumb": (0.022111, 0.156839, 0.02872),
-    "tip_index": (0.0065, 0.0265, 0.205748),
-    "tip_mid": (0.0065, 0.004, 0.206248),
-    "tip_ring": (0.0065, -0.016, 0.203248),
-    "tip_pinky": (0.0065, -0.036, 0.200248),
-}
-STRONG, WEAK = (1.1, 8.63), (0.4, 14.38)
-JOINTS = [
-    ("thumb_bend_joint", 0.0, 1.832, STRONG), ("thumb_rota_joint1", -0.698, 1.57, STRONG),
-    ("thumb_rota_joint2", 0.0, 1.57, WEAK), ("index_bend_joint", -0.174, 0.174, WEAK),
-    ("index_joint1", 0.0, 1.919, STRONG), ("index_joint2", 0.0, 1.919, WEAK),
-    ("mid_joint1", 0.0, 1.919, STRONG), ("mid_joint2", 0.0, 1.919, WEAK),
-    ("ring_joint1", 0.0, 1.919, STRONG), ("ring_joint2", 0.0, 1.919, WEAK),
-    ("pinky_joint1", 0.0, 1.919, STRONG), ("pinky_joint2", 0.0, 1.919, WEAK),
-]  # fmt: skip
-AREA = {"thumb": 1243.8e-6, "finger": 719.18e-6}
-MIRROR = {"thumb": 0, "finger": 1}  # link axis that changes sign
-FINGER_OF = {"thumb": "thumb", "finger": "index"}
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")
-def model():
-    return mujoco.MjModel.from_xml_path(str(xhand.xml_path()))
+def b(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("xhand")
+    return bundle.load(export.export(str(make_checkpoint(folder / "policy.pt")), folder / "out", steps=2))
 
 
-@pytest.fixture()
-def data(model):
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return data
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """One hand model for all loops here, and no collection of torch's whole heap before each."""
+    from dexsim.deploy import loop, measure
+
+    with pytest.MonkeyPatch.context() as patch:
+        model = measure.HandKinematics()
+        patch.setattr(measure, "HandKinematics", lambda hand: model)
+        patch.setattr(loop.gc, "collect", lambda: 0)
+        yield
 
 
-def lattice(pad: str) -> np.ndarray:
-    return xhand.taxel_table(FINGER_OF[pad])["position"].reshape(xhand.COLUMNS, xhand.ROWS, 3)
+def driver(clock=None, hand=LaggingHand, port="auto", serial=None, side="right", hang=0.15, **faults):
+    package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0} | faults))
+    return VendorXHand(port, clock, package, serial, side, hang)
 
 
-def surface(pad: str) -> Lattice:
-    return Lattice(to_sensor(lattice(pad), PADS[pad]))
+class Watched(Loop):
+    """Remembers when the policy began and when the hand was let go; what it said."""
+
+    began = relaxed = None
+
+    def _begin_run(self, now):
+        self.began = now
+        super()._begin_run(now)
+
+    def _let_go(self, lock=True):
+        self.relaxed = self.relaxed or self.clock.now()
+        super()._let_go(lock)
 
 
-def geom_mesh(model, name: str) -> trimesh.Trimesh:
-    """Convex hull of a mesh geom in its body's frame, as the physics sees it."""
-    geom = model.geom(name).id
-    mesh = model.geom_dataid[geom]
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    vertices = model.mesh_vert[first : first + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-    return trimesh.convex.convex_hull(vertices)
+def run(b, hand=LaggingHand, port="auto", settings=None, **faults):
+    """A run of the policy in virtual time: (report, loop, fake, what was said)."""
+    said = []
+    d = driver(VirtualClock(50.0), hand, port, **faults)
+    loop = Watched(b, d, FixedPlace([0.055, 0.0, 0.04]), Calibration.default(),
+                   LoopSettings(**{"seconds": 1.5, "tor_max": 300.0, "home_speed": 3.0} | (settings or {})),
+                   d.clock, say=said.append)  # fmt: skip
+    report = loop.run()
+    return report, loop, d.body._sdk, said
 
 
-def distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Unsigned distance of points to a small mesh by brute force."""
-    triangles = mesh.triangles
-    closest = trimesh.triangles.closest_point(
-        np.tile(triangles, (len(points), 1, 1)), np.repeat(points, len(triangles), axis=0)
-    )
-    gap = np.linalg.norm(closest - np.repeat(points, len(triangles), axis=0), axis=1)
-    return gap.reshape(len(points), -1).min(axis=1)
+def since(fake, loop, t):
+    """s from a fault's time until the hand was let go."""
+    return loop.relaxed - (fake.zero + t)
 
 
-def inertia_in_link_axes(model, body: int) -> np.ndarray:
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
-    rotation = rotation.reshape(3, 3)
-    return rotation @ np.diag(model.body_inertia[body]) @ rotation.T
+# -- cycles and commands
+# --------------------------------------------------------------------------------------------------------------------
+def test_a_cycle_is_one_round_trip(b):
+    report, loop, fake, _ = run(b)
+    t = np.array([t for t, _ in fake.trips])
+    cycles = np.diff(t[(t > loop.began - fake.zero) & (t < loop.relaxed - fake.zero)])
+    assert report.ended == "done" and 0.0094 < np.median(cycles) < 0.0099 and cycles.max() < 0.012
 
 
-def test_total_mass_and_body_count(model):
-    assert model.body_mass.sum() == pytest.approx(1.1014664, abs=1e-6)
-    assert model.nbody - 1 == 13 == len(LINKS)
-    for name, mass in CLUSTER_MASS.items():
-        assert model.body(name).mass[0] == pytest.approx(mass, abs=2e-8)
+@pytest.mark.parametrize("start", [0.0, 0.9])
+def test_homing_begins_where_the_hand_is_not_from_the_zeros_of_the_cache(b, start):
+    _, _, fake, _ = run(b, partial(LaggingHand, start=start))
+    mode, _, first, _ = next(c for _, c in fake.trips if c[0] == POSITION)
+    assert np.abs(first[[0, 1, 2, 4, 5, 6]] - start).max() < 0.02 and mode == POSITION
+    before = [c for _, c in fake.trips[: [c[0] for _, c in fake.trips].index(POSITION)]]
+    assert len(before) >= 3 and not any(c[3].any() for c in before), "until then nothing drives"
 
 
-@pytest.mark.parametrize("name", LINKS)
-def test_body_inertials(model, name):
-    mass, com, (ixx, iyy, izz, ixy, ixz, iyz) = LINKS[name]
-    body = model.body(name).id
-    # Folding the tip marker in (6 mg, up to 28 mm off) moves the centre by < 10 um, the inertia by < 5e-9.
-    assert model.body_mass[body] == pytest.approx(mass, abs=6e-6)
-    np.testing.assert_allclose(model.body_ipos[body], com, atol=1e-5)
-    expected = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    np.testing.assert_allclose(inertia_in_link_axes(model, body), expected, atol=5e-9)
+@pytest.mark.parametrize("code", [1501029, 1501030, 1501028])
+def test_a_refused_command_ends_the_run_and_is_not_called_relaxed(b, code):
+    report, loop, fake, said = run(b, refuse_s=1.2, refuse=code)
+    assert ("too warm" if code == 1501028 else "refuses") in report.ended and str(code) in report.ended
+    assert since(fake, loop, 1.2) < 0.15 and report.not_relaxed and "DANGER" in " ".join(said)
 
 
-@pytest.mark.parametrize("site", TIPS)
-def test_tip_positions_at_zero(data, site):
-    x, y, z = TIPS[site]
-    np.testing.assert_allclose(data.site(site).xpos, (z - 0.065, -y, x), atol=1e-4)
+@pytest.mark.parametrize("code", [1501018, 1501019, 1501020, 1501035])
+def test_codes_that_are_not_refusals_are_none(b, code):
+    assert run(b, refuse_s=0.5, refuse=code)[0].ended == "done"
 
 
-def test_world_frame_is_the_palm_frame(data):
-    np.testing.assert_allclose(data.site("palm").xmat.reshape(3, 3), np.eye(3), atol=1e-9)
+# -- the cache
+# --------------------------------------------------------------------------------------------------------------------
+def test_a_bus_that_died_behind_its_cache_is_seen(b):
+    report, loop, fake, _ = run(b, freeze_s=1.3)
+    assert "bus is dead" in report.ended and since(fake, loop, 1.3) < 0.15 and "dead" in report.not_relaxed
 
 
-def test_joints_limits_efforts_speeds_in_sdk_order(model):
-    names = [name for name, *_ in JOINTS]
-    assert [model.joint(i).name for i in range(model.njnt)] == names == list(xhand.JOINTS)
-    limits = np.array([(low, high) for _, low, high, _ in JOINTS])
-    np.testing.assert_allclose(model.jnt_range, limits)
-    np.testing.assert_allclose(xhand.joint_limits(), limits)
-    assert model.jnt_limited.all()
-    np.testing.assert_allclose(xhand.efforts(), [kind[0] for *_, kind in JOINTS])
-    np.testing.assert_allclose(xhand.speeds(), [kind[1] for *_, kind in JOINTS])
-    np.testing.assert_allclose(model.dof_armature, [{1.1: 5e-4, 0.4: 2e-4}[kind[0]] for *_, kind in JOINTS])
-    assert model.nu == 0
+def test_the_same_of_encoders_without_jitter_shows_when_targets_move(b):
+    report, loop, fake, _ = run(b, freeze_s=0.25, jitter=0.0)
+    assert "no bit of the readings has changed" in report.ended and since(fake, loop, 0.25) < 0.45
+    assert report.not_relaxed, "and what it says of being limp is not believed"
 
 
-def test_joint_axes_move_the_tips_the_measured_way(model, data):
-    """Flexion lifts the tip out of the palm; the index swings to the thumb; the thumb bends up out
-    of the palm and its two other joints close it in the direction of the fingers (its pad faces them at zero)."""
-    start = {site: data.site(site).xpos.copy() for site in TIPS}
-    moves = [(4, "tip_index", 2, 1), (5, "tip_index", 2, 1), (6, "tip_mid", 2, 1), (7, "tip_mid", 2, 1),
-             (8, "tip_ring", 2, 1), (9, "tip_ring", 2, 1), (10, "tip_pinky", 2, 1), (11, "tip_pinky", 2, 1),
-             (1, "tip_thumb", 0, 1), (2, "tip_thumb", 0, 1),
-             (3, "tip_index", 1, -1), (0, "tip_thumb", 2, 1)]  # fmt: skip
-    for joint, site, axis, sign in moves:
-        data.qpos[:] = 0
-        data.qpos[joint] = 0.15
-        mujoco.mj_forward(model, data)
-        moved = (data.site(site).xpos - start[site])[axis] * sign
-        assert moved > 0.003, (xhand.JOINTS[joint], moved)
+def test_a_resting_hand_without_jitter_is_not_taken_for_a_dead_bus(b):
+    assert run(b, jitter=0.0)[0].ended == "done"
 
 
-def test_no_self_contact_at_rest(model, data):
-    assert data.ncon == 0
+@pytest.mark.parametrize("share", [0.02, 0.3])
+def test_torn_frames_are_not_taken(b, share):
+    report, loop, _, _ = run(b, torn=share)
+    assert report.ended == "done"
+    seen = []
+    d = driver(VirtualClock(1.0), partial(LaggingHand, start=0.15), torn=share)
+    d.open()
+    for _ in range(200):
+        d.clock.sleep_until(d.clock.now() + 0.01)
+        seen.append(d.read().position)
+    assert np.abs(np.stack(seen) - 0.15).max() < 0.02
 
 
-def test_unrelated_collision_geoms_do_not_overlap_at_rest(model, data):
-    """Whatever the filter says: geoms of bodies that are neither equal nor neighbours keep clear of each other."""
-    geoms = [g for g in range(model.ngeom) if model.geom_contype[g]]
-    chain = lambda b: {b, model.body_parentid[b]}  # noqa: E731
-    checked = 0
-    for i, a in enumerate(geoms):
-        for b in geoms[:i]:
-            bodies = model.geom_bodyid[a], model.geom_bodyid[b]
-            if bodies[0] in chain(bodies[1]) or bodies[1] in chain(bodies[0]):
-                continue
-            if 1 in bodies:  # the palm holds the roots of the index and the thumb
-                other = max(bodies)
-                if model.body(other).name in ("right_hand_index_rota_link1", "right_hand_thumb_rota_link1"):
-                    continue
-            gap = mujoco.mj_geomDistance(model, data, a, b, 0.1, None)
-            assert gap > 0, (model.geom(a).name, model.geom(b).name, gap)
-            checked += 1
-    assert checked > 150
+def test_two_signs_of_integers(b):
+    class Drawing(LaggingHand):
+        def state(self, now):
+            state = super().state(now)
+            state.current, state.velocity = np.full(12, -536.0), np.full(12, -0.25)
+            return state
+
+    for sdk in ("0.10.3", "1.5.2"):
+        d = driver(VirtualClock(1.0), Drawing, sdk=sdk)
+        d.open()
+        d.clock.sleep_until(d.clock.now() + 0.03)
+        state = d.read()
+        assert (state.current == -536).all() and state.current.dtype == np.int16
+        np.testing.assert_allclose(state.velocity, -0.25)
 
 
-def test_only_capsules_and_one_small_hull_per_tip_collide(model):
-    colliding = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
-    tips = [g for g in colliding if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH]
-    assert sorted(model.geom(g).name for g in tips) == sorted(xhand.TIP_GEOMS)
-    for g in colliding:
-        if g in tips:
-            assert model.mesh_vertnum[model.geom_dataid[g]] <= 64
-            assert model.geom_priority[g] == 1 and model.geom_condim[g] == 4
-        else:
-            assert model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE
-            assert model.geom(g).name.startswith(("col_", "self_"))
-        proxy = model.geom(g).name.startswith("self_")  # meets the hand, not the object
-        assert bool(model.geom_contype[g] & xhand.HAND_BIT) != proxy
-        assert bool(model.geom_conaffinity[g] & xhand.OBJECT_BIT) != proxy
-    bodies = [model.body(model.geom_bodyid[model.geom(name).id]).name for name in xhand.TIP_GEOMS]
-    assert bodies == list(xhand.TIP_BODIES)
+# -- touch and CRC
+# --------------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("at", [0.0, 1.2])
+def test_a_dead_taxel_board_is_said_and_the_hand_plays_on(b, at):
+    report, _, _, said = run(b, board=2, board_s=at)
+    assert report.ended == "done" and report.counts["silent_mid"] > 50 and "mid" in " ".join(said)
+    assert not [k for k in report.counts if k.startswith("silent_") and k != "silent_mid"]
 
 
-def test_self_collision_pairs_are_the_meant_ones(model):
-    """42 pairs: finger tips 6, thumb tip (2 proxies) on finger tips 8, on finger links 8 and palm 8, thumb links on
-    tips 12."""
-    colliding = [g for g in range(model.ngeom) if model.geom_contype[g]]
-    count = 0
-    for i, a in enumerate(colliding):
-        for b in colliding[:i]:
-            x, y = model.geom_bodyid[a], model.geom_bodyid[b]
-            if x == y or model.body_parentid[x] == y or model.body_parentid[y] == x:
-                continue
-            if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
-                count += 1
-                names = {model.geom(a).name, model.geom(b).name}
-                assert any(name.startswith("self_") for name in names), names
-    assert count == 42
+def test_the_boards_that_live_are_felt_beside_a_dead_one():
+    class Touched(LaggingHand):
+        def state(self, now):
+            state = super().state(now)
+            state.tactile[:, 7, 2] = 10 + int(1e3 * now) % 5
+            return state
+
+    d = driver(VirtualClock(1.0), Touched, board=2)
+    d.open()
+    for _ in range(30):
+        d.clock.sleep_until(d.clock.now() + 0.01)
+        state = d.read()
+    assert (state.tactile[[0, 1, 3, 4], 7, 2] >= 10).all() and not state.tactile[2].any()
+    assert state.silent.tolist() == [False, False, True, False, False]
 
 
-def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
-    spec = xhand.hand_spec()
-    body = spec.worldbody.add_body(name="ball", pos=[0.0762, -0.0265, 0.0365])
-    body.add_freejoint()
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], contype=xhand.OBJECT_BIT,
-                  conaffinity=xhand.HAND_BIT)  # fmt: skip
-    with_ball = spec.compile()
-    data = mujoco.MjData(with_ball)
-    targets = [
-        g
-        for g in range(with_ball.ngeom)
-        if with_ball.geom_contype[g] & xhand.HAND_BIT and with_ball.geom_bodyid[g] < 14
-    ]
-    for g in targets:
-        data.qpos[:] = 0
-        mujoco.mj_forward(with_ball, data)
-        data.qpos[12:15] = data.geom_xpos[g]
-        data.qpos[15] = 1
-        mujoco.mj_forward(with_ball, data)
-        touched = {with_ball.geom(c).name for pair in data.contact.geom for c in pair}
-        assert with_ball.geom(g).name in touched
+def test_all_boards_silent_lets_go(b):
+    report, loop, fake, _ = run(b, silent_s=1.2)
+    assert "no taxel board" in report.ended and 0.09 < since(fake, loop, 1.2) < 0.15 and report.limp
 
 
-def test_capsules_stay_within_the_measured_bounds(model):
-    """Every capsule lies inside its link's bounds to 1 mm (they are fitted to them)."""
-    with open(xhand.FOLDER / "bodies.csv", encoding="ascii") as f:
-        bounds = {row["body"]: row for row in csv.DictReader(f)}
-    for g in range(model.ngeom):
-        if not model.geom(g).name.startswith("col_"):
-            continue
-        row = bounds[model.body(model.geom_bodyid[g]).name]
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
-        half = rotation.reshape(3, 3)[:, 2] * model.geom_size[g, 1]
-        reach = np.abs(half) + model.geom_size[g, 0]
-        low = [float(row[f"min_{c}"]) for c in "xyz"]
-        high = [float(row[f"max_{c}"]) for c in "xyz"]
-        assert (model.geom_pos[g] - reach > np.array(low) - 0.001).all(), model.geom(g).name
-        assert (model.geom_pos[g] + reach < np.array(high) + 0.001).all(), model.geom(g).name
+@pytest.mark.parametrize("share", [0.005, 0.05])
+def test_crc_errors_cost_a_pause_and_no_boot_mode(b, share):
+    report, _, fake, _ = run(b, crc=share, settings={"seconds": 4.0}, seed=3)
+    t = np.array([t for t, _ in fake.trips])
+    assert report.ended == "done" and np.diff(t).max() < 0.09
+    if share > 0.01:
+        assert (np.diff(t) > 0.05).sum() > 5, "it had some, and waited after each"
+    assert not report.counts["error_codes"], "a tip board's code in a broken frame is no fault of the joint"
 
 
-@pytest.mark.parametrize("pad", PADS)
-def test_lattice_is_mirror_symmetric(pad):
-    finger = FINGER_OF[pad]
-    flip = np.ones(3)
-    flip[MIRROR[pad]] = -1
-    table = xhand.taxel_table(finger)
-    shape = (xhand.COLUMNS, xhand.ROWS, 3)
-    np.testing.assert_allclose(table["position"].reshape(shape)[::-1] * flip, lattice(pad), atol=1e-9)
-    np.testing.assert_allclose(table["normal"].reshape(shape)[::-1] * flip, table["normal"].reshape(shape), atol=2e-6)
-    np.testing.assert_allclose(table["tangent"].reshape(shape)[::-1] * -flip, table["tangent"].reshape(shape),
-                               atol=2e-6)  # fmt: skip
-    np.testing.assert_allclose(table["area"].reshape(10, 12)[::-1], table["area"].reshape(10, 12), rtol=1e-5)
+def test_a_retry_at_once_would_have_started_the_boot_mode():
+    """The fake is as unkind as the firmware: the old way of going on at once meets it."""
+    clock = VirtualClock(0.0)
+    fake = FakeXHand(clock, faults=Faults(crc=1.0, outlier=0.0))
+    device = fake.XHandControl()
+    device.open_serial("fake", 3_000_000)
+    codes = [device.send_command(0, fake.HandCommand_t()).error_code]
+    fake.faults = Faults(outlier=0.0)
+    codes += [device.send_command(0, fake.HandCommand_t()).error_code for _ in range(120)]
+    assert codes[0] == 1501070 and codes[1] == 1501036 and 95 < codes.count(1501036) < 105
 
 
-def test_measured_taxel_points():
-    """A few points of the measured lists, so that the order k = column * 12 + row is fixed (m, link frame)."""
-    thumb, finger = xhand.taxel_table("thumb")["position"], xhand.taxel_table("ring")["position"]
-    assert thumb.shape == finger.shape == (120, 3)
-    np.testing.assert_allclose(thumb[0], (-0.01488, 0.01984, -0.00134), atol=1e-9)
-    np.testing.assert_allclose(thumb[4 * 12 + 11], (-0.00086, 0.05087, -0.00271), atol=1e-9)
-    np.testing.assert_allclose(finger[2 * 12 + 5], (0.00744, -0.00677, 0.0304), atol=1e-9)
-    np.testing.assert_allclose(finger[9 * 12], (0.0004, 0.00832, 0.01809), atol=1e-9)
+def test_the_measured_tail_with_its_outliers_is_lived_through(b):
+    report, _, fake, _ = run(b, outlier=0.01, settings={"seconds": 3.0}, seed=1)
+    t = np.array([t for t, _ in fake.trips])
+    assert report.ended == "done" and np.diff(t).max() > 0.11
 
 
-@pytest.mark.parametrize("pad", PADS)
-def test_areas_sum_to_the_lattice_area(pad):
-    area = xhand.taxel_table(FINGER_OF[pad])["area"]
-    assert area.min() > 0
-    assert area.sum() == pytest.approx(AREA[pad], rel=0.01)
+# -- opening
+# --------------------------------------------------------------------------------------------------------------------
+def opened(**kw):
+    d = driver(VirtualClock(1.0), **kw)
+    return d, d.open()
 
 
-@pytest.mark.parametrize("pad", PADS)
-def test_normals_are_unit_outward_and_smooth(pad):
-    table = xhand.taxel_table(FINGER_OF[pad])
-    normal, tangent, points = table["normal"], table["tangent"], table["position"]
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=2e-6)
-    np.testing.assert_allclose(np.linalg.norm(tangent, axis=1), 1, atol=2e-6)
-    np.testing.assert_allclose((normal * tangent).sum(axis=1), 0, atol=3e-6)
-    # Outward: every taxel's tangent plane has all other taxels on its inner side (the pad is convex) to 0.5 mm.
-    side = ((points[None] - points[:, None]) * normal[:, None]).sum(axis=-1)
-    assert side.max() < 5e-4
-    grid = normal.reshape(xhand.COLUMNS, xhand.ROWS, 3)
-    turn = np.degrees(np.arccos(np.clip((grid[:, 1:] * grid[:, :-1]).sum(-1), -1, 1)))
-    assert turn.max() < 35
+def test_versions_and_names_are_logged_and_the_auxiliary_port_is_passed_over():
+    d, info = opened(serial="FAKE0001")
+    assert info["port"] == "/dev/ttyACM1" and info["serial"] == "FAKE0001" and info["side"] == "right"
+    assert info["sdk"] == "1.5.2" and info["firmware"] == "1.3.9"
+    with pytest.raises(UserError, match="/dev/ttyACM0 opens and lists no hand.*port=auto"):
+        opened(port="/dev/ttyACM0")
+    with pytest.raises(UserError, match="has hand FAKE0001, not OTHER"):
+        opened(serial="OTHER")
 
 
-def test_taxel_axes_on_the_flat_of_the_pad():
-    """Mid-pad the taxel frame is the sensor's: thumb (x, y, z) = link (x, y, z), finger = link (y, z, x)."""
-    for finger, x_axis, z_axis in (("thumb", (1, 0, 0), (0, 0, 1)), ("mid", (0, 1, 0), (1, 0, 0))):
-        table = xhand.taxel_table(finger)
-        k = 4 * 12 + 1
-        assert table["tangent"][k] @ x_axis > 0.99
-        assert table["normal"][k] @ z_axis > 0.98
+def test_a_left_hand_under_a_right_policy_is_refused():
+    with pytest.raises(UserError, match="left hand, the policy is for a right one"):
+        driver(VirtualClock(1.0), **{"side": "right"}).__class__(
+            "auto", VirtualClock(1.0), partial(FakeXHand, faults=Faults(side="L")), None, "right"
+        ).open()
 
 
-@pytest.mark.parametrize("pad", PADS)
-def test_collision_hull_follows_the_skin(model, pad):
-    hull = geom_mesh(model, f"tip_{FINGER_OF[pad]}")
-    skin = surface(pad)
-    u, v = skin.grid(41, 49)
-    fine = to_link(skin.position(u, v).reshape(-1, 3), PADS[pad])
-    # the mesh is the tip shrunk by the geom's margin: the contact surface lies that far outside it
-    margin = model.geom_margin[model.geom(f"tip_{FINGER_OF[pad]}").id]
-    assert margin == pytest.approx(0.0015)
-    assert np.abs(distance(hull, lattice(pad).reshape(-1, 3)) - margin).max() <= 3e-4
-    assert np.abs(distance(hull, fine) - margin).max() <= 3e-4
-    assert hull.is_watertight and 2e-6 < hull.volume < 3e-5  # it closes the back
+def test_opening_is_tried_three_times():
+    before = time.perf_counter()
+    d, _ = opened(opens=4)  # two ports a try
+    assert 5.0 < d.clock.now() < 7.0 and time.perf_counter() - before < 2.0
+    with pytest.raises(UserError, match="does not open"):
+        opened(opens=6)
 
 
-@pytest.mark.parametrize("finger", xhand.FINGERS)
-def test_skin_mesh_is_closed_and_passes_through_the_taxels(finger):
-    vertices, faces = xhand.tip_skin_mesh(finger)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_convex and mesh.volume > 4e-6
-    offset = (mesh.face_normals * mesh.triangles[:, 0]).sum(axis=1)
-    plane = xhand.taxel_table(finger)["position"] @ mesh.face_normals.T - offset
-    assert abs(plane.max(axis=1)).max() < 1e-4  # signed distance to a convex solid
+def test_a_hand_that_is_plugged_in_again_is_found_at_its_new_port():
+    d, _ = opened(unplug_s=1.0)
+    while not d.problem() and d.clock.now() < 5.0:
+        d.send(HandCommand(np.full(12, 0.1), np.full(12, 300)))
+        d.clock.sleep_until(d.clock.now() + 0.01)
+        d.read()
+    assert "refuses" in d.problem()
+    clock = d.body.clock
+    clock.sleep_until(d.body._sdk.zero + 3.1)
+    bus = XHandBus(clock, "auto", "FAKE0001", "right", lambda clock: d.body._sdk)
+    assert bus.open()["port"] == "/dev/ttyACM3"
 
 
-def test_tables_agree_with_the_generator(tmp_path, monkeypatch):
-    """The committed files are what build.py writes."""
-    before = {p.name: p.read_text() for p in xhand.FOLDER.glob("*.*") if p.suffix in (".csv", ".xml")}
-    for name in before:
-        shutil.copy(xhand.FOLDER / name, tmp_path / name)
-    monkeypatch.setattr(xhand, "FOLDER", tmp_path)
-    build.build()
-    numbers = lambda text: np.array(  # noqa: E731
-        [float(t) for t in text.replace('"', " ").replace(",", " ").split() if t.replace(".", "").lstrip("-").isdigit()]
-    )
-    for name, text in before.items():
-        after = (tmp_path / name).read_text()
-        assert len(after) == len(text)
-        np.testing.assert_allclose(numbers(after), numbers(text), atol=2e-6)
+def test_without_the_package_it_is_said():
+    with pytest.raises(UserError, match="xhand_controller is not installed"):
+        VendorXHand("/dev/ttyACM0").open()
+
+
+# -- letting go
+# --------------------------------------------------------------------------------------------------------------------
+Pressing = partial(LaggingHand, start=0.4, push=-0.06)
+"""Somebody holds its joints away from where they are driven: what does not let go draws current."""
+
+
+@pytest.mark.parametrize(
+    ("limp", "says"),
+    [("passive", "limp by passive mode"), ("torque", "a torque limit of 0"), ("never", "still resists")],
+)
+def test_letting_go_is_shown_by_what_follows(limp, says):
+    d = driver(VirtualClock(1.0), Pressing, limp=limp)
+    d.open()
+    for _ in range(20):
+        d.send(HandCommand(np.full(12, 0.4), np.full(12, 300)))
+        d.clock.sleep_until(d.clock.now() + 0.01)
+        state = d.read()
+    assert np.abs(state.current).max() > 200
+    d.relax()
+    at = d.clock.now()
+    while (proof := d.released()) is None and d.clock.now() < at + 2:
+        d.clock.sleep_until(d.clock.now() + 0.01)
+        d.read()
+    assert proof[0] == (limp != "never") and says in proof[1] and d.clock.now() - at < 0.4
+    mode, kp, position, limit = d.body._sdk.trips[-1][1]
+    assert kp == 0 and not limit.any() and np.abs(position - d.read().position).max() < 0.02
+    first = next(c for t, c in d.body._sdk.trips if t + d.body._sdk.zero >= at - 1e-6)
+    assert first[0] == PASSIVE and not first[3].any()
+
+
+def test_a_hand_that_resists_is_danger_in_the_loop(b):
+    report, _, fake, said = run(b, Pressing, limp="never", settings={"home_error": 1.0})
+    assert "still resists" in report.not_relaxed and "cut its power" in " ".join(said)
+    assert not fake.trips[-1][1][3].any(), "and its torque limit stays at its lowest"
+
+
+# -- processes
+# --------------------------------------------------------------------------------------------------------------------
+def commands(log):
+    rows = [line.split() for line in log.read_text().splitlines()] if log.exists() else []
+    return [(float(t), int(mode), float(limit)) for t, mode, limit in rows]
+
+
+def drive(d, seconds, until=lambda: False):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not until():
+        d.read()
+        d.send(HandCommand(np.full(12, 0.3), np.full(12, 300)))
+        time.sleep(0.01)
+
+
+def test_the_package_lives_in_a_process_of_its_own_and_a_silent_loop_is_let_go_of(tmp_path):
+    log = tmp_path / "log"
+    d = driver(Clock(), Pressing, hang=0.3, log=str(log))
+    d.open()
+    try:
+        drive(d, 0.3)
+        assert d._process.pid != os.getpid() and not d.problem()
+        last = time.monotonic()
+        time.sleep(0.8)  # the loop hangs
+        first = next(t for t, mode, _ in commands(log) if t > last and mode == PASSIVE)
+        assert 0.2 < first - last < 0.5 and "loop was silent" in d.problem()
+        d.send(HandCommand(np.full(12, 0.3), np.full(12, 300)))  # what the loop still has in hand drives no more
+        time.sleep(0.1)
+        assert all(mode == PASSIVE or not limit for t, mode, limit in commands(log) if t > first)
+        d.relax()
+        drive(d, 0.2)
+        assert not d.problem() and commands(log)[-1][1:] == (POSITION, 300), "after it has let go itself, it may again"
+    finally:
+        d.close()
+    assert commands(log)[-1][2] == 0
+
+
+def test_an_abort_of_the_package_is_said_at_once(tmp_path):
+    d = driver(Clock(), abort_s=1.0, hang=2.0)
+    d.open()
+    died = []
+    drive(d, 10.0, lambda: not d._process.is_alive() and (died.append(time.monotonic()) or True))
+    assert "SIGABRT" in d.problem() and "nobody holds the bus" in d.problem() and "cut its power" in d.problem()
+    assert time.monotonic() - died[0] < 0.15
+    with pytest.raises(UserError, match="nobody holds the bus"):
+        d.relax()
+    d.close()  # the hand is there again: a new process lets go of it
+
+
+DRIVE = """
+import sys, time
+from functools import partial
+import numpy as np
+from dexsim.deploy.driver import Clock, HandCommand
+from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
+from dexsim.deploy.vendor import VendorXHand
+if __name__ == "__main__":
+    hand = partial(LaggingHand, start=0.4, push=-0.06)
+    d = VendorXHand("auto", Clock(), partial(FakeXHand, make=hand, faults=Faults(log=sys.argv[1])), hang=0.3)
+    d.open()
+    while True:
+        d.read()
+        d.send(HandCommand(np.full(12, 0.3), np.full(12, 300)))
+        time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
+def test_a_loop_that_is_killed_or_stopped_leaves_a_hand_that_is_let_go(tmp_path, how):
+    log, script = tmp_path / "log", tmp_path / "drive.py"
+    script.write_text(DRIVE)
+    p = subprocess.Popen([sys.executable, str(script), str(log)])
+    try:
+        limit = time.monotonic() + 60
+        while len(commands(log)) < 60 and time.monotonic() < limit:
+            time.sleep(0.05)
+        at = time.monotonic()
+        p.send_signal(getattr(signal, how))
+        time.sleep(1.0)
+        first = next(t for t, mode, _ in commands(log) if t > at and mode == PASSIVE)
+        assert first - at < 0.6 and commands(log)[-1][2] == 0
+        if how == "SIGKILL":
+            size = log.stat().st_size
+            time.sleep(0.5)
+            assert log.stat().st_size == size, "and its process has ended"
+    finally:
+        p.kill()
+        p.wait()
+
+
+def test_an_object_of_this_process_can_stand_for_the_package():
+    clock = Clock()
+    fake = FakeXHand(clock, faults=Faults(outlier=0.0))
+    d = VendorXHand("auto", package=fake, hang=1.0)
+    d.open()
+    drive(d, 0.2)
+    assert fake.trips[-1][1][0] == POSITION and d.read().sequence > 5
+    d.close()
+    assert fake.trips[-1][1][0] == PASSIVE

@@ -170,7 +170,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
             f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
             " hand (dexsim/deploy/driver.py)"
         )
-    wrong = [k for k in ("port", "serial") if kind == "sim" and k in given]
+    wrong: list[str] = [k for k in ("port", "serial") if kind == "sim" and k in given]
     wrong += [k for k in ("vision", "shape", "seed") if kind == "xhand" and not fake and k in given]
     wrong += [k for k in ("imu",) if (kind == "sim" or fake) and k in given]
     if wrong:
@@ -248,8 +248,9 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     folders.make(path.parent, "record=")
     new(path, "record=")
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
+    simulated = given.get("driver", "sim") == "sim" or given.get("port", "")[:4] == "fake"
     meta = {
-        "source": "sim" if given.get("driver", "sim") == "sim" or given.get("port", "")[:4] == "fake" else "real", "robot": b.hand.robot,
+        "source": "sim" if simulated else "real", "robot": b.hand.robot,
         "effort_is": "current_A", "effort_sign": sign,
         "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}",
         "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -58,9 +58,10 @@ class HandCommand:
 
 
 class HandDriver(Protocol):
-    """A hand. None of the calls waits for the bus. Two more may be absent, and tell what a person beside the hand does:
+    """A hand. None of the calls waits for the bus. Four more may be absent. Two tell what a person beside it does:
     `present()`, an object is held out and the fingers are about to close on it; `started()`, the policy begins and it
-    is let go."""
+    is let go. `problem()` says why the hand cannot be driven any longer (empty: it can); `released()`, after `relax`,
+    whether the hand is limp and by what that is known (None: not known yet)."""
 
     name: str
 
@@ -70,8 +71,9 @@ class HandDriver(Protocol):
     def read(self) -> HandState | None:
         """The newest reading (the same one again until there is a newer), None before the first."""
 
-    def send(self, command: HandCommand) -> None:
-        """Hand over targets for the next bus cycle."""
+    def send(self, command: HandCommand) -> Any:
+        """Hand over targets for the next bus cycle. What is returned says that they were not taken, if anything: a
+        text, False, or an object with an `error_code` that is not 0."""
 
     def relax(self) -> None:
         """Mode 0 at every joint, as soon as possible; may be called from another thread, and twice."""

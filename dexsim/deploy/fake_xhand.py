@@ -42,7 +42,8 @@ class Faults:
     refused with the code `refuse`; unplug_s: the cable is out for two seconds, and the port's number is another then;
     outlier: share of round trips of 111 ms; opens: how often opening fails first; limp: what makes the hand limp
     (passive: mode 0, torque: a torque limit of 0, never); sdk: version, 0.10.3 has unsigned currents; side, serial;
-    jitter rad of the encoders; seed."""
+    jitter rad of the encoders; seed; log: a file to which a line is added for each command that the hand has taken, its
+    time (monotonic, s), mode and largest torque limit (mA)."""
 
     crc: float = 0.0
     torn: float = 0.0
@@ -63,6 +64,7 @@ class Faults:
     serial: str = "FAKE0001"
     jitter: float = ENCODER_JITTER
     seed: int = 0
+    log: str = ""
 
     @classmethod
     def parse(cls, text: str) -> Faults:
@@ -73,7 +75,7 @@ class Faults:
             key, _, value = part.partition("=")
             if key not in fields:
                 raise UserError(f"port=fake:{text}: '{key}' must be one of {', '.join(fields)}")
-            kind = type(fields[key].default)
+            kind: Any = type(fields[key].default)
             try:
                 changes[key] = kind(value)
             except ValueError:
@@ -84,10 +86,12 @@ class Faults:
 class LaggingHand:
     """Twelve joints that follow their targets with a lag, and draw current as they do; nothing is touched."""
 
-    def __init__(self, start: float = 0.05, lag: float = 0.04):
-        self.q, self.target, self.time = np.full(JOINTS, start), np.full(JOINTS, start), 0.0
+    def __init__(self, start: float = 0.05, lag: float = 0.04, push: float = 0.0):
+        self.q, self.time = np.full(JOINTS, start), 0.0
+        self.q[3] = min(start, 0.15)  # the index's abduction has no more
+        self.target = self.q.copy()
         self.stiff = self.limit = 0.0
-        self.lag, self.push = lag, np.zeros(JOINTS)  # push: rad that somebody holds joints away from their targets
+        self.lag, self.push = lag, np.full(JOINTS, push)  # rad that somebody holds joints away from their targets
 
     def command(self, c: HandCommand) -> None:
         """Takes effect now."""
@@ -194,8 +198,8 @@ class _Force:
 
 class _HandCommand:
     def __init__(self, other: _HandCommand | None = None) -> None:
-        fingers = [None] * JOINTS if other is None else other.finger_command
-        self.finger_command = [_FingerCommand(f) for f in fingers]
+        fingers: list[Any] = [None] * JOINTS if other is None else other.finger_command
+        self.finger_command: list[Any] = [_FingerCommand(f) for f in fingers]
 
 
 class _Control:
@@ -291,8 +295,8 @@ class _Control:
         while t >= f.hang_s:
             clock.sleep_until(clock.now() + 3600.0)
         now = clock.now()
-        if now < self._crc_at + RETRY:
-            self._boot_until, self._crc_at = now + BOOTING, -np.inf
+        if now < self._crc_at + RETRY and now >= self._boot_until:
+            self._boot_until = now + BOOTING
         if now < self._boot_until:
             clock.sleep_until(now + REFUSING)
             self._code = BOOT
@@ -328,6 +332,9 @@ class _Control:
         position = np.array([f.position for f in fingers])
         fake.trips.append((fake.time, (mode, kp, position, limit)))
         f = fake.faults
+        if f.log:
+            with open(f.log, "a", encoding="utf-8") as log:
+                log.write(f"{fake.clock.now():.4f} {mode} {limit.max():g}\n")
         if mode == PASSIVE and f.limp == "passive" or mode != PASSIVE and not limit.any() and f.limp == "torque":
             fake.hand.relax()
         elif mode == POSITION and limit.any():

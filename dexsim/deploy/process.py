@@ -40,7 +40,8 @@ _HEAD = 8  # numbers at the start of a command: number, era, mode, kp, ki, kd, w
 class Body(Protocol):
     """A hand behind its bus. due [s]: when the next cycle begins, or a slow hand's next state is there."""
 
-    due: float
+    @property
+    def due(self) -> float: ...
 
     def open(self) -> dict[str, str]:
         """Connect; returns what to log. Raises UserError."""

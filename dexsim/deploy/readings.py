@@ -93,9 +93,8 @@ _ARRAYS = ("position", "current", "temperature", "error", "tactile", "velocity",
 
 def copied(state: HandState) -> HandState:
     """A reading whose arrays nobody else writes."""
-    return dataclasses.replace(
-        state, **{n: x.copy() for n in _ARRAYS if isinstance(x := getattr(state, n), np.ndarray)}
-    )
+    own: dict[str, Any] = {n: x.copy() for n in _ARRAYS if isinstance(x := getattr(state, n), np.ndarray)}
+    return dataclasses.replace(state, **own)
 
 
 def overwritten(given: HandState, mine: HandState) -> str | None:

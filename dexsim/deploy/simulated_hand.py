@@ -428,6 +428,12 @@ class SimulatedXHand(BusDriver):
         make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip), latency=latency)
         super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
 
+    @property
+    def hand(self) -> SimulatedHand:
+        """The hand itself, where it lives in this process."""
+        assert isinstance(self.body, SimulatedBody)
+        return self.body.hand
+
     def open(self) -> dict[str, str]:
         if self._camera and type(self.clock) is Clock:
             choose_gl()

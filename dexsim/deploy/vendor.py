@@ -70,7 +70,8 @@ class XHandBus:
         self._sent: HandCommand | None = None
         self._frame: list[Any] = []
         self._sequence, self._fast = 0, False
-        self._last_bits, self._stirred, self._restless = ([], []), clock.now(), False
+        self._last_bits: tuple[list, list] = ([], [])
+        self._stirred, self._restless = clock.now(), False
         self._steps = np.zeros(JOINTS)
         self._boards = [b""] * TAXELS[0]
         self._touch = np.zeros(TAXELS, np.int16)
