@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from dexsim.recording.schema import Recording
     from dexsim.tasks.env import HandEnv
 
+    Task = str | type[HandEnv]
+    """A task by name, as "module:Class", or its class."""
+
 File = str | Path
 Policy = Callable[[Any], "torch.Tensor"]
 """Observations of an environment (a TensorDict) -> actions [N, A]."""
@@ -183,7 +186,7 @@ def diagnose(
 # ---------------------------------------------------------------------------------------
 
 
-def settings(task: str = "grasp", overrides: Sequence[str] = ()) -> dict[str, Any]:
+def settings(task: Task = "grasp", overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Every setting of a training with the value it would have, as a plain nested dict (`dexsim train --cfg`).
 
     Args:
@@ -193,7 +196,7 @@ def settings(task: str = "grasp", overrides: Sequence[str] = ()) -> dict[str, An
 
 
 def make_env(
-    task: str = "grasp",
+    task: Task = "grasp",
     worlds: int | None = None,
     device: str | None = None,
     seed: int = 1,
@@ -203,7 +206,7 @@ def make_env(
     """Many simulated hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it gymnasium's).
 
     Args:
-        task: "grasp", "rotate" or "rotate_fingertips".
+        task: a name (`dexsim tasks` lists them), "module:Class", or a class derived from `dexsim.tasks.Task`.
         worlds: hands simulated at once; None: what fits the machine.
         device: "cpu", "cuda", "cuda:1"; None: cuda where there is one.
         seed: of everything random.
@@ -219,11 +222,13 @@ def make_env(
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_env as make
 
-    cfg = _start(task, worlds, device, seed, settings, checkpoint).cfg
+    begun = _start(task, worlds, device, seed, settings, checkpoint)
+    cfg = begun.cfg
     seed_all(cfg["seed"])
     machine.set_threads(cfg["device"])
     quiet_warp(cfg["device"])
     env: HandEnv = make(cfg, cfg["worlds"], cfg["device"], cfg["seed"], cfg["sim"]["engine"])
+    env.given = begun.given
     return env
 
 
@@ -243,7 +248,7 @@ def load_policy(checkpoint: File, env: HandEnv) -> Policy:
 
 
 def train(
-    task: str = "grasp",
+    task: Task = "grasp",
     worlds: int | None = None,
     iterations: int | None = None,
     device: str | None = None,
@@ -279,7 +284,7 @@ def train(
 def play(
     checkpoint: File | None = None,
     policy: str | None = None,
-    task: str = "grasp",
+    task: Task = "grasp",
     episodes: int = 256,
     device: str | None = None,
     seed: int = 0,
@@ -303,7 +308,7 @@ def play(
     argv += [] if device is None else [f"device={device}"]
     argv += [] if out is None else [_setting("out", out)]
     argv += [] if checkpoint is None else [_setting("checkpoint", checkpoint)]
-    argv += [] if policy is None else [f"policy={policy}", f"task={task}"]
+    argv += [] if policy is None else [f"policy={policy}", f"task={_named(task)}"]
     ready = start.for_play(argv, CONFIGS)
     assert ready is not None  # neither --help nor --cfg was asked
     playing.run(ready)
@@ -316,7 +321,7 @@ def play(
 
 
 def _start(
-    task: str,
+    task: Task,
     worlds: int | None,
     device: str | None,
     seed: int | None,
@@ -336,9 +341,16 @@ def _start(
     if checkpoint is not None:
         ready = start.for_play([_setting("checkpoint", checkpoint), *argv], CONFIGS)
     else:
-        ready = start.for_train([f"task={task}", *argv], CONFIGS)
+        ready = start.for_train([f"task={_named(task)}", *argv], CONFIGS)
     assert ready is not None  # neither --help nor --cfg was asked
     return ready
+
+
+def _named(task: Task) -> str:
+    """A task as the command line has it; a class that is given may be used."""
+    from dexsim.tasks import registry
+
+    return task if isinstance(task, str) else registry.name_class(registry.where_of(task), task)
 
 
 def _setting(key: str, path: File) -> str:

@@ -99,7 +99,7 @@ def test_settings_are_those_of_the_command_line():
     ("call", "words"),
     [
         (lambda: dexsim.settings("grasp", ["wrlds=3"]), "unknown setting 'wrlds'"),
-        (lambda: dexsim.settings("grab"), "task=grab: no such option; task can be grasp"),
+        (lambda: dexsim.settings("grab"), "task=grab: no such task; task can be grasp"),
         (lambda: dexsim.settings("grasp", "worlds=3"), "must be a list"),
         (lambda: dexsim.settings("grasp", ["--help"]), "is no setting"),
         (lambda: dexsim.make_env(checkpoint="none.pt"), "none.pt"),

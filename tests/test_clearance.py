@@ -30,7 +30,7 @@ def test_distance_is_that_of_the_pad_centre_to_the_surface(env):
     for w in range(12):
         pos, mat = env.engine.t.xpos[w].double().numpy(), env.engine.t.xmat[w].double().numpy()
         o = env.objects.body
-        shape = env.scene.variants[int(env.objects.variant[w])].shape
+        shape = env.objects.scene.variants[int(env.objects.variant[w])].shape
         size = env.touch.shape_size[w].double().numpy()
         for f in range(5):
             b = env.engine.body(layout.bodies[f])
@@ -64,7 +64,7 @@ def test_emphasis_counts_in_training_and_not_elsewhere(env):
     assert float(weight[rows].max()) == 1.5  # box
     env.draw_from(rows)
     even = env._cumulative.diff(prepend=torch.zeros(1))
-    names = [env.scene.variants[int(i)].shape.name for i in rows]
+    names = [env.objects.scene.variants[int(i)].shape.name for i in rows]
     share = {n: sum(float(p) for p, m in zip(even, names, strict=True) if m == n) for n in set(names)}
     assert all(abs(v - 1 / 3) < 1e-6 for v in share.values())
     env.draw_from(rows, env.emphasis)

@@ -25,7 +25,7 @@ def _pick(env) -> torch.Tensor:
 
 def _tilt(env) -> torch.Tensor:
     """Angle of the object's longest axis to the palm's y."""
-    longest = torch.tensor([int(v.shape.extents.argmax()) for v in env.scene.variants])[env.objects.variant]
+    longest = torch.tensor([int(v.shape.extents.argmax()) for v in env.objects.scene.variants])[env.objects.variant]
     m = rotation.to_matrix(env.engine.t.qpos[:, env.object_q[3:]])
     return m[torch.arange(N), 1, longest].abs().clamp(max=1).arccos()
 

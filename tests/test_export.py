@@ -14,9 +14,10 @@ from bundles import make_checkpoint
 
 from dexsim import export
 from dexsim.assets import xhand
-from dexsim.deploy import bundle, observations
+from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
+from dexsim.tasks import observations
 
 
 @pytest.fixture(scope="module")

@@ -145,9 +145,9 @@ def _plain(**given):
         ({"objects": ["cross"]}, "kept_out: 'cross' is trained on as well"),
         ({"objects": ["box"], "object_scale": 0}, "object_scale=0: must be a positive number"),
         ({"objects": ["box"], "object_hulls": 99}, "object_hulls=99: must be a whole number from 1 to 32"),
-        ({"objects": ["box"], "task": {"name": "press"}}, "task.name='press': must be one of grasp, rotate"),
-        ({"kept_out": ["m.stl"], "task": {"name": "rotate", "mode": "fingertips"}},
-         "kept_out=.*task=rotate_fingertips.*kept_out= is for task=grasp and task=rotate"),
+        ({"objects": ["box"], "task": {"name": "press"}}, "task=press: no such task; task can be grasp"),
+        ({"kept_out": ["m.stl"], "task": {"name": "rotate"}, "choices": {"task": "rotate_fingertips"}},
+         "kept_out=.*task=rotate_fingertips.*kept_out= is for tasks that take others"),
     ],
 )
 def test_wrong_settings(given, said):
@@ -160,7 +160,7 @@ def test_wrong_settings(given, said):
 )
 def test_a_task_made_from_another_takes_objects_as_that_does(monkeypatch, kind, takes):
     """By its class, whatever it is called."""
-    monkeypatch.setattr("dexsim.tasks.task_class", lambda task: type("Lift", (kind,), {}))
+    monkeypatch.setattr("dexsim.tasks.registry.task_class", lambda cfg: type("Lift", (kind,), {}))
     plain = _plain(objects=["box"], kept_out=["cross"])
     plain["task"]["name"] = "lift"
     if takes:

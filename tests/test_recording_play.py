@@ -426,7 +426,7 @@ def test_the_object_of_a_real_recording_is_placed(played, tmp_path, monkeypatch)
     size = 2 * o.size[0].numpy()
     box = (
         led_object.Stated("box", tuple(size))
-        if env.scene.variants[int(o.variant[0])].shape.name == "box"
+        if env.objects.scene.variants[int(o.variant[0])].shape.name == "box"
         else led_object.Stated("box", (0.05, 0.06, 0.05))
     )
     for name, stated in (("marked", None), ("led", box)):

@@ -113,7 +113,7 @@ def test_a_flat_object_is_not_dropped_as_it_lies_and_falls_with_any_axis_up(tmp_
     assert let_go.shape.tolist() == [0, 1] * 6 and let_go.names == names
     plates = let_go[let_go.shape == 0]
     turn = rotation.to_matrix(plates.pose[:, 3:])
-    size = torch.tensor(env.scene.variants[0].shape.extents, dtype=torch.float32)
+    size = torch.tensor(env.objects.scene.variants[0].shape.extents, dtype=torch.float32)
     half = (turn.abs() @ size[:, None])[:, 2, 0] / 2  # along the palm's normal
     bottom = plates.pose[:, 2] - half - float(env.places.catch[2])
     torch.testing.assert_close(bottom, torch.full((6,), 0.01 * env.unit), atol=1e-5, rtol=0)

@@ -25,7 +25,7 @@ def _press(env, seed: int) -> dict[str, torch.Tensor]:
         return low + (high - low) * torch.rand(N, *shape, generator=g)
 
     e, o = env.engine, env.objects
-    names = [v.shape.name for v in env.scene.variants]
+    names = [v.shape.name for v in env.objects.scene.variants]
     rows = torch.tensor([names.index(s) for s in ("sphere", "box", "rock", "egg")])[torch.arange(N) % 4]
     mass = torch.tensor(np.geomspace(0.03, 0.5, N)[torch.randperm(N, generator=g).numpy()], dtype=torch.float32)
     k = u(4000, 9000)

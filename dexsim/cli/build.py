@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -16,10 +16,11 @@ from dexsim.sim.quiet import quiet_warp
 MakeEnv = Callable[..., Any]
 
 
-def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, Any]) -> Any:
+def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, Any], given: Sequence[str] = ()) -> Any:
     """Print versions, machine and ``facts``, seed everything, make the environment.
 
-    ``make_env`` replaces :func:`dexsim.tasks.make_env` (tests).
+    ``make_env`` replaces :func:`dexsim.tasks.make_env` (tests). given: names of the settings that the user gave, each
+    of which something must read. Raises UserError.
     """
     if make_env is None:
         from dexsim import tasks
@@ -39,6 +40,7 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
     start = time.perf_counter()
     quiet_warp(where)
     env = make_env(cfg, n_worlds=cfg["worlds"], device=where, seed=cfg["seed"], engine=cfg["sim"]["engine"])
+    env.given = given
     with torch.no_grad():  # one step compiles the rest and captures the graph
         env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
     print(f"ready after {time.perf_counter() - start:.1f} s", flush=True)

@@ -29,6 +29,7 @@ COMMANDS: dict[str, Command] = {
     "play": Command(
         "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
     ),
+    "tasks": Command("dexsim.cli.tasks:main", "list the tasks, those of installed packages too"),
     "diagnose": Command(
         "dexsim.gap.command:main",
         "find the physics that the simulator leaves out of your recordings",

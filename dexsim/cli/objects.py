@@ -16,13 +16,13 @@ def apply(plain: dict[str, Any]) -> None:
     if all(value is None for value in given.values()):
         return
     task = plain["task"]
-    from dexsim.tasks import task_class  # heavy, and only who gives objects needs it
+    from dexsim.tasks import registry
 
-    if not task_class(task).TAKES_OBJECTS:
+    if not registry.task_class(plain).TAKES_OBJECTS:  # heavy, and only who gives objects needs it
         key = next(k for k, value in given.items() if value is not None)
-        name = "rotate_fingertips" if task.get("mode") == "fingertips" else task.get("name")
+        name = (plain.get("choices") or {}).get("task") or task.get("name")
         raise UserError(
-            f"{key}={given[key]}: task={name} has its own object; {key}= is for task=grasp and task=rotate"
+            f"{key}={given[key]}: task={name} has its own object; {key}= is for tasks that take others"
             " (a task of your own: TAKES_OBJECTS = True in its class)"
         )
     for key, into in (("objects", "train"), ("kept_out", "held_out")):

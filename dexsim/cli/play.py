@@ -23,7 +23,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         return recorded.run(play)
     out = outputs.claim(results(start), "out=", () if play["view"] else (METRICS, *((VIDEO,) if play["video"] else ())))
     what = start.source or f"policy {play['policy']}"
-    env = build.build_env(cfg, make_env, {"policy": what, "results": out})
+    env = build.build_env(cfg, make_env, {"policy": what, "results": out}, start.given)
     env.dump_folder = out  # for worlds that were not finite
     if start.data is not None:
         checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))

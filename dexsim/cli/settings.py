@@ -24,6 +24,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dexsim.errors import UserError
+from dexsim.tasks import registry
 
 WORDS = ("auto", "unknown", "inf", "null")  # strings that a number's place may hold
 
@@ -74,6 +75,15 @@ def _option(item: Override, options: list[str]) -> str:
     group, name = item.key_or_group, str(item.value())
     if name in options:
         return name
+    if group == "task":
+        if name in registry.installed() or registry.is_class(name):
+            registry.find(name)
+            return name
+        known = [*options, *registry.installed()]
+        raise UserError(
+            f"task={name}: no such task; task can be {', '.join(known)}{_guess(name, known)}, or a class of your own,"
+            " task=module:Class"
+        )
     if name.endswith((".yaml", ".yml")) and group == "servo":
         raise UserError(f"servo={name}: a file of your own is given as servo_file={name}")
     raise UserError(f"{group}={name}: no such option; {group} can be {', '.join(options)}{_guess(name, options)}")
@@ -84,14 +94,26 @@ def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
     them."""
     found = [(str(f), f.stat()) for f in sorted(config_dir.rglob("*.yaml")) if f.is_file()]
     stamps = tuple((name, s.st_mtime_ns, s.st_size) for name, s in found)
-    return copy.deepcopy(_composed(config_dir, tuple(choices.items()), stamps))
+    own = choices.get("task")
+    if own is None or own in groups(config_dir).get("task", ()):
+        return copy.deepcopy(_composed(config_dir, tuple(choices.items()), stamps))
+    made = registry.load(registry.find(own)).config()  # a task whose settings stand in its class
+    others = [(k, v) for k, v in choices.items() if k != "task"]
+    cfg = copy.deepcopy(_composed(config_dir, (("~task", ""), *others), stamps))
+    OmegaConf.set_struct(cfg, False)
+    for group, values in made.items():
+        if group == "task" or group not in choices:
+            cfg[group] = values
+    cfg.choices["task"] = made["task"]["name"]
+    OmegaConf.set_struct(cfg, True)
+    return cfg
 
 
 @functools.lru_cache(maxsize=16)
 def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tuple) -> DictConfig:
     """What files of these stamps give: reading them takes some tenths of a second, and who trains or plays several
     times in one process chooses the same again."""
-    overrides = [f"{group}={option}" for group, option in choices]
+    overrides = [group if group.startswith("~") else f"{group}={option}" for group, option in choices]
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(config_dir.resolve())):
@@ -108,13 +130,16 @@ def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tu
 
 def choose(cfg: DictConfig, config_dir: Path, choices: dict[str, str]) -> DictConfig:
     """Exchange whole groups of a config that came out of a checkpoint for options of the config files."""
+    task = choices.get("task", "")
+    if registry.is_class(task) and OmegaConf.select(cfg, "task.class") == task:
+        choices = {k: v for k, v in choices.items() if k != "task"}  # said only so that it may be imported
     if not choices:
         return cfg
     fresh = from_files(config_dir, choices)
     OmegaConf.set_struct(cfg, False)
-    for group, option in choices.items():
+    for group in choices:
         cfg[group] = fresh[group]
-        cfg.setdefault("choices", {})[group] = option
+        cfg.setdefault("choices", {})[group] = fresh.choices[group]
     OmegaConf.set_struct(cfg, True)
     return cfg
 
@@ -173,6 +198,19 @@ def typed(request: Request) -> frozenset[tuple[str, Any]]:
         if item.type != OverrideType.DEL:
             add(item.key_or_group, item.value())
     return frozenset(found)
+
+
+def given(request: Request) -> tuple[str, ...]:
+    """Names of the settings that were given a value, those inside a typed mapping one by one."""
+
+    def names(key: str, value: Any) -> list[str]:
+        if isinstance(value, dict) and "log" not in value:
+            return [x for name, inner in value.items() for x in names(f"{key}.{name}", inner)]
+        return [key]
+
+    return tuple(
+        x for item in request.values if item.type != OverrideType.DEL for x in names(item.key_or_group, item.value())
+    )
 
 
 def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfig:

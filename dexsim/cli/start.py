@@ -37,6 +37,7 @@ class Start:
     cfg: resolved config. play: play.py's own settings ({} for train.py). source: the checkpoint's path, or None.
     data: the checkpoint, as :func:`dexsim.learning.checkpoint.load` returns it, or None.
     typed: the settings of the command line itself, (name, value), which alone may name code (dexsim.learning.names).
+    given: the names of all of them.
     """
 
     cfg: dict[str, Any]
@@ -44,6 +45,7 @@ class Start:
     source: str | None = None
     data: dict[str, Any] | None = None
     typed: frozenset[tuple[str, Any]] = frozenset()
+    given: tuple[str, ...] = ()
 
 
 def for_train(argv: list[str], config_dir: Path) -> Start | None:
@@ -73,7 +75,9 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
         checks.check(plain)
     if checks.get(plain, "agent.logger") == "wandb":
         weights_and_biases.check_installed()  # before anything is built
-    return None if only_show and _show(plain) else Start(plain, {}, source, data, settings.typed(request))
+    if only_show and _show(plain):
+        return None
+    return Start(plain, {}, source, data, settings.typed(request), settings.given(request))
 
 
 def for_play(argv: list[str], config_dir: Path) -> Start | None:
@@ -121,7 +125,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     return (
         None
         if only_show and _show(plain | play)
-        else Start(plain, play, play["checkpoint"], data, settings.typed(request))
+        else Start(plain, play, play["checkpoint"], data, settings.typed(request), settings.given(request))
     )
 
 
@@ -170,8 +174,13 @@ def _last(request: settings.Request, key: str) -> str | None:
 
 def _load(path: Any) -> dict[str, Any]:
     from dexsim.learning import checkpoint
+    from dexsim.tasks import registry
 
-    return checkpoint.load(str(path))
+    data = checkpoint.load(str(path))
+    where = data["config"]["task"].get("class")
+    if where is not None and where not in registry.built_in().values():
+        registry.load(str(where), str(path))  # refused now, before its settings are read
+    return data
 
 
 def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:

@@ -20,6 +20,7 @@ from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ranks import Ranks
 from dexsim.learning.runner import Runner
+from dexsim.tasks.registry import typing
 
 SAVE_EVERY_S = 60.0  # last.pt and policy.pt, besides what save_interval keeps
 TAGS = {
@@ -67,7 +68,7 @@ def _run(
     ranks.on_loss("")
     facts = {"run": where} if ranks.size == 1 else {"ranks": f"{ranks.size}, {cfg['worlds']} worlds each", "run": where}
     with ranks.one_compiles():
-        env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts)
+        env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts, start.given)
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
@@ -77,7 +78,8 @@ def _run(
         runner.restore(start.data, str(start.source))
         went = f"; {runner.resumed}" if runner.resumed else ""
         print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps{went}")
-    resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}"
+    said = typing(str(cfg["task"].get("class")))
+    resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}{said}"
     ranks.on_loss(f"continue: {resume}")
     log = Log(runner, where, start) if ranks.leader else None
     stop.gently = True
@@ -96,7 +98,7 @@ def _run(
         print(f"\nstopped after {runner.iteration} iterations; saved {where / 'last.pt'}\ncontinue: {resume}")
         return stop.status
     status = _final_episodes(runner, cfg, where) if ranks.leader else 0
-    print(f"\nplay it:  {program.name('play')} checkpoint={shlex.quote(str(where / 'policy.pt'))}")
+    print(f"\nplay it:  {program.name('play')} checkpoint={shlex.quote(str(where / 'policy.pt'))}{said}")
     return status
 
 

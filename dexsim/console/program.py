@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -19,6 +20,13 @@ def name(job: str) -> str:
     return (
         f"python -m dexsim {job}" if (called.parent.name, called.name) == ("dexsim", "__main__.py") else f"dexsim {job}"
     )
+
+
+def typed() -> str:
+    """This process's command line as the user typed it."""
+    given = sys.argv[1:]
+    head = name(given[0]) if given and not _by_door() else f"python {Path(sys.argv[0]).name}"
+    return " ".join([head, *map(shlex.quote, given if _by_door() else given[1:])])
 
 
 def torchrun(job: str, processes: int) -> str:

@@ -275,7 +275,7 @@ class SimulatedCamera:
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self.WIDTH, self.HEIGHT
         self._model.vis.global_.fovy = self.FOVY
         self._data = mujoco.MjData(self._model)
-        self._geoms = [self._model.geom(s).id for s in env.scene.slots]
+        self._geoms = [self._model.geom(s).id for s in env.objects.scene.slots]
         try:
             self._renderer = mujoco.Renderer(self._model, self.HEIGHT, self.WIDTH)
         except Exception as error:  # whatever a driver raises

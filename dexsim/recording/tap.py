@@ -323,7 +323,7 @@ class PlayRecorder:
     def _world(self, index: int, about: list[np.ndarray]) -> tuple[dict[str, Any], dict[str, Any]]:
         """What differs in a world: object and drives, as plain data."""
         params, variant, size, mass, friction, stiffness, damping = about
-        shape = self.env.scene.variants[int(variant)].shape
+        shape = self.env.objects.scene.variants[int(variant)].shape
         servo = {
             joint: {
                 name: float(params[j, c])

@@ -2,53 +2,44 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping
+import importlib
 from typing import TYPE_CHECKING, Any
-
-from dexsim.errors import UserError
 
 if TYPE_CHECKING:
     from dexsim.tasks.env import HandEnv
-    from dexsim.tasks.stable_grasps import GraspSet
+    from dexsim.tasks.scenes import Base, Free, Hinge, Scene, Screw, Slide, Table, Thing, Tree
+    from dexsim.tasks.task import Task
+    from dexsim.tasks.terms import command, done, event, memory, metric, observe, reward
+
+_FROM = {
+    "scenes": ("Base", "Free", "Hinge", "Scene", "Screw", "Slide", "Table", "Thing", "Tree"),
+    "task": ("Task",),
+    "terms": ("command", "done", "event", "memory", "metric", "observe", "reward"),
+}
+__all__ = [
+    "Base", "Free", "Hinge", "Scene", "Screw", "Slide", "Table", "Task", "Thing", "Tree", "command", "done", "event",
+    "make_env", "memory", "metric", "observe", "reward",
+]  # fmt: skip
 
 
-def task_class(task: Mapping[str, Any]) -> type[HandEnv]:
-    """The class of the task with the settings `task` (its `name` and `mode`). Raises UserError for an unknown one."""
-    from dexsim.tasks.grasp import GraspEnv
-    from dexsim.tasks.rotate import RotateEnv
-    from dexsim.tasks.rotate_fingertips import FingertipEnv
-
-    mode = task.get("mode", "palm")
-    if mode not in ("palm", "fingertips"):
-        raise UserError(f"task.mode={mode}: must be palm or fingertips")
-    tasks: dict[str, type[HandEnv]] = {"grasp": GraspEnv, "rotate": RotateEnv if mode == "palm" else FingertipEnv}
-    name = task["name"]
-    if name not in tasks:
-        near = difflib.get_close_matches(name, tasks, 1)
-        raise UserError(
-            f"task.name='{name}': must be one of {', '.join(tasks)}" + (f"; did you mean {near[0]}?" if near else "")
-        )
-    return tasks[name]
+def __getattr__(name: str) -> Any:
+    for module, names in _FROM.items():
+        if name in names:
+            return getattr(importlib.import_module(f"dexsim.tasks.{module}"), name)
+    raise AttributeError(f"module 'dexsim.tasks' has no attribute {name!r}")
 
 
-def make_env(
-    cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
-) -> HandEnv:
-    """The environment of `cfg["task"]["name"]`: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
+def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: Any = None) -> HandEnv:
+    """The environment of a resolved configuration: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
 
-    cfg: the resolved configuration as a plain dict. engine: "auto", "warp" or "mujoco". grasps: held poses that
-    rotation begins with (`tasks.stable_grasps.GraspSet`); by default those of `task.initial.poses` or of the hand,
-    searched for first where it has none. Raises UserError for an unknown task and for every impossible value that the
-    task finds.
+    cfg: as a plain dict; its task's class is found by `dexsim.tasks.registry`. engine: "auto", "warp" or "mujoco".
+    grasps: held poses that rotation begins with (`tasks.stable_grasps.GraspSet`); by default those of
+    `task.initial.poses` or of the hand, searched for first where it has none. Raises UserError for an unknown task and
+    for every impossible value that the task finds.
     """
-    from dexsim.tasks.rotate import RotateEnv
+    from dexsim.tasks.registry import task_class
 
-    made = task_class(cfg["task"])
-    if issubclass(made, RotateEnv):
-        if grasps is None and cfg["task"]["initial"]["poses"] is None and cfg["task"].get("mode", "palm") == "palm":
-            from dexsim.tasks.make_grasps import ensure
-
-            ensure(cfg)
-        return made(cfg, n_worlds, device, seed, engine, grasps)
-    return made(cfg, n_worlds, device, seed, engine)
+    given = {} if grasps is None else {"grasps": grasps}
+    made = task_class(cfg)
+    made.prepare(cfg, **given)
+    return made(cfg, n_worlds, device, seed, engine, **given)

@@ -11,18 +11,19 @@ import copy
 import math
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from dexsim import files, model_file
+from dexsim import files, model_file, rotation
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets.objects.own import named
@@ -43,7 +44,9 @@ from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.reality import Reality, present
+from dexsim.tasks.scenes import BASE, Scene, Slide, fasten, furnish, mount
 from dexsim.tasks.structs import filled
+from dexsim.tasks.watched import Watched, unread
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
@@ -55,19 +58,22 @@ UNIT_PALM = 0.025
 """m, height of that hand's palm over the origin of its palm frame."""
 
 
-def contact_pairs(hand: Hand, root: str) -> tuple[ContactPair, ...]:
+def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[ContactPair, ...]:
     """Contact pairs of the hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object (F .. 2F-1),
-    palm on object (2F), distal link on the hand itself (2F+1 .. 3F). A fingertip of several geoms counts as its whole
-    distal link. root: the hand's root body."""
+    palm on object (2F), distal link on the hand itself (2F+1 .. 3F), then fingertips on each of the bodies `parts`. A
+    fingertip of several geoms counts as its whole distal link. root: the hand's root body."""
     obj = ("body", OBJECT)
+    tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
     return (
-        *(
-            ContactPair(f"tip_{f.name}", ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body), obj)
-            for f in hand.fingers
-        ),
+        *(ContactPair(f"tip_{f.name}", tip, obj) for f, tip in zip(hand.fingers, tips, strict=True)),
         *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
         ContactPair("palm", ("body", hand.palm_body), obj),
         *(ContactPair(f"self_{f.name}", ("body", f.body), ("subtree", root)) for f in hand.fingers),
+        *(
+            ContactPair(f"tip_{f.name}:{body}", tip, ("body", body))
+            for body in parts
+            for f, tip in zip(hand.fingers, tips, strict=True)
+        ),
     )
 
 
@@ -85,18 +91,32 @@ class HandEnv(VecEnv):
     `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """
 
+    scene: ClassVar[Scene] = Scene()
+    """What the world holds beside the hand."""
     TAKES_OBJECTS: bool = False
     """Whether `objects=` and `kept_out=` may give it a user's own objects (`task.objects`)."""
+    camera: ClassVar[dict[str, Any] | None] = None
+    """View of a film: lookat [3] m, distance m, azimuth and elevation in degrees; None: the usual one."""
+    given: Sequence[str] = ()
+    """Names of settings that the user gave: after the first step each must have been read."""
+    learning = True
+    """False while an evaluation plays."""
     nan_count: torch.Tensor
+    _reach: Any
+    _moves: tuple[float, float]
+    _reaches: torch.Tensor
+    _act_args: list[Any]
     _wrong: torch.Tensor | None
     _sources: tuple[str, ...]
 
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
-        self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
+        self.cfg, self.task, sim = cfg, Watched(cfg["task"], "task"), cfg["sim"]
         self.hand = hand_of(cfg)
         self.unit, self.places = self.hand.span / UNIT_SPAN, places(self.hand)
         self.rise = float(self.places.catch[2]) - self.unit * UNIT_PALM
-        self.num_envs, self.device, self.num_actions = n_worlds, device, len(self.hand.joints)
+        base = self.scene.base
+        self.joints = self.hand.joints if base is None else (*self.hand.joints, *BASE)
+        self.num_envs, self.device, self.num_actions = n_worlds, device, len(self.joints)
         self.fingers, self.pads = len(self.hand.fingers), len(self.hand.fingers) if self.hand.touches else 0
         self.decimation, self.dt = _periods(sim, self.task)
         if self.task["action"]["mode"] not in ("relative", "absolute"):
@@ -104,7 +124,7 @@ class HandEnv(VecEnv):
         self._check_rewards()
         self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
-        shapes = named(self.task["objects"])
+        shapes = {} if self.scene.object is None else named(self.task["objects"])
         self.shape_names = list(shapes)
         spec = model_of(self.hand, cfg.get("model_file"))  # a checkpoint from before has none
         contact = self.task["contact"]
@@ -115,8 +135,19 @@ class HandEnv(VecEnv):
         if firm is not None and not 0.5 <= firm < 1.0:
             raise UserError(f"task.contact.hand_impedance={firm}: must be null or lie in [0.5, 1)")
         root = spec.worldbody.bodies[0].name
-        scales = [x * self.unit for x in self.task["objects"]["baked_scales"]]
-        scene = hand_object_scene(spec, [shapes[s] for s in self.shape_names], scales, sim["timestep"])
+        if base is not None:
+            mount(spec, base)
+        spec.option.timestep = sim["timestep"]
+        table = None
+        if self.scene.object is None:
+            spec.worldbody.add_body(name=OBJECT, pos=[0.0, 0.0, -1e3])  # what pairs and touch name; nothing is there
+        else:
+            scales = [x * self.unit for x in self.task["objects"]["baked_scales"]]
+            table = hand_object_scene(spec, [shapes[s] for s in self.shape_names], scales, sim["timestep"])
+            if not self.scene.free:
+                spec.delete(spec.joint("object_free"))
+                fasten(spec.body(OBJECT), self.scene.object, spec)  # type: ignore[arg-type]  # not free, not None
+        self.furniture = furnish(spec, self.scene)
         tips, joints = set(self.hand.tip_geoms), set(self.hand.joints)
         for geom in spec.geoms:
             if geom.name in tips:
@@ -128,7 +159,7 @@ class HandEnv(VecEnv):
                 # stiffer dry friction than MuJoCo's default, in which a stuck joint creeps; stiffer yet, and Newton
                 # needs many more iterations (measured: 99th percentile 9 at 0.9999, 5 here)
                 joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
-        _solver_options(spec, sim, engine_of(engine, device))
+        _solver_options(spec, sim, engine_of(engine, device), self.scene.table is not None)
         self.rng = torch.Generator(device=device)
         self.rng.manual_seed(seed)
         # another world to be judged in
@@ -140,14 +171,17 @@ class HandEnv(VecEnv):
         for geom in list(spec.geoms):
             if not geom.contype and not geom.conaffinity:
                 spec.delete(geom)
-        more = len(scene.slots) - len(SLOTS)  # parts of hollow objects: each may touch
+        # parts of hollow objects, further bodies: each may touch
+        more = (len(table.slots) - len(SLOTS) if table is not None else 0) + 4 * len(self.furniture.parts)
+        more += 8 * (self.scene.table is not None)
+        bodies = [p.body for p in self.furniture.parts]
         self.engine = make_engine(
             spec,
             n_worlds,
             device,
             engine,
             fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
-            pairs=contact_pairs(self.hand, root),
+            pairs=contact_pairs(self.hand, root, bodies),
             deterministic=sim["deterministic"],
             nconmax=sim["nconmax"] + 2 * more,
             njmax=sim["njmax"] + 8 * more,
@@ -155,29 +189,36 @@ class HandEnv(VecEnv):
             collision=sim.get("collision", "auto"),
             solver=sim.get("solver", "auto"),
         )
-        self.scene = scene
+        drives = cfg["servo"]
+        if base is not None:
+            drives = {**drives, "joints": {**drives["joints"], **base.servos()}}
         self.servo = Servo(
             self.engine,
-            self.hand.joints,
-            ServoTable.from_dict(cfg["servo"]),
+            self.joints,
+            ServoTable.from_dict(drives),
             control_period=self.dt,
             varied=list(cfg["randomize"].get("servo", {})),
         )
-        self.objects = Objects(self.engine, scene, list(self.hand.tip_geoms), d)
-        if self.reality is not None:
+        if table is not None:
+            self.objects = Objects(self.engine, table, list(self.hand.tip_geoms), d)
+        if self.reality is not None and table is not None:
             self.objects.friction_factor = self.reality.friction_factor(
                 self.engine.mjm, self.objects.hand_geoms.tolist()
             )
-        touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
+        shown = [v.shape for v in table.variants] if table is not None else []
+        pairs = [[f"tip_{f}", *(f"tip_{f}:{body}" for body in bodies)] for f in self.hand.finger_names]
         self.touch = Tactile(
             self.engine,
             hand_layout(self.hand) or tip_layout(self.hand),
-            touch_shapes,
-            OBJECT,
+            ShapeSet([*shown, *(p.touch for p in self.furniture.parts)], device),
+            [OBJECT, *bodies] if bodies else OBJECT,
             cfg["tactile"],
-            pairs=[f"tip_{f}" for f in self.hand.finger_names],
+            pairs=pairs,
             tips=tip_skins(self.hand) if self.hand.touches else None,
         )
+        for k, part in enumerate(self.furniture.parts, 1):
+            self.touch.shape_id[:, k] = len(shown) + k - 1
+            self.touch.shape_size[:, k] = torch.as_tensor(part.size, dtype=torch.float32, device=device)
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()
@@ -186,10 +227,11 @@ class HandEnv(VecEnv):
         self.setup()
         compile_side_by_side(self._name_kernels, device)
         self.reset_all()
+        self._check_widths()
 
     def _check_rewards(self) -> None:
         """UserError for a weight of a reward that the task does not know, or that is no number."""
-        known, file = self.reward_words(), f"dexsim/configs/task/{self.task['name']}.yaml"
+        known, file = self.reward_words(), type(self).__module__
         for name, weight in self.task["rewards"].items():
             if name not in known:
                 raise UserError(
@@ -198,6 +240,32 @@ class HandEnv(VecEnv):
                 )
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
                 raise UserError(f"task.rewards.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
+
+    @classmethod
+    def prepare(cls, cfg: dict, **given: Any) -> None:
+        """Make what the task of this configuration must find before it is built. given: arguments of the class."""
+
+    def _check_given(self) -> None:
+        """UserError for one of the settings `given` that nothing has read: it would change nothing."""
+        keys, self.given = self.given, ()
+        read = self.task.read | {f"randomize.{name}" for name in self.sampler.read}
+        later = ("task.evaluation", "task.presets", "task.objects.emphasis")
+        mine = [k for k in keys if k.startswith(("task.", "randomize.")) and not k.startswith(later)]
+        for key in unread(read, mine):
+            raise UserError(
+                f"{key}: nothing reads this setting, with the others as they are, so that it would change nothing;"
+                " leave it out, or switch on what it belongs to"
+            )
+
+    def _check_widths(self) -> None:
+        """UserError where a group of observations has not the columns that its table states."""
+        for group, rows in self.describe()["observations"].items():
+            stated, is_wide = sum(row[1] for row in rows), self.obs[group].shape[1]
+            if stated != is_wide:
+                raise UserError(
+                    f"task {self.task['name']}: the {group} sees {is_wide} numbers, its table has {stated}"
+                    f" ({', '.join(f'{row[0]} {row[1]}' for row in rows)}): make them equal"
+                )
 
     # -- for the task to fill in
     # -----------------------------------------------------------------------------------------
@@ -271,6 +339,8 @@ class HandEnv(VecEnv):
         substeps = self.decimation if self.reality is None else self.reality.substeps(self.decimation)
         self.engine.step(substeps, self.servo.before_each, self.feel)
         self._replay("after", self._after)
+        if self.given:
+            self._check_given()
         if self.keep_final_obs:
             final = {k: torch.nan_to_num(v, 0.0, 0.0, 0.0) for k, v in self.observe(advance=False).items()}
         self._replay("reset", self._reset_done)
@@ -296,9 +366,29 @@ class HandEnv(VecEnv):
         self.episode_length_buf += 1
         self.read_state()
         ends, terms = self.terminated(), self.rewards()
+        if self._wrong is None:
+            self._check_terms(ends, terms)
         rates, reward = self._judge(ends, terms)
+        self._rates = rates
         self._nan_dump.after(self.nan)
         self._log(terms, ends, torch.cat([reward, rates]).mean(1))
+
+    def _check_terms(self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]) -> None:
+        """UserError for a term that is not one value for each world."""
+        for kind, values in (("termination", ends), ("reward", terms)):
+            for name, value in values.items():
+                if value.shape != (self.num_envs,):
+                    raise UserError(
+                        f"{kind} {name}: has shape {list(value.shape)}, must be [{self.num_envs}]: one value for each"
+                        " world (squeeze the last axis?)"
+                    )
+        if not terms:
+            raise UserError(f"task {self.task['name']}: no reward is left; give one a weight, task.rewards.NAME=1")
+        self.end_names = (*ends, "nan", "time_out")
+
+    def ended_by(self) -> torch.Tensor:
+        """Index into `end_names` [N] of what ended the episodes that the last step ended."""
+        return self._rates.argmax(0)
 
     def _judge(
         self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]
@@ -360,8 +450,12 @@ class HandEnv(VecEnv):
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
         the joint's range."""
         act, reach = self.task["action"], self._reach
-        reach.relative, reach.scale = act["mode"] == "relative", act.get("scale", 0.0)
-        reach.lead = act.get("lead", 0.0)
+        reach.relative = act["mode"] == "relative"
+        moves = float(act.get("scale", 0.0)), float(act.get("lead", 0.0))
+        if moves != self._moves:
+            self._moves = moves
+            for own, value in zip(self._reaches, moves, strict=True):
+                own[: len(self.hand.joints)] = value
         inputs = [wp.from_torch(actions.to(torch.float32)), reach, *self._act_args]
         wp.launch(state_kernels.act, dim=actions.shape, inputs=inputs, device=self.device)
         if self.reality is None:
@@ -406,15 +500,22 @@ class HandEnv(VecEnv):
         object_pose: torch.Tensor,
         object_velocity: torch.Tensor,
         target: torch.Tensor | None = None,
+        also: Mapping[int, torch.Tensor] | None = None,
     ) -> None:
         """Where mask holds: hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); object at pose
-        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own)."""
+        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own), where
+        it moves freely. also: values [N] of further numbers of qpos, by index (`q_of`)."""
         e, target = self.engine, hand_q if target is None else target
-        qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
+        # what else there is begins as the scene has it
+        qpos = e.t.qpos.clone() if self._alone else self._begin_q.expand_as(e.t.qpos).clone()
+        qvel = torch.zeros_like(e.t.qvel)
         at_q, at_v = self._object_at
         qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
-        qpos[:, at_q : at_q + 7] = object_pose.to(qpos.dtype)
-        qvel[:, at_v : at_v + 6] = object_velocity.to(qvel.dtype)
+        if self.scene.free:
+            qpos[:, at_q : at_q + 7] = object_pose.to(qpos.dtype)
+            qvel[:, at_v : at_v + 6] = object_velocity.to(qvel.dtype)
+        for index, value in (also or {}).items():
+            qpos[:, index] = value.to(qpos.dtype)
         e.set_state(mask, qpos, qvel)
         self.servo.reset(mask, target)
         self.touch.reset(mask)
@@ -424,7 +525,8 @@ class HandEnv(VecEnv):
         """Kernels of a step beside its physics, one of each module at least; a task adds its own."""
         real = self.engine.real
         own = [self._read, state_kernels.act, nan_dump.keep_world]
-        return [*own, object_kernel.write_kernel(real), servos.draw_kernel(real), randomize.spread]
+        write = [] if self.scene.object is None else [object_kernel.write_kernel(real)]
+        return [*own, *write, servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
         """For `compile_side_by_side`, which asks of a launch only which kernel it is of."""
@@ -450,12 +552,37 @@ class HandEnv(VecEnv):
         """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan`
         [N]."""
         wp.launch(self._read, dim=self._read_dim, inputs=self._read_args, device=self.device)
+        if not self.scene.free:
+            self._read_object()
         if self.servo.misread:  # what a hand's own sensors say is all that a policy will know of them
             ok = ~self.nan[:, None]
             for own, reported in ((self.q, self.servo.position()), (self.qd, self.servo.velocity())):
                 own.copy_(torch.where(ok, reported, 0.0))
         if self.reality is not None:
             self.reality.read(self)
+
+    def _read_object(self) -> None:
+        """Pose and velocity of an object on a joint; `object_joint` [N] rad or m and `object_speed` [N]."""
+        e = self.engine.t
+        if self.scene.object is None:
+            return
+        body, (at_q, at_v) = self.objects.body, self._object_at
+        turned = rotation.from_matrix(e.xmat[:, body].float())
+        self.object_pose.copy_(torch.nan_to_num(torch.cat([e.xpos[:, body].float(), turned], 1)))
+        self.object_joint.copy_(torch.nan_to_num(e.qpos[:, at_q].float()))
+        self.object_speed.copy_(torch.nan_to_num(e.qvel[:, at_v].float()))
+        self.object_velocity.zero_()
+        part = 0 if isinstance(self.scene.object, Slide) else 3
+        self.object_velocity[:, part : part + 3] = self.object_speed[:, None] * self.object_axis
+
+    def q_of(self, joint: str) -> int:
+        """Index in qpos of a joint of the scene (the first of a free one's seven): "object_joint", "NAME_free" of a
+        further object, "TREE/JOINT" of an imported one."""
+        return int(self.engine.mjm.jnt_qposadr[self.engine.joint(joint)])
+
+    def v_of(self, joint: str) -> int:
+        """The same in qvel."""
+        return int(self.engine.mjm.jnt_dofadr[self.engine.joint(joint)])
 
     def _index(self) -> None:
         e, dev, hand = self.engine, self.device, self.hand
@@ -464,15 +591,29 @@ class HandEnv(VecEnv):
         def long(x: Any) -> torch.Tensor:
             return torch.as_tensor(x, dtype=torch.long, device=dev)
 
-        self.joint_q, self.joint_v = long(e.qpos_index(hand.joints)), long(e.dof_index(hand.joints))
-        j = e.joint("object_free")
-        self.object_q = long(range(mjm.jnt_qposadr[j], mjm.jnt_qposadr[j] + 7))
-        self.object_v = long(range(mjm.jnt_dofadr[j], mjm.jnt_dofadr[j] + 6))
-        self._object_at = int(mjm.jnt_qposadr[j]), int(mjm.jnt_dofadr[j])
-        limits = torch.as_tensor(hand.limits, dtype=torch.float32, device=dev)
+        self.joint_q, self.joint_v = long(e.qpos_index(self.joints)), long(e.dof_index(self.joints))
+        self._object_at = 0, 0
+        if self.scene.object is not None:
+            joint = "object_free" if self.scene.free else "object_joint"
+            self._object_at = self.q_of(joint), self.v_of(joint)
+        if self.scene.free:
+            self.object_q = long(range(self._object_at[0], self._object_at[0] + 7))
+            self.object_v = long(range(self._object_at[1], self._object_at[1] + 6))
+        elif self.scene.object is not None:
+            axis = mjm.jnt_axis[e.joint(joint)]
+            self.object_axis = torch.as_tensor(axis, dtype=torch.float32, device=dev)
+        self._alone = self.scene.free and not self.furniture.parts and not self.furniture.joints
+        self._begin_q = torch.as_tensor(mjm.qpos0, dtype=e.t.qpos.dtype, device=dev)[None]
+        bounds, efforts = np.asarray(hand.limits), np.asarray(hand.efforts)
+        base = self.scene.base
+        if base is not None:
+            far = np.repeat([base.travel, base.turn], 3)
+            bounds = np.concatenate([bounds, np.stack([-far, far], 1)])
+            efforts = np.concatenate([efforts, np.repeat(base.limit, 3)])
+        limits = torch.as_tensor(bounds, dtype=torch.float32, device=dev)
         self.q_low, self.q_high = limits[:, 0], limits[:, 1]
         self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
-        self.effort = torch.as_tensor(hand.efforts, dtype=torch.float32, device=dev)
+        self.effort = torch.as_tensor(efforts, dtype=torch.float32, device=dev)
         self.tip_body = long([e.body(b) for b in hand.tip_bodies])
         self.pad_centre = torch.as_tensor(self.touch.layout.centre(), dtype=torch.float32, device=dev)
         self.tip_offset = torch.tensor([f.position for f in hand.fingers], dtype=torch.float32, device=dev)
@@ -490,12 +631,14 @@ class HandEnv(VecEnv):
         self.action, self.last_action, self.target = zeros(J), zeros(J), zeros(J)
         self.q, self.qd, self.torque = zeros(J), zeros(J), zeros(J)
         self.object_pose, self.object_velocity = zeros(7), zeros(6)
+        self.object_joint, self.object_speed = zeros(), zeros()
         self.tip_force, self.finger_force, self.self_force, self.palm_force = zeros(F), zeros(F), zeros(F), zeros()
         self.tips = zeros(F, 3)
         self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.reward = zeros()
         # worlds of which an observation was not finite: of any group, then of each
         self._blind = torch.zeros(1 + MOST_GROUPS, n, dtype=torch.bool, device=dev)
+        self.last: dict[str, torch.Tensor] = {}  # figures [N] of each world's last ended episode
         self._wrong = None  # world-steps that were not finite since the last `check`, by source
         self._sources = ()
         self._steps_since = 0
@@ -528,8 +671,15 @@ class HandEnv(VecEnv):
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
             state.xmat, at, seen,
         ]  # fmt: skip
+        base = self.scene.base
+        self._moves = 0.0, 0.0
+        self._reaches = torch.zeros(2, self.num_actions, device=self.device)
+        if base is not None:
+            far = [[x[0]] * 3 + [x[1]] * 3 for x in (base.scale, base.lead)]
+            self._reaches[:, len(self.hand.joints) :] = torch.tensor(far)
         self._reach = filled(
-            state_kernels.Reach, relative=False, scale=0.0, lead=0.0, low=self.q_low, high=self.q_high,
+            state_kernels.Reach, relative=False, scale=self._reaches[0], lead=self._reaches[1], low=self.q_low,
+            high=self.q_high,
             middle=self.q_mid, half=self.q_half,
         )  # fmt: skip
         self._act_args = [wp.from_torch(x) for x in (self.q, self.action, self.last_action, self.target)]
@@ -561,7 +711,7 @@ class HandEnv(VecEnv):
         """A model of one world as it is now, with the shells and skins, to render its qpos; reads from the device."""
         drawn = self._drawn = self._drawn or self.drawn_spec.compile()
         model = copy.copy(drawn)
-        for slot in self.scene.slots:
+        for slot in self.objects.scene.slots if self.scene.object is not None else ():
             g = drawn.geom(slot).id
             e = self.engine.geom(slot)
             for name in ("geom_pos", "geom_quat", "geom_size", "geom_dataid"):
@@ -614,6 +764,49 @@ class HandEnv(VecEnv):
                 " sim.timestep"
             )
 
+    def action_rows(self) -> list[tuple[str, float, float, str]]:
+        """(joint, lowest, highest, what) of the targets, for the first screen."""
+        what, base = f"rad ({self.task['action']['mode']})", len(self.hand.joints)
+        low, high = self.q_low.tolist(), self.q_high.tolist()
+        return [(j, low[k], high[k], what if k < base or k >= base + 3 else what.replace("rad", "m"))
+                for k, j in enumerate(self.joints)]  # fmt: skip
+
+    def usual_ends(self) -> list[tuple[str, str]]:
+        """Rows of the ends that every task has."""
+        return [("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")]
+
+    def describe(self) -> dict[str, Any]:
+        """Tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
+        "terminations", "randomization", "notes", and "headline", names of the log that the console shows."""
+        return {
+            "observations": {group: [(group, value.shape[1], "")] for group, value in self.obs.items()},
+            "action": self.action_rows(),
+            "rewards": [row for row in self.reward_rows() if row[1]],
+            "terminations": self.usual_ends(),
+            "randomization": self.sampler.rows(),
+            "notes": self.hand_notes(),
+        }
+
+    def figure_units(self) -> dict[str, str]:
+        """Units of the figures in `last`, which an evaluation reports."""
+        return dict.fromkeys(self.last, "")
+
+    def judge_kept_out(self, kept_out: bool) -> None:
+        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        raise UserError(f"task {self.task['name']}: has task.objects.held_out, and no judge_kept_out that draws them")
+
+    def evaluate(
+        self,
+        policy: Callable[..., torch.Tensor],
+        episodes: int = 256,
+        seed: int = 0,
+        progress: Callable[..., None] | None = None,
+    ) -> dict:
+        """Play episodes; returns {"metrics", "tables", "frames"} and perhaps "plots" (`dexsim.tasks.evaluation`)."""
+        from dexsim.tasks.evaluation import evaluate
+
+        return evaluate(self, policy, episodes, seed, progress)
+
     def hand_notes(self) -> list[str]:
         """What a reader of the first screen must know of the hand."""
         guessed = self.hand.file.guessed
@@ -624,7 +817,7 @@ class HandEnv(VecEnv):
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        return self.hand.joints
+        return self.joints
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
         """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
@@ -692,7 +885,8 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
 
 
 
-def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:
+def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str, several: bool) -> None:
+    """several: contacts of two hulls may be, or what lies on a table would rock."""
     o = spec.option
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -701,5 +895,5 @@ def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:
     o.noslip_iterations = sim["noslip_iterations"]
     if engine == "warp":  # MuJoCo-Warp then adds up an iteration's Hessian in one kernel, not two: 7 % of the step
         o.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    # one contact a convex pair, so that a fingertip's stiffness is that of one contact
-    o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    if not several:  # one contact a convex pair, so that a fingertip's stiffness is that of one contact
+        o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD

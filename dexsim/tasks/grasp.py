@@ -52,7 +52,7 @@ def _is_range(pair: Any) -> bool:
 
 
 class GraspEnv(HandEnv):
-    """The grasp task; see the module."""
+    """Catch an object, hold it against pushes, press with a commanded force."""
 
     TAKES_OBJECTS = True
 
@@ -85,7 +85,7 @@ class GraspEnv(HandEnv):
                 "task.objects.held_out=[]: must name a shape, e.g. [cross]; policies are judged on some that they never"
                 " met"
             )
-        names = [v.shape.name for v in self.scene.variants]
+        names = [v.shape.name for v in self.objects.scene.variants]
         self.train_rows = torch.tensor([i for i, s in enumerate(names) if s in train], device=dev)
         self.held_rows = torch.tensor([i for i, s in enumerate(names) if s in held], device=dev)
         # every shape is equally likely, whatever the number of its baked sizes
@@ -132,7 +132,7 @@ class GraspEnv(HandEnv):
         self.beside = float(where.beside[1]) if beside is None else beside
         h = 0.5**0.5  # rotations that bring the body's x, y or z axis to palm y
         to_y = torch.tensor([[h, 0.0, 0.0, h], [1.0, 0.0, 0.0, 0.0], [h, -h, 0.0, 0.0]], device=dev)
-        self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.scene.variants], device=dev)]
+        self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.objects.scene.variants], device=dev)]
         pose = t["initial"]["pose"]
         angles = self.hand.pose("open").tolist() if pose is None else [pose[j] for j in self.hand.joints]
         self.pose0 = torch.tensor(angles, device=dev)
@@ -411,13 +411,9 @@ class GraspEnv(HandEnv):
         if self.task["critic"] == "privileged":
             critic += [(name, width, "privileged") for name, width in privileged(self.num_actions, self.fingers)]
         groups["critic"] = critic
-        act = self.task["action"]
         return {
             "observations": groups,
-            "action": [
-                (j, float(lo), float(hi), f"rad ({act['mode']})")
-                for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
-            ],
+            "action": self.action_rows(),
             "rewards": self.reward_rows(),
             "terminations": [
                 (
@@ -425,13 +421,9 @@ class GraspEnv(HandEnv):
                     f"centre below {self.unit * self.task['termination']['below'] + self.rise:.3g} m or"
                     f" {self.unit * self.task['termination']['distance']:.3g} m away",
                 ),
-                ("nan", "state not finite"),
-                ("time_out", f"{self.max_episode_length} steps"),
+                *self.usual_ends(),
             ],
-            "randomization": [
-                (name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
-                for name, (lo, hi, log) in self.sampler.ranges.items()
-            ],
+            "randomization": self.sampler.rows(),
             "notes": [
                 f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[self.others[0]].item():.2f} N.m"
                 " (command 1)",

@@ -189,7 +189,7 @@ def _play(
     out["frames"] = None
     if shown:
         force_shown, given = np.stack(shown_force, 1), command[shown].cpu().numpy()
-        names = [env.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
+        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
         out["frames"] = {
             "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": env.hand.finger_names,
             "full": 1.2 * env.f_max,
@@ -319,7 +319,7 @@ def _correlations(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
 
 def _by_object(r: dict, env: GraspEnv) -> dict[str, float | None]:
     """Share of unpushed episodes held, command >= 0.1, by object."""
-    names = np.array([env.scene.variants[int(v)].shape.name for v in r["shape"]])
+    names = np.array([env.objects.scene.variants[int(v)].shape.name for v in r["shape"]])
     among = ~r["pushed"].astype(bool) & (r["command"] >= 0.1)
     return {str(name): _rate(r["held"], among & (names == name)) for name in np.unique(names)}
 
@@ -451,7 +451,7 @@ def _tables(r: dict, k: dict, env: GraspEnv) -> list:
     by_shape = []
     for part, label in ((r, ""), (k, " (kept out)")):
         able = must_hold(part, f_max, n)
-        names = np.array([env.scene.variants[int(v)].shape.name for v in part["shape"]])
+        names = np.array([env.objects.scene.variants[int(v)].shape.name for v in part["shape"]])
         for name in dict.fromkeys(names.tolist()):
             m = names == name
             p = part["pushed"].astype(bool)

@@ -22,11 +22,12 @@ from dexsim.hand import Hand
 from dexsim.hand.places import approach
 from dexsim.tasks.env import UNIT_SPAN, hand_of
 from dexsim.tasks.reach import Reach
-from dexsim.tasks.rotate import RotateEnv, check_objects
+from dexsim.tasks.registry import task_class
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_file
 
 if TYPE_CHECKING:
     from dexsim.tasks.env import HandEnv
+    from dexsim.tasks.rotate import RotateEnv
 
 SETTLE, HOLD = 2.0, 2.0  # s
 DRIFT, TURN = 0.004, 0.10  # m, rad: how far a held cube may creep in HOLD seconds
@@ -73,7 +74,7 @@ def candidates(
     yaw = 2 * torch.pi * torch.rand(n, generator=rng)
     shape = torch.arange(n) % len(env.names)
     height, onto = edge.clone(), ONTO[2].repeat(n, 1)
-    for k, variant in enumerate(env.scene.variants):
+    for k, variant in enumerate(env.objects.scene.variants):
         mine = torch.nonzero(shape == k)[:, 0]
         if env.names[k] != CUBE and len(mine):
             up = torch.randint(3, (len(mine),), generator=rng)
@@ -151,7 +152,7 @@ def holds(env: HandEnv, start: GraspSet) -> torch.Tensor:
 def _smallest(env: RotateEnv) -> torch.Tensor:
     """Smallest extent of each object [m]; of a cube, whose edges differ, as large as may be."""
     return torch.tensor([
-        torch.inf if v.shape.name == CUBE else float(min(v.shape.extents)) * v.scale for v in env.scene.variants
+        torch.inf if v.shape.name == CUBE else float(min(v.shape.extents)) * v.scale for v in env.objects.scene.variants
     ])  # fmt: skip
 
 
@@ -198,7 +199,7 @@ def ensure(
     """The held poses of a config's hand are there: else they are searched for and kept in the hand's folder. Raises
     UserError."""
     hand, objects = hand_of(cfg), cfg["task"]["objects"]
-    check_objects(cfg["task"])
+    task_class(cfg).check_objects(cfg["task"])  # type: ignore[attr-defined]  # of a task that turns objects
     own = [name for name in (*objects["train"], *objects["held_out"]) if name != CUBE]
     if own:
         raise UserError(
@@ -231,7 +232,8 @@ def generate(
     """`count` held poses (of several objects about as many each), made on the CPU by C MuJoCo. sizes: edges of the
     cubes [m]. Raises UserError."""
     rng = torch.Generator().manual_seed(seed)
-    env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=_waiting(cfg, worlds, sizes))
+    waiting = {"grasps": _waiting(cfg, worlds, sizes)}
+    env: RotateEnv = task_class(cfg)(cfg, worlds, "cpu", seed, "mujoco", **waiting)  # type: ignore[assignment]
     reach = Reach(env.hand, np.random.default_rng(seed))
     found: list[GraspSet] = []
     kinds = len(env.names)

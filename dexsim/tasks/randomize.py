@@ -84,6 +84,7 @@ class Sampler:
     def __init__(self, cfg: dict, rng: torch.Generator, n: int, device: str):
         self.cfg, self.rng, self.n, self.device = cfg, rng, n, device
         self.ranges: dict[str, tuple[float, float, bool]] = {}
+        self.read: set[str] = set()  # names of ranges that somebody asked for
         # share of each range, about its middle, that `draw` uses: a curriculum widens it
         self.width = torch.ones((), device=device)
         self._read("randomize", cfg)
@@ -153,7 +154,14 @@ class Sampler:
         if a < low or b > high:
             raise UserError(f"randomize.{name}=[{a:g}, {b:g}]: must lie in [{low:g}, {high:g}]")
 
+    def rows(self) -> list[tuple[str, str, str]]:
+        """(name, range, "") of all ranges, for the first screen."""
+        return [
+            (name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.ranges.items()
+        ]
+
     def range(self, name: str) -> tuple[float, float, bool]:
+        self.read.add(name)
         if name not in self.ranges:
             raise UserError(f"randomize.{name} is missing; the file has: {', '.join(self.ranges)}")
         return self.ranges[name]

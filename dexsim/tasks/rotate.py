@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -51,27 +52,8 @@ def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
     )  # fmt: skip
 
 
-def check_objects(task: dict) -> None:
-    """Raises UserError for objects that this task cannot turn."""
-    objects, tips = task["objects"], task.get("mode") == "fingertips"
-    if not objects["train"]:
-        raise UserError(f"task.objects.train=[]: must name '{CUBE}'{'' if tips else ' or mesh files'}")
-    for key in ("train", "held_out"):
-        for name in objects[key]:
-            if name != CUBE and (tips or not is_own(name)):
-                raise UserError(
-                    f"task.objects.{key}: '{name}': this task turns '{CUBE}'{'' if tips else ' or the path of a mesh'}"
-                )
-    names = [called(name) for name in dict.fromkeys((*objects["train"], *objects["held_out"]))]
-    if len(set(names)) < len(names):
-        raise UserError(
-            f"task.objects: {', '.join(names)}: two of one name, and held poses know a mesh by its file's name; rename"
-            " one"
-        )
-
-
 class RotateEnv(HandEnv):
-    """The rotation task; see the module.
+    """Turn a cube on the palm about one axis, 90 degrees at a time.
 
     goal [N, 4]: orientation to reach (object to palm); home [N, 3]: where the cube lay when the episode began, m;
     successes [N]: goals reached in this episode.
@@ -86,11 +68,39 @@ class RotateEnv(HandEnv):
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
         """grasps: start from these instead of the file `task.initial.poses`."""
-        check_objects(cfg["task"])
+        self.check_objects(cfg["task"])
         self.grasps, self.in_order = grasps, False
         if not cfg["task"]["observe"]["force_weighted"]:  # the plain mean needs every taxel
             cfg = {**cfg, "tactile": {**cfg["tactile"], "raw": True}}
         super().__init__(cfg, n_worlds, device, seed, engine)
+
+    @classmethod
+    def check_objects(cls, task: dict) -> None:
+        """Raises UserError for objects that this task cannot turn."""
+        objects, tips = task["objects"], not cls.TAKES_OBJECTS
+        if not objects["train"]:
+            raise UserError(f"task.objects.train=[]: must name '{CUBE}'{'' if tips else ' or mesh files'}")
+        for key in ("train", "held_out"):
+            for name in objects[key]:
+                if name != CUBE and (tips or not is_own(name)):
+                    raise UserError(
+                        f"task.objects.{key}: '{name}': this task turns '{CUBE}'"
+                        f"{'' if tips else ' or the path of a mesh'}"
+                    )
+        names = [called(name) for name in dict.fromkeys((*objects["train"], *objects["held_out"]))]
+        if len(set(names)) < len(names):
+            raise UserError(
+                f"task.objects: {', '.join(names)}: two of one name, and held poses know a mesh by its file's name;"
+                " rename one"
+            )
+
+    @classmethod
+    def prepare(cls, cfg: dict, **given: Any) -> None:
+        """Search for the held poses of a hand that has none yet."""
+        if given.get("grasps") is None and cfg["task"]["initial"]["poses"] is None:
+            from dexsim.tasks.make_grasps import ensure
+
+            ensure(cfg)
 
     def setup(self) -> None:
         t, n, dev, F = self.task, self.num_envs, self.device, self.fingers
@@ -108,7 +118,8 @@ class RotateEnv(HandEnv):
         below = self.unit * t["termination"]["below"]
         self.lowest = torch.tensor(
             [below + self.rise if v.shape.name == CUBE else
-             min(below, LEAST * float(min(v.shape.extents)) * v.scale) + self.rise for v in self.scene.variants],
+             min(below, LEAST * float(min(v.shape.extents)) * v.scale) + self.rise
+             for v in self.objects.scene.variants],
             device=dev,
         )  # fmt: skip
         ends = t["termination"]
@@ -179,7 +190,7 @@ class RotateEnv(HandEnv):
             raise UserError(f"task.curriculum={c}: steps must be 0 (none) or more, start must lie in [0, 1]")
         if t["observe"].get("last_action", "step") not in ("target", "step"):
             raise UserError(f"task.observe.last_action={t['observe']['last_action']}: must be target or step")
-        if not 1 <= t["history"] <= 32:
+        if t["perception"] == "proprioception" and not 1 <= t["history"] <= 32:
             raise UserError(f"task.history={t['history']}: must lie in [1, 32]")
         ends = t["termination"]
         if ends.get("training") is not None and not 0 < ends["training"] <= ends["distance"]:
@@ -523,22 +534,15 @@ class RotateEnv(HandEnv):
         edge, what = 1000 * self.grasps.edge, "cubes" if self.names == (CUBE,) else ", ".join(self.names)
         return {
             "observations": {"actor": actor, "critic": seen},
-            "action": [
-                (j, float(lo), float(hi), f"rad ({t['action']['mode']})")
-                for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
-            ],
+            "action": self.action_rows(),
             "rewards": [row for row in self.reward_rows() if row[1]],
             "terminations": [
                 ("dropped", f"centre {float(self.farthest):.3g} m from its start or below"
                  f" {self.unit * limit['below'] + self.rise:.3g} m"),
                 ("tipped", f"{limit['tilt']} rad away from lying on its face"),
-                ("nan", "state not finite"),
-                ("time_out", f"{self.max_episode_length} steps"),
+                *self.usual_ends(),
             ],
-            "randomization": [
-                (name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
-                for name, (lo, hi, log) in self.sampler.ranges.items()
-            ],
+            "randomization": self.sampler.rows(),
             "notes": [
                 f"{len(self.grasps)} held poses, {what} of {edge.min():.0f}-{edge.max():.0f} mm",
                 f"reached: rotation error below {r['delta_rot']} rad and drift below"

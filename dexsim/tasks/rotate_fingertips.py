@@ -10,6 +10,7 @@ ours; reward and success are those of `tasks/rotate.py`.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +38,9 @@ TOUCH = 0.1  # N on anything but fingertips that counts as touching it
 
 
 class FingertipEnv(RotateEnv):
-    """See the module. start [N, 4]: orientation as first held; gravity [N, 3] m/s2, palm frame; palm [N]: index into
+    """Turn a cube that fingertips hold, about three axes, seen late and with gaps.
+
+    start [N, 4]: orientation as first held; gravity [N, 3] m/s2, palm frame; palm [N]: index into
     PALMS; other_force [N] N on anything but fingertips; hidden [N] s that the camera sees nothing yet; age [N] s."""
 
     TAKES_OBJECTS = False  # its held poses are of a cube
@@ -51,6 +54,10 @@ class FingertipEnv(RotateEnv):
         if cfg["task"]["observe"]["taxels"] is not None:  # patches are sums of taxels
             cfg = {**cfg, "tactile": {**cfg["tactile"], "raw": True}}
         super().__init__(cfg, n_worlds, device, seed, engine, grasps)
+
+    @classmethod
+    def prepare(cls, cfg: dict, **given: Any) -> None:
+        """Nothing: poses held by fingertips come with dexsim, or are given."""
 
     def setup(self) -> None:
         t, n, dev = self.task, self.num_envs, self.device

@@ -3,6 +3,7 @@ Randomization"), always from the table's nominal."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
+from collections.abc import Sequence
 from functools import cache
 
 import torch
@@ -71,7 +72,8 @@ class ServoRandomizer:
     otherwise `randomize.servo.<column>` says how: a factor for the columns in RELATIVE, an addition for the others.
     """
 
-    def __init__(self, servo: Servo, sampler: Sampler):
+    def __init__(self, servo: Servo, sampler: Sampler, exact: Sequence[str] = ()):
+        """exact: joints whose drives stay as the table has them."""
         wp.init()
         self.servo, self.sampler = servo, sampler
         low, high = servo.table.bounds(servo.joints)
@@ -80,6 +82,7 @@ class ServoRandomizer:
         fitted = torch.as_tensor((low < high) & ~unknown, device=dev)
         self.low = torch.where(fitted, torch.as_tensor(low, device=dev, dtype=dtype), servo.nominal)
         self.high = torch.where(fitted, torch.as_tensor(high, device=dev, dtype=dtype), servo.nominal)
+        fitted[[servo.joints.index(name) for name in exact]] = True
         self.fitted = fitted
         self.simulated = torch.as_tensor(simulated(servo.features), device=dev)
         self.columns = [name.removeprefix("servo.") for name in sampler.ranges if name.startswith("servo.")]

@@ -118,8 +118,8 @@ class Reach:
     """What targets a joint may be given. Relative: an action moves the target, else it spans the range."""
 
     relative: bool
-    scale: float  # rad a control step; relative only
-    lead: float  # rad that a target may be ahead of the measured angle; relative only
+    scale: wp.array(dtype=float)  # [J] rad a control step; relative only
+    lead: wp.array(dtype=float)  # [J] rad that a target may be ahead of the measured angle; relative only
     low: wp.array(dtype=float)  # [J] rad
     high: wp.array(dtype=float)
     middle: wp.array(dtype=float)
@@ -146,8 +146,8 @@ def act(
     action[w, j] = a
     t = reach.middle[j] + a * reach.half[j]
     if reach.relative:
-        t = target[w, j] + a * reach.scale
-        t = wp.max(wp.min(t, q[w, j] + reach.lead), q[w, j] - reach.lead)
+        t = target[w, j] + a * reach.scale[j]
+        t = wp.max(wp.min(t, q[w, j] + reach.lead[j]), q[w, j] - reach.lead[j])
     target[w, j] = wp.max(wp.min(t, reach.high[j]), reach.low[j])
 
 

@@ -24,7 +24,8 @@ SAME = ("worlds", "task", "sim", "servo", "tactile", "randomize", "model_file", 
 def live(env: HandEnv) -> dict[str, tuple[torch.Tensor, int, int]]:
     """(tensor, lowest, highest) of all memory by name; the bounds matter for whole numbers only."""
     out: dict[str, tuple[torch.Tensor, int, int]] = {}
-    for part in (env.engine, env.servo, env.touch, env.objects, env):
+    things = () if env.scene.object is None else (env.objects,)
+    for part in (env.engine, env.servo, env.touch, *things, env):
         name = "env" if part is env else type(part).__name__.lower()
         for key, value in part.memory().items():
             tensor, low, high = value if isinstance(value, tuple) else (value, 0, 0)

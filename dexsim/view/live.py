@@ -310,7 +310,7 @@ class LiveView:
 
     def _about(self, world: int) -> dict[str, object]:
         env = self.env
-        variant = env.scene.variants[int(env.objects.variant[world])]
+        variant = env.objects.scene.variants[int(env.objects.variant[world])]
         rows = {
             "time": f"{int(env.episode_length_buf[world]) * env.dt:.2f} s of the episode",
             "step": self.steps,

@@ -1,0 +1,194 @@
+"""Finds tasks: those of dexsim, those of installed packages, and any class that the user names.
+
+    dexsim train task=grasp                      a task of dexsim: a file of dexsim/configs/task, which names its class
+    dexsim train task=lift                       of an installed package: an entry point of the group `dexsim.tasks`
+    dexsim train task=my_tasks.lift:Lift         anything importable, the current folder included
+
+A file (a checkpoint, a bundle, a dump) names its task as "module:Class" too, but has no say in what is imported: a
+class is loaded only if dexsim or an installed package provides it, or the user named it in this process.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dexsim.console import program
+from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
+
+GROUP = "dexsim.tasks"
+CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""A class as the user names one."""
+
+_named: dict[str, type[HandEnv] | None] = {}
+"""Classes that the user named in this process: typed on the command line (None until it is loaded), or given as an
+object."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A task that can be chosen by name. where: "module:Class"; origin: "dexsim", or the package that provides it."""
+
+    name: str
+    where: str
+    origin: str
+
+
+@cache
+def built_in(folder: Path = CONFIGS / "task") -> dict[str, str]:
+    """The tasks of dexsim, name -> "module:Class": each settings file of a task names its class."""
+    found = {}
+    for file in sorted(folder.glob("*.yaml")):
+        named = re.search(r"^class: *(\S+)", file.read_text(encoding="utf-8"), re.M)
+        if named:
+            found[file.stem] = named[1]
+    return found
+
+
+def installed() -> dict[str, EntryPoint]:
+    """The tasks of other installed packages by name: their entry points in the group `dexsim.tasks`."""
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def entries() -> Iterator[Entry]:
+    """All tasks that can be chosen by name."""
+    for name, where in built_in().items():
+        yield Entry(name, where, "dexsim")
+    for name, point in installed().items():
+        yield Entry(name, point.value, point.dist.name if point.dist else "?")
+
+
+def is_class(choice: str) -> bool:
+    """Whether a choice of task is spelled "module:Class"."""
+    return bool(CLASS.fullmatch(choice))
+
+
+def name_class(where: str, made: type[HandEnv] | None = None) -> str:
+    """Note that the user named this class, so that it may be imported; made: the class itself. Returns `where`."""
+    _named[where] = made or _named.get(where)
+    return where
+
+
+def where_of(made: type) -> str:
+    """The "module:Class" of a class. Of one in the script that runs, the script's name is the module."""
+    module = made.__module__
+    if module == "__main__" and getattr(sys.modules["__main__"], "__file__", None):
+        module = Path(str(sys.modules["__main__"].__file__)).stem
+    return f"{module}:{made.__name__}"
+
+
+def find(choice: str) -> str:
+    """The "module:Class" of a chosen task: a name, or a class, which is then named by the user. Raises UserError."""
+    if is_class(choice):
+        return name_class(choice)
+    known = {entry.name: entry.where for entry in entries()}
+    if choice not in known:
+        near = difflib.get_close_matches(choice, known, 1)
+        raise UserError(
+            f"task={choice}: no such task; task can be {', '.join(known)}, or a class of your own,"
+            f" task=module:Class{f' (did you mean {near[0]}?)' if near else ''}"
+        )
+    return known[choice]
+
+
+def load(where: str, source: str = "") -> type[HandEnv]:
+    """The class "module:Class". Raises UserError: nobody that may name it has, it cannot be imported, or it is no task.
+
+    source: the file that names it, for the message.
+    """
+    if where in _named and _named[where] is not None:
+        return _named[where]  # type: ignore[return-value]  # looked at just now
+    if where not in _named and not provided(where):
+        said = f"{source}: its task" if source else "the task"
+        raise UserError(
+            f"{said} {where} is provided by no installed package; if you trust its code, type task={where} as well:"
+            f" {program.typed()} task={where}"
+        )
+    made = _imported(where, f"{source}: task {where}" if source else f"task={where}")
+    if where in _named:
+        _named[where] = made
+    return made
+
+
+def provided(where: str) -> bool:
+    """Whether dexsim or an installed package provides a class, so that whoever names it may have it imported."""
+    return where in built_in().values() or where in {point.value for point in installed().values()}
+
+
+def typing(where: str) -> str:
+    """What a command that is given a file of this task must say too: " task=module:Class", or nothing."""
+    return "" if provided(where) else f" task={where}"
+
+
+def _imported(where: str, about: str) -> type[HandEnv]:
+    from dexsim.tasks.env import HandEnv
+
+    module, _, name = where.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path and "" not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        loaded = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name and (module == error.name or module.startswith(f"{error.name}.")):
+            raise UserError(
+                f"{about}: there is no module {error.name}, neither installed nor in {here}; run this in the folder"
+                " that holds it, or install its package"
+            ) from None
+        raise UserError(f"{about}: {module} needs the module {error.name}, which is not installed") from None
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{about}: {module} fails as it is imported: {_failure(error)}") from error
+    made = getattr(loaded, name, None)
+    if made is None:
+        tasks = [k for k, v in vars(loaded).items() if isinstance(v, type) and issubclass(v, HandEnv)]
+        own = [k for k in tasks if getattr(loaded, k).__module__ == module]
+        raise UserError(f"{about}: {module} has no {name}; the tasks in it: {', '.join(own) or 'none'}")
+    if not (isinstance(made, type) and issubclass(made, HandEnv)):
+        raise UserError(f"{about}: {name} is no task: derive it from dexsim.tasks.Task")
+    return made
+
+
+def _failure(error: Exception) -> str:
+    """An error and the line of the file in which it arose, in one line."""
+    line = getattr(error, "lineno", None)
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    line = line or (trace.tb_lineno if trace is not None else 0)
+    file = getattr(error, "filename", None) or (trace.tb_frame.f_code.co_filename if trace is not None else "")
+    return f"{type(error).__name__}: {error} ({Path(str(file)).name}, line {line})"
+
+
+def of_config(cfg: dict[str, Any]) -> str:
+    """The "module:Class" of a resolved config's task. Checkpoints from before name no class: the settings file of the
+    task that they chose does."""
+    task = cfg["task"]
+    where = task.get("class")
+    if where is None:
+        chosen = (cfg.get("choices") or {}).get("task") or task["name"]
+        return find(str(chosen))
+    return str(where)
+
+
+def task_class(cfg: dict[str, Any], source: str = "") -> type[HandEnv]:
+    """The class of a resolved config's task. Raises UserError; source: the file that the config is from."""
+    return load(of_config(cfg), source)
+
+
+def about(made: type) -> str:
+    """The first line of a task's docstring."""
+    return ((made.__doc__ or "").strip().splitlines() or [""])[0]

@@ -1,0 +1,562 @@
+"""`Task`: a task of your own in one file, declared by terms.
+
+    from dexsim.tasks import Task, done, observe, reward
+
+    class Lift(Task):
+        \"\"\"Raise the box.\"\"\"
+
+        @observe("rad", noise=0.003)
+        def joint_position(self):
+            return self.q
+
+        @reward(2.0)
+        def height(self, top=0.08):
+            return (self.object_pose[:, 2] / top).clamp(0, 1)
+
+    dexsim train task=my_tasks:Lift
+
+A control step: `before_physics` (commands, events) -> physics, touch -> `update` -> terminations -> rewards -> metrics
+-> masked reset (`begin`) -> observations.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, ClassVar
+
+import torch
+
+from dexsim import rotation, yaml_text
+from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
+from dexsim.tasks import registry
+from dexsim.tasks.env import HandEnv
+from dexsim.tasks.scenes import BASE
+from dexsim.tasks.servos import ServoRandomizer
+from dexsim.tasks.stable_grasps import CUBE, GraspSet, held_poses
+from dexsim.tasks.terms import Memory, Sensing, Term, memories_of, span, terms_of
+
+SWITCHES = ("actor", "critic")
+STATE = (
+    "q", "qd", "torque", "target", "action", "last_action", "object_pose", "object_velocity", "object_joint",
+    "object_speed", "tips", "tip_force", "finger_force", "self_force", "palm_force", "reward", "done", "time_out",
+    "nan", "obs", "engine", "servo", "touch", "objects", "sampler", "rng", "task", "cfg", "hand", "joints", "fingers",
+    "pads", "commands", "last", "dt", "device", "num_envs", "num_actions",
+)  # fmt: skip
+"""What every environment holds by these names."""
+
+
+class Task(HandEnv):
+    """A task made of declared terms (`dexsim.tasks.terms`).
+
+    A subclass may set: `scene`, what stands around the hand; `settings`, laid over `dexsim/configs/own_task.yaml`, part
+    `task`; `randomize`, laid over its part `randomize`; `weights`, of rewards by name, over those of the decorators.
+
+    Tensors of N worlds for terms, in the palm frame (of a hand on a base: the world's), SI units: q, qd, torque,
+    target, action, last_action [N, J]; object_pose [N, 7] (x y z, w x y z), object_velocity [N, 6] (linear in the
+    world, angular in the object's frame); tips [N, F, 3]; touch_force [N, P], touch_centre [N, P, 3] of the pads;
+    tip_force, finger_force, self_force [N, F], palm_force [N]; episode_length_buf [N] control steps.
+    """
+
+    TAKES_OBJECTS = True
+    settings: ClassVar[Mapping[str, Any]] = {}
+    weights: ClassVar[Mapping[str, float]] = {}
+    randomize: ClassVar[Mapping[str, Any]] = {}
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        for name, value in vars(cls).items():
+            is_term = isinstance(value, Memory) or hasattr(value, "_dexsim_term")
+            before = next((vars(base)[name] for base in cls.__mro__[1:] if name in vars(base)), None)
+            taken = before is not None and not isinstance(before, Memory) and not hasattr(before, "_dexsim_term")
+            if is_term and (taken or (isinstance(value, Memory) and name in STATE)):
+                raise UserError(f"{cls.__name__}.{name}: every task has something of this name; give it another")
+
+    # -- from the class to settings
+    # ----------------------------------------------------------------------------------------------
+    @classmethod
+    def config(cls) -> dict[str, Any]:
+        """The settings that a run of this task starts from: groups "task" and "randomize"."""
+        out = copy.deepcopy(_start())
+        weights: dict[str, float] = {}
+        for owner in reversed(cls.__mro__):
+            own = vars(owner)
+            _lay(out["task"], own.get("settings", {}))
+            _lay(out["randomize"], own.get("randomize", {}) if isinstance(own.get("randomize"), Mapping) else {})
+            weights |= own.get("weights", {})
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+        task = {"name": name, "class": registry.where_of(cls)} | out["task"]
+        terms = terms_of(cls)
+        unknown = sorted(set(weights) - {t.name for t in terms["reward"]})
+        if unknown:
+            raise UserError(f"task {name}: weights of {', '.join(unknown)}: there is no reward of that name")
+        task["observations"] = {t.name: _observation(t) for t in terms["observe"]}
+        task["rewards"] = {t.name: weights.get(t.name, t.options["weight"]) for t in terms["reward"]}
+        task["terminations"] = {t.name: True for t in terms["done"]}
+        for kind, part in (("reward", "reward"), ("done", "termination"), ("metric", "metric")):
+            task[part] = {t.name: dict(t.params) for t in terms[kind] if t.params}
+        task["commands"] = {
+            t.name: {"hold_s": _plain(t.options["hold_s"]), **dict.fromkeys(SWITCHES, True), **_only(t), **t.params}
+            for t in terms["command"]
+        }
+        task["events"] = {t.name: {"on": True, "every_s": _plain(t.options["every_s"]), **t.params}
+                          for t in terms["event"]}  # fmt: skip
+        return out | {"task": task}
+
+    # -- setting up
+    # --------------------------------------------------------------------------------------------------------------
+    def setup(self) -> None:
+        n, dev, t = self.num_envs, self.device, self.task
+        self._terms = terms_of(type(self))
+        self._check_names()
+        self._clean_read, self._is_clean = False, False
+        for held in memories_of(type(self)).values():
+            held.allocate(self)
+        self.servo_random = ServoRandomizer(self.servo, self.sampler, BASE if self.scene.base is not None else ())
+        self._gravity = torch.tensor(self.engine.mjm.opt.gravity, dtype=torch.float32, device=dev)
+        self._sensed = [Sensing(x, t["observations"][x.name], f"task.observations.{x.name}")
+                        for x in self._terms["observe"]]  # fmt: skip
+        self._history: torch.Tensor | None = None
+        if not (isinstance(t["history"], int) and 1 <= t["history"] <= 64):
+            raise UserError(f"task.history={t['history']}: must be a whole number in [1, 64]")
+        self.commands: dict[str, torch.Tensor] = {}
+        self._left: dict[str, torch.Tensor] = {}
+        self._due: dict[str, torch.Tensor] = {}
+        for x in self._terms["event"]:
+            if t["events"][x.name]["every_s"] is not None:
+                self._due[x.name] = torch.zeros(n, device=dev)
+        self.last: dict[str, torch.Tensor] = {x.name: torch.zeros(n, device=dev) for x in self._terms["metric"]}
+        self._figures: dict[str, torch.Tensor] = {}
+        self._grasps: GraspSet | None = None
+        if self.scene.object is not None:
+            self._set_objects()
+        self.prepare_task()
+        for x in self._terms["command"]:
+            value = self._command_value(x)
+            self.commands[x.name] = torch.zeros_like(value)
+            self._left[x.name] = torch.zeros(n, device=dev)
+
+    def prepare_task(self) -> None:
+        """Allocate what the task needs beside declared memory; called once, before the first episode."""
+
+    def _check_names(self) -> None:
+        t, known = self.task, {kind: [x.name for x in terms] for kind, terms in self._terms.items()}
+        parts = (("observations", "observe"), ("terminations", "done"), ("commands", "command"), ("events", "event"))
+        for part, kind in parts:
+            for name in t.get(part) or {}:
+                if name not in known[kind]:
+                    raise UserError(f"task.{part}.{name}: there is no such term; there are"
+                                    f" {', '.join(known[kind]) or 'none'}")  # fmt: skip
+
+    def _set_objects(self) -> None:
+        t, dev = self.task, self.device
+        train, held = t["objects"]["train"], t["objects"]["held_out"]
+        names = [v.shape.name for v in self.objects.scene.variants]
+        rows = [torch.tensor([i for i, x in enumerate(names) if x in group], device=dev) for group in (train, held)]
+        self._rows_of = rows
+        # every shape is equally likely, whatever the number of its baked sizes
+        self._odds = torch.tensor([1.0 / names.count(x) for x in names], device=dev)
+        self.judge_kept_out(False)
+        for name, low, high in (
+            ("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.com", -0.25, 0.25),
+            ("object.scale", 0.05, 20.0), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
+        ):  # fmt: skip
+            self.sampler.check(name, low, high)
+
+    def judge_kept_out(self, kept_out: bool) -> None:
+        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        self._rows = self._rows_of[kept_out]
+        odds = self._odds[self._rows]
+        self._chances = (odds / odds.sum()).cumsum(0)
+
+    # -- what terms read
+    # ---------------------------------------------------------------------------------------------------------
+    @property
+    def clean(self) -> bool:
+        """Whether the value that is computed now is for the critic, which sees no faults of sensors."""
+        self._clean_read = True
+        return self._is_clean
+
+    @property
+    def touch_force(self) -> torch.Tensor:
+        """Normal force on each pad [N, P], N."""
+        return (self.touch.force_clean if self.clean else self.touch.force)[:, : self.pads]
+
+    @property
+    def touch_centre(self) -> torch.Tensor:
+        """Centre of pressure of each pad [N, P, 3], m."""
+        return (self.touch.centre_clean if self.clean else self.touch.centre)[:, : self.pads]
+
+    @property
+    def object_spin(self) -> torch.Tensor:
+        """Angular velocity of the object in the world [N, 3], rad/s."""
+        return rotation.rotate(self.object_pose[:, 3:], self.object_velocity[:, 3:])
+
+    @property
+    def age(self) -> torch.Tensor:
+        """Time since each episode began [N], s."""
+        return self._episode_length * self.dt
+
+    def thing_pose(self, name: str) -> torch.Tensor:
+        """Pose [N, 7] of a further object of the scene."""
+        at = self.q_of(f"{name}_free")
+        return self.engine.t.qpos[:, at : at + 7].float()
+
+    def joint_of(self, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Position [N] (rad or m) and speed [N] of a joint of an imported tree, "TREE/JOINT"."""
+        return self.engine.t.qpos[:, self.q_of(name)].float(), self.engine.t.qvel[:, self.v_of(name)].float()
+
+    # -- episodes
+    # ----------------------------------------------------------------------------------------------------------------
+    def begin_episodes(self, mask: torch.Tensor) -> None:
+        """Draw object, touch, drives; then `begin`, commands and events of the task."""
+        for held in memories_of(type(self)).values():
+            if held.reset:
+                own = self.__dict__[held.name]
+                own.masked_fill_(mask.view(-1, *(1,) * (own.dim() - 1)), 0)
+        if self.scene.object is not None:
+            self._draw_object(mask)
+        self.touch.randomize(mask, self.rng)
+        self.servo_random.draw(mask)
+        gravity = self.engine.field("opt.gravity")
+        torch.where(mask[:, None], self._gravity.to(gravity.dtype), gravity, out=gravity)
+        self.begin(mask)
+        if self._terms["command"] or self._terms["event"]:  # which may ask where things are now
+            self.engine.refresh()
+            self.read_state()
+        for row in self._sensed:
+            row.begin(mask, self.sampler.uniform, self.dt)
+        for x in self._terms["command"]:
+            self.renew(x.name, mask)
+        for x in self._terms["event"]:
+            self._happen(x, mask, True)
+
+    def begin(self, mask: torch.Tensor) -> None:
+        """Put hand and object where an episode begins in the masked worlds, through `start`, `drop_object` or `hold`;
+        by default the object falls on the open palm."""
+        if self.scene.free and self.scene.base is None:
+            self.drop_object(mask)
+        else:
+            self.start(mask)
+
+    def _draw_object(self, mask: torch.Tensor) -> None:
+        s = self.sampler
+        pick = torch.searchsorted(self._chances, s.uniform()).clamp(max=len(self._chances) - 1)
+        scale = self.unit * s.draw("object.scale")[:, None].expand(-1, 3)
+        self._physics = {
+            "mass": s.draw("object.mass"), "com": s.draw("object.com", 3), "friction": s.draw("object.friction"),
+            "stiffness": s.draw("contact.stiffness"), "damping_ratio": s.draw("contact.damping_ratio"),
+        }  # fmt: skip
+        self.give_object(mask, self._rows[pick], scale.contiguous())
+
+    def give_object(self, mask: torch.Tensor, row: torch.Tensor, scale: torch.Tensor) -> None:
+        """Where mask holds: an object by its row [N] of the scene's table, of `scale` [N, 3] times its shape's size
+        where that is a box, sphere or capsule; its mass and friction as drawn."""
+        self.objects.write(mask, row, scale=scale, **self._physics)
+        here = self.touch if self.touch.shape_id.dim() == 1 else None
+        ids, sizes = (self.touch.shape_id, self.touch.shape_size) if here is not None else (
+            self.touch.shape_id[:, 0], self.touch.shape_size[:, 0])  # fmt: skip
+        ids.copy_(self.objects.variant.to(torch.int32))
+        sizes.copy_(self.objects.size)
+
+    def pose(self, name: str) -> torch.Tensor:
+        """Joint angles [J] of the hand's pose "open" or "cupped", a base at 0."""
+        angles = torch.zeros(self.num_actions, device=self.device)
+        angles[: len(self.hand.joints)] = torch.as_tensor(self.hand.pose(name), dtype=torch.float32)
+        return angles
+
+    def start(
+        self,
+        mask: torch.Tensor,
+        hand: str | torch.Tensor = "open",
+        object_pose: torch.Tensor | None = None,
+        target: torch.Tensor | None = None,
+        also: Mapping[int, torch.Tensor] | None = None,
+    ) -> torch.Tensor:
+        """Where mask holds: the hand in a pose (its name, or [J] or [N, J] rad), give or take
+        `randomize.initial.joint`, at rest, sent to `target` [N, J]; the object at object_pose [N, 7], which is
+        returned. also: see `place`."""
+        n = self.num_envs
+        angles = (self.pose(hand) if isinstance(hand, str) else hand).expand(n, -1)
+        off = self.sampler.draw("initial.joint", self.num_actions)
+        if self.scene.base is not None:
+            off = off.clone()
+            off[:, len(self.hand.joints) :] = 0.0
+        angles = torch.maximum(torch.minimum(angles + off, self.q_high), self.q_low)
+        still = torch.zeros_like(self.object_velocity)
+        pose = self.object_pose if object_pose is None else object_pose
+        self.place(mask, angles, pose, still, target, also)
+        return pose
+
+    def drop_object(self, mask: torch.Tensor, above: float = 0.03, spread: float = 0.01) -> torch.Tensor:
+        """Where mask holds: the open hand, the object at rest in any orientation, `above` m over the palm and its own
+        radius, give or take `spread` m aside. Returns its pose [N, 7]."""
+        s = self.sampler
+        where = torch.as_tensor(self.places.catch, dtype=torch.float32, device=self.device).expand(self.num_envs, 3)
+        where = where.clone()
+        where[:, :2] += spread * (2 * s.uniform(2) - 1)
+        where[:, 2] += above + self.objects.radius
+        return self.start(mask, "open", torch.cat([where, s.quaternion()], 1))
+
+    def hold(self, mask: torch.Tensor) -> torch.Tensor:
+        """Where mask holds: a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its edge
+        is `randomize.object.size`, m. Returns its pose [N, 7]."""
+        s = self.sampler
+        if self._grasps is None:
+            edges = [self.unit * x for x in s.range("object.size")[:2]]
+            file = self.task["initial"]["poses"]
+            with torch.inference_mode(False):
+                self._grasps = held_poses(self.hand, file).within(*edges).to(self.device)
+                self._half = self.objects.primitive_size(
+                    torch.full((1,), self.shape_names.index(CUBE), device=self.device),
+                    torch.ones(1, 3, device=self.device),
+                )
+        g = self._grasps
+        pick = (s.uniform() * len(g)).long().clamp(max=len(g) - 1)
+        row = torch.full_like(pick, self.shape_names.index(CUBE))
+        self.give_object(mask, row, g.edge[pick][:, None] / 2 / self._half)
+        self.place(mask, g.hand[pick], g.pose[pick], torch.zeros_like(self.object_velocity), g.target[pick])
+        return g.pose[pick]
+
+    # -- commands and events
+    # -------------------------------------------------------------------------------------------------------
+    def _command_value(self, term: Term) -> torch.Tensor:
+        value = term.method(self, **self._params("commands", term))
+        return _columns(value, self.num_envs, f"command {term.name}").float()
+
+    def renew(self, name: str, mask: torch.Tensor) -> None:
+        """A new value of a command where mask [N] holds."""
+        term = next(x for x in self._terms["command"] if x.name == name)
+        self.commands[name].copy_(torch.where(mask[:, None], self._command_value(term), self.commands[name]))
+        low, high = span(self.task["commands"][name]["hold_s"], f"task.commands.{name}.hold_s")
+        held = low if low == high else low + (high - low) * self.sampler.uniform()
+        self._left[name].copy_(torch.where(mask, held, self._left[name]))
+
+    def before_physics(self) -> None:
+        """Commands that are held long enough change; events that are due happen."""
+        for x in self._terms["command"]:
+            low, _ = span(self.task["commands"][x.name]["hold_s"], f"task.commands.{x.name}.hold_s")
+            if low != float("inf"):
+                self._left[x.name] -= self.dt
+                self.renew(x.name, self._left[x.name] <= 0)
+        for x in self._terms["event"]:
+            self._happen(x, None, False)
+
+    def _happen(self, term: Term, begun: torch.Tensor | None, beginning: bool) -> None:
+        given = self.task["events"][term.name]
+        if not given["on"]:
+            return
+        if given["every_s"] is None:
+            if begun is not None:
+                term.method(self, begun, **self._params("events", term))
+            return
+        low, high = span(given["every_s"], f"task.events.{term.name}.every_s")
+        due = self._due[term.name]
+        wait = low + (high - low) * self.sampler.uniform()
+        if begun is not None:
+            due.copy_(torch.where(begun, wait, due))
+            return
+        due -= self.dt
+        now = due <= 0
+        term.method(self, now, **self._params("events", term))
+        due.copy_(torch.where(now, wait, due))
+
+    def push(self, force: torch.Tensor) -> None:
+        """Pull at the object with a force [N, 3] N, in the world, from now until it is changed or an episode begins."""
+        applied = self.engine.t.xfrc_applied
+        applied[:, self.objects.body, :3] = force.to(applied.dtype)
+
+    # -- terminations, rewards, metrics
+    # --------------------------------------------------------------------------------------------
+    def update(self) -> None:
+        """Move the task's own memory on: after physics, before terminations and rewards."""
+
+    def _params(self, part: str, term: Term) -> dict[str, Any]:
+        """A term's arguments as the settings have them."""
+        if not term.params:
+            return {}
+        given = self.task[part][term.name]
+        return {name: given[name] for name in term.params}
+
+    def terminated(self) -> dict[str, torch.Tensor]:
+        """The ends that are switched on."""
+        self.update()
+        on = [x for x in self._terms["done"] if self.task["terminations"][x.name]]
+        out = {x.name: x.method(self, **self._params("termination", x)) for x in on}
+        for name, value in out.items():
+            if value.shape != (self.num_envs,) or value.dtype != torch.bool:
+                raise UserError(
+                    f"termination {name}: gives {value.dtype} {list(value.shape)}, must be bool [{self.num_envs}]"
+                )
+        return out
+
+    def reward_words(self) -> dict[str, str]:
+        return {x.name: x.text for x in terms_of(type(self))["reward"]}
+
+    def rewards(self) -> dict[str, torch.Tensor]:
+        """Terms of a weight other than 0, weighted."""
+        weights = self.task["rewards"]
+        paid = [x for x in self._terms["reward"] if weights.get(x.name)]
+        out = {x.name: weights[x.name] * x.method(self, **self._params("reward", x)) for x in paid}
+        for x in self._terms["metric"]:
+            value = x.method(self, **self._params("metric", x))
+            if value.shape != (self.num_envs,):
+                raise UserError(f"metric {x.name}: has shape {list(value.shape)}, must be [{self.num_envs}]")
+            self._figures[x.name] = value.float()
+        return out
+
+    def _judge(self, ends: dict, terms: dict) -> tuple[torch.Tensor, torch.Tensor]:
+        judged = super()._judge(ends, terms)
+        for name, value in self._figures.items():
+            self.last[name].copy_(torch.where(self.done, torch.nan_to_num(value), self.last[name]))
+        return judged
+
+    def figure_units(self) -> dict[str, str]:
+        return {x.name: x.unit for x in self._terms["metric"]}
+
+    def metrics(self) -> dict[str, torch.Tensor]:
+        return {f"task/{name}": value.mean() for name, value in self.last.items()}
+
+    # -- observations
+    # ------------------------------------------------------------------------------------------------------------
+    def observe(self, advance: bool) -> dict[str, torch.Tensor]:
+        fresh = self._episode_length == 0
+        actor, critic = [], []
+        told = [(x.name, self.task["commands"][x.name]) for x in self._terms["command"]]
+        for row in self._sensed:
+            given = self.task["observations"][row.term.name]
+            if not (given["actor"] or given["critic"]):
+                continue
+            self._clean_read = False
+            self._is_clean = False
+            value = self._value(row)
+            if row.width == 0:
+                row.width, row.twice = value.shape[1], self._clean_read
+            if given["actor"]:
+                actor.append(row(value, self, fresh, advance))
+            if given["critic"]:
+                if row.twice:
+                    self._is_clean = True
+                    value = self._value(row)
+                    self._is_clean = False
+                critic.append(value)
+        actor += [self.commands[name] for name, given in told if given["actor"]]
+        critic += [self.commands[name] for name, given in told if given["critic"]]
+        if not actor:
+            raise UserError(f"task {self.task['name']}: the actor sees nothing; declare or switch on a row")
+        seen = torch.where(self.nan[:, None], 0.0, torch.cat(actor, 1))
+        if self.task["history"] > 1:
+            seen = self._with_past(seen, fresh, advance)
+        return {"actor": seen, "critic": torch.nan_to_num(torch.cat(critic, 1)) if critic else seen}
+
+    def _value(self, row: Sensing) -> torch.Tensor:
+        value = row.term.method(self, **row.params)
+        value = _columns(value, self.num_envs, f"observation {row.term.name}").float()
+        if row.width and value.shape[1] != row.width:
+            raise UserError(f"observation {row.term.name}: had {row.width} numbers, now {value.shape[1]}")
+        return value
+
+    def _with_past(self, now: torch.Tensor, fresh: torch.Tensor, advance: bool) -> torch.Tensor:
+        if self._history is None:
+            with torch.inference_mode(False):
+                self._history = torch.zeros(len(now), self.task["history"], now.shape[1], device=self.device)
+        moved = torch.cat([now[:, None], self._history[:, :-1]], 1)
+        moved = torch.where(fresh[:, None, None], now[:, None].expand_as(moved), moved)
+        if advance:
+            self._history.copy_(moved)
+        return moved.flatten(1)
+
+    def memory(self) -> dict:
+        own: dict[str, Any] = {}
+        for name, held in memories_of(type(self)).items():
+            value = self.__dict__[held.name]
+            own[name] = value if value.is_floating_point() or value.dtype == torch.bool else (value, -(2**31), 2**31)
+        for row in self._sensed:
+            own |= row.memory()
+        own |= {f"command.{k}": v for k, v in self.commands.items()}
+        own |= {f"command_left.{k}": v for k, v in self._left.items()}
+        own |= {f"event_due.{k}": v for k, v in self._due.items()} | {f"last.{k}": v for k, v in self.last.items()}
+        if self._history is not None:
+            own["history"] = self._history
+        return super().memory() | own
+
+    # -- what is said of it
+    # --------------------------------------------------------------------------------------------------------
+    def describe(self) -> dict:
+        """Tables for the first screen."""
+        t = self.task
+        groups: dict[str, list] = {"actor": [], "critic": []}
+        for row in self._sensed:
+            given = t["observations"][row.term.name]
+            seen = [row.unit or "1", row.term.text, f"noise {row.noise:g}" if row.noise else ""]
+            seen += [f"{row.delay[0]:g}-{row.delay[1]:g} s old" if row.delay[1] else ""]
+            seen += [f"{100 * row.dropout:g} % lost" if row.dropout else ""]
+            if given["actor"]:
+                groups["actor"].append((row.term.name, row.width * row.frames * t["history"],
+                                        "; ".join(x for x in seen if x)))  # fmt: skip
+            if given["critic"]:
+                groups["critic"].append((row.term.name, row.width, "; ".join(x for x in (*seen[:2], "clean") if x)))
+        for x in self._terms["command"]:
+            for group in SWITCHES:
+                if t["commands"][x.name][group]:
+                    wide = self.commands[x.name].shape[1] * (t["history"] if group == "actor" else 1)
+                    groups[group].append((x.name, wide, f"{x.unit or '1'}; {x.text or 'command'}"))
+        if not groups["critic"]:
+            groups["critic"] = groups["actor"]
+        ends = [(x.name, x.text) for x in self._terms["done"] if t["terminations"][x.name]]
+        return {
+            "observations": groups,
+            "action": self.action_rows(),
+            "rewards": [row for row in self.reward_rows() if row[1]],
+            "terminations": [*ends, *self.usual_ends()],
+            "randomization": self.sampler.rows(),
+            "notes": self.hand_notes(),
+            "headline": [f"task/{name}" for name in list(self.last)[:3]],
+        }
+
+
+def _columns(value: torch.Tensor, n: int, what: str) -> torch.Tensor:
+    """[N, D] of [N] or [N, ...]. Raises UserError."""
+    if not isinstance(value, torch.Tensor) or value.dim() < 1 or value.shape[0] != n:
+        shape = list(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+        raise UserError(f"{what}: gives {shape}, must be a tensor [{n}] or [{n}, ...], one row for each world")
+    return value[:, None] if value.dim() == 1 else value.flatten(1)
+
+
+def _observation(term: Term) -> dict[str, Any]:
+    o = term.options
+    return dict.fromkeys(SWITCHES, True) | _only(term) | {
+        "noise": o["noise"], "delay": _plain(o["delay"]), "dropout": o["dropout"], "frames": o["frames"], **term.params
+    }  # fmt: skip
+
+
+def _only(term: Term) -> dict[str, bool]:
+    only = term.options.get("only")
+    if only not in (None, *SWITCHES):
+        raise UserError(f"term {term.name}: only={only!r}: must be actor, critic or None")
+    return {} if only is None else {s: s == only for s in SWITCHES}
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+@cache
+def _start() -> dict[str, Any]:
+    return yaml_text.load(CONFIGS / "own_task.yaml", "settings")
+
+
+def _lay(onto: dict[str, Any], over: Mapping[str, Any]) -> None:
+    """Lay nested settings over others, in place; ranges and lists as wholes."""
+    for key, value in over.items():
+        mine = onto.get(key)
+        if isinstance(value, Mapping) and isinstance(mine, dict) and "log" not in (*value, *mine):
+            _lay(mine, value)
+        else:
+            onto[key] = copy.deepcopy(dict(value) if isinstance(value, Mapping) else _plain(value))
+
+
+Policy = Callable[[Any], torch.Tensor]

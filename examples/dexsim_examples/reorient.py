@@ -1,0 +1,145 @@
+"""Reorient a cube in the palm: any orientation after any other, to 0.4 rad, goal after goal."""
+
+from __future__ import annotations
+
+import torch
+
+from dexsim import rotation
+from dexsim.tasks import Task, done, memory, metric, observe, reward
+
+REACHED = 0.4  # rad
+PATIENCE = 8.0  # s in training, after which another goal is set
+
+
+class Reorient(Task):
+    """Turn a cube in the palm to any orientation, one goal after another."""
+
+    settings = {
+        "episode_s": 20.0,
+        "evaluation": {"cap_s": 120.0},
+        "presets": {
+            "cuda": {
+                "worlds": 8192, "iterations": 3000, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+                "agent": {"num_steps_per_env": 12, "algorithm": {"gamma": 0.995, "entropy_coef": 0.002}},
+            },
+            "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
+        },
+    }  # fmt: skip
+    randomize = {"object": {"size": [0.05, 0.06], "mass": {"log": [0.04, 0.12]}}}
+
+    goal = memory(4)  # orientation to reach, w x y z
+    angle = memory()  # rad, left to the goal
+    progress = memory()  # rad, what the last step took off it
+    goals = memory()  # reached in this episode
+    since = memory()  # s, since the last goal
+    reached = memory(dtype=torch.bool)
+    home = memory(3)  # m, where the cube lay
+
+    def begin(self, mask):
+        pose, m = self.hold(mask), mask[:, None]
+        self.home = torch.where(m, pose[:, :3], self.home)
+        self.goal = torch.where(m, self.sampler.quaternion(), self.goal)
+        self.angle = torch.where(mask, rotation.error(pose[:, 3:], self.goal), self.angle)
+
+    def update(self):
+        now = rotation.error(self.object_pose[:, 3:], self.goal)
+        self.progress = self.angle - now
+        self.reached = (now < REACHED) & (self.drift() < 0.06) & ~self.nan
+        self.goals += self.reached
+        self.since = torch.where(self.reached, 0.0, self.since + self.dt)
+        renew = self.reached | ((self.since > PATIENCE) & self.learning)
+        self.since = torch.where(renew, 0.0, self.since)
+        self.goal = torch.where(renew[:, None], self.sampler.quaternion(), self.goal)
+        self.angle = rotation.error(self.object_pose[:, 3:], self.goal)
+
+    def drift(self):
+        """Distance of the cube from where it lay at first [N], m."""
+        return (self.object_pose[:, :3] - self.home).norm(dim=1)
+
+    # -- what is seen
+    @observe("rad", noise=0.003)
+    def joint_position(self):
+        """measured"""
+        return self.q
+
+    @observe("1")
+    def sent(self):
+        """targets last sent, over each joint's range"""
+        return (self.target - self.q_mid) / self.q_half
+
+    @observe("1", noise=0.02, delay=(0.0, 0.05))
+    def to_goal(self):
+        """6D of the turn from the cube to its goal, from a camera"""
+        return rotation.six(rotation.multiply(rotation.conjugate(self.object_pose[:, 3:]), self.goal))
+
+    @observe("1")
+    def goal_turn(self):
+        """6D of the goal, palm frame"""
+        return rotation.six(self.goal)
+
+    @observe("m", noise=0.002, delay=(0.0, 0.05))
+    def cube_position(self):
+        """from a camera, palm frame"""
+        return self.object_pose[:, :3]
+
+    @observe("N")
+    def touch(self):
+        """sum of a pad's normal forces"""
+        return self.touch_force
+
+    @observe("m")
+    def fingertips(self):
+        """from the measured angles"""
+        return self.tips
+
+    @observe("rad/s, m/s", only="critic")
+    def motion(self):
+        """joints, cube"""
+        return torch.cat([self.qd, self.object_velocity[:, :3], self.object_spin], 1)
+
+    @observe("N, kg, 1", only="critic")
+    def physics(self):
+        """forces of fingers and palm; size, mass, centre and friction of the cube"""
+        o = self.objects
+        return torch.cat([self.finger_force, self.palm_force[:, None], 10 * o.size, o.mass[:, None], o.com,
+                          o.friction[:, None], self.torque], 1)  # fmt: skip
+
+    # -- what is paid
+    @reward(2.0)
+    def nearer(self):
+        """turned towards the goal, rad"""
+        return self.progress.clamp(-0.5, 0.5)
+
+    @reward(0.02)
+    def closeness(self, epsilon=0.2):
+        """closeness to the goal"""
+        return 1 / (self.angle + epsilon)
+
+    @reward(8.0)
+    def bonus(self):
+        """a goal reached"""
+        return self.reached.float()
+
+    @reward(-4.0)
+    def lost(self):
+        """the cube fell"""
+        return self.dropped().float()
+
+    @reward(-0.5)
+    def away(self):
+        """drift of the cube, m"""
+        return self.drift().clamp(max=0.2)
+
+    @reward(-0.001)
+    def change(self):
+        """change of the action"""
+        return (self.action - self.last_action).square().sum(1)
+
+    @done
+    def dropped(self, below=0.0, far=0.1):
+        """centre below the palm, or far from where it lay"""
+        return (self.object_pose[:, 2] < below) | (self.drift() > far)
+
+    @metric("goals in a row")
+    def successes(self):
+        return self.goals
