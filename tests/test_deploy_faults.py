@@ -634,3 +634,153 @@ def test_a_flood_of_the_sender_itself_is_read_young():
         child.wait()
         imu.close()
     assert np.median(ages) < 0.25, ages
+
+
+# -- what a driver may not do, and signals of every kind
+# ----------------------------------------------------------------------------------------------------------------
+def every_second(spoil):
+    return lambda state, now, kept: spoil(state, now, kept) if state.sequence % 2 else None
+
+
+def still(state, now, kept):
+    """Counts on and says the same to the last bit; the time of it is its own."""
+    kept.append(dataclasses.replace(state))
+    return dataclasses.replace(kept[0], time=now, sequence=state.sequence)
+
+
+WRONG = {
+    "an error code in every second reading": (every_second(change(error=one(7))), "reports error code 7", 0.15),
+    "a count that goes back": (
+        lambda state, now, kept: (kept.append(1), change(sequence=3)(state, now) if len(kept) > 5 else None)[1],
+        "the count of its readings went back from", 0.15),
+    "a count of NaN": (change(sequence=NAN), "count of its readings is nan", 0.15),
+    "readings that never change": (still, "no bit of the readings has changed", 0.45),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", WRONG)
+def test_what_a_driver_may_not_do_ends_the_run_with_its_reason(b, fault):
+    spoil, says, limit = WRONG[fault]
+    hand = Spoiled(VirtualClock(100.0), spoil)
+    loop = Loop(b, hand, FixedPlace(PLACE), Calibration.default(),
+                LoopSettings(seconds=2.0, tor_max=300.0, home_speed=3.0), hand.clock)  # fmt: skip
+    wave = np.sin(np.arange(400) / 6.0)
+    act, k = loop.bundle.act, iter(range(400))
+    loop.bundle = dataclasses.replace(loop.bundle)
+    loop.bundle.act = lambda obs: np.full_like(act(obs), wave[next(k)])  # targets move
+    report = loop.run()
+    check_sent(hand, loop.guard)
+    first = 0.06 if fault == "a count that goes back" else 0.0
+    assert says in report.ended and hand.relaxed_at[0] - hand.since - first < limit, report.ended
+
+
+def test_one_error_code_in_ten_readings_is_counted_and_no_more(b):
+    rare = lambda s, now, kept: change(error=one(7))(s, now) if s.sequence % 10 == 0 else None  # noqa: E731
+    hand = Spoiled(VirtualClock(100.0), rare)
+    report = run(b, hand)
+    assert report.ended == "done" and report.counts["error_codes"] > 3
+
+
+def test_readings_that_never_change_under_load_may_be_those_of_a_blocked_hand(b):
+    def spoil(state, now, kept):
+        state = still(state, now, kept)
+        state.current = np.full(12, -200.0)
+        return state
+
+    assert run(b, Spoiled(VirtualClock(100.0), spoil)).ended == "done"
+
+
+class Said:
+    error_code, error_message = 1501029, "refused"
+
+
+@pytest.mark.parametrize("answer", ["no", Said(), False])
+def test_a_send_that_returns_an_error_ends_the_run(b, answer):
+    hand = Spoiled(VirtualClock(100.0))
+    send, since = hand.send, []
+
+    def refusing(command):
+        if hand.begun and hand.clock.now() > hand.begun + 0.3:
+            since.append(hand.clock.now())
+            return answer
+        return send(command)
+
+    hand.send = refusing
+    report = run(b, hand)
+    assert "refuses what is sent" in report.ended and hand.relaxed_at[0] - since[0] < 0.15, report.ended
+    assert run(b, Spoiled(VirtualClock(100.0))).ended == "done"
+
+
+@pytest.mark.parametrize("name", ["position", "current", "tactile"])
+def test_a_driver_that_changes_a_reading_it_gave_ends_the_run(b, name):
+    hand = Spoiled(VirtualClock(100.0))
+    read, since = hand.read, []
+
+    def reusing():
+        state = read()
+        if hand.begun and hand.clock.now() > hand.begun + 0.3:
+            since.append(hand.clock.now())
+            if len(since) > 1:
+                buffer = getattr(kept[0], name)
+                buffer += 1
+            kept[:] = [state]
+        return state
+
+    kept = []
+    hand.current = np.zeros(12)
+    hand.read = reusing
+    report = run(b, hand)
+    assert f"changed the {name} of a reading" in report.ended and hand.relaxed_at[0] - since[0] < 0.15
+
+
+def test_sys_exit_in_a_driver_has_its_reason(b):
+    hand = Spoiled(VirtualClock(100.0))
+    read = hand.read
+
+    def leaving():
+        if hand.begun and hand.clock.now() > hand.begun + 0.3:
+            sys.exit(0)
+        return read()
+
+    hand.read = leaving
+    loop = Loop(b, hand, FixedPlace(PLACE), Calibration.default(),
+                LoopSettings(seconds=1.0, tor_max=300.0, home_speed=3.0), hand.clock)  # fmt: skip
+    with pytest.raises(UserError, match="SystemExit: 0"):
+        loop.run()
+    assert "SystemExit" in loop.report.ended and hand.relaxed_at
+
+
+def test_a_send_that_the_watchdog_overtook_delivers_nothing(b):
+    from dexsim.deploy.driver import Clock
+
+    class Slow(FakeHand):
+        def send(self, command):
+            if self.begun and self.clock.now() > self.begun + 0.2 and not self.relaxed_at:
+                time.sleep(0.6)
+            super().send(command)
+
+    hand = Slow(Clock(), start=0.45)
+    settings = LoopSettings(seconds=3.0, tor_max=300.0, home_speed=5.0, home_error=2.0, settle=0.1, hang=0.2, late=5.0,
+                            stale=5.0, overruns=1000)  # fmt: skip
+    loop = Loop(b, hand, FixedPlace(PLACE), Calibration.default(), settings)
+    report = loop.run()
+    late = [(mode, tor) for t, _, tor, mode in hand.sent if t > hand.relaxed_at[0]]
+    assert report.counts["watchdog"] == 1 and len(late) == 1
+    assert late[0][0] == PASSIVE and not late[0][1].any(), "what was on its way lets go, too"
+
+
+@pytest.mark.parametrize("name", ["SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGTSTP", "SIGALRM", "SIGTTOU"])
+def test_every_signal_that_would_end_or_halt_the_program_lets_go(b, name):
+    number = getattr(signal, name)
+
+    def hit(hand, now):
+        if hand.begun and now > hand.begun + 0.3:
+            hand.fault, hand.hit = None, now
+            os.kill(os.getpid(), number)
+
+    hand, before = Spoiled(VirtualClock(100.0)), signal.getsignal(number)
+    hand.fault = hit
+    with _Stop() as stop:
+        report = run(b, hand)
+    assert stop.status == 128 + number and "stopped by" in report.ended and hand.relaxed_at[0] - hand.hit < 0.02
+    assert signal.getsignal(number) == before

@@ -1,0 +1,85 @@
+"""What the bus costs a policy: included bundles on the simulated hand by itself, and behind the xHand's own driver on
+the strict fake of the vendor's package (cycles of 9.6 ms with their tail, 0.5 % CRC errors with their pauses, encoders
+that jitter, one dead taxel board), with the same seeds and objects.
+
+    python -m benchmarks.xhand_bus checkpoint=checkpoints/grasp.pt episodes=20 seconds=6 seed=5000 out=FILE.json
+
+way: direct, bus (virtual time), process (in real time, the driver's child process with it).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dexsim import export, intervals
+from dexsim.calibration.file import Calibration
+from dexsim.deploy import bundle
+from dexsim.deploy.driver import Clock, VirtualClock
+from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.simulated_hand import SimulatedXHand, faked
+
+FAULTS = "crc=0.005,board=2"
+DEFAULTS = {"checkpoint": "checkpoints/grasp.pt", "episodes": "20", "seconds": "6", "seed": "5000", "out": "",
+            "ways": "direct,bus", "faults": FAULTS}  # fmt: skip
+
+
+def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str) -> dict:
+    """One run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
+    c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
+    objects, grip = b.config["task"]["objects"], b.manifest.get("grip")
+    shapes = [*objects["train"], *objects["held_out"]]
+    shape = None if grip else shapes[seed % len(shapes)]
+    clock = Clock() if way == "process" else VirtualClock()
+    slack = {"late": 1.0, "overruns": 1000, "hang": 1.0, "stale": 0.5} if way == "process" else {}
+    if way == "direct":
+        hand = SimulatedXHand(b.config, c, clock, seed=seed, shape=shape, grip=grip)
+    else:
+        text = f"{faults},seed={seed}"
+        hand = faked(b.config, c, text, seed, False, shape, grip, 1.0, clock=None if way == "process" else clock)
+    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, **slack), clock)
+    try:
+        report = loop.run()
+        place = hand.place(clock.now())[0]
+    finally:
+        hand.close()
+    rule = b.config["task"]["termination"]
+    begun = np.array(grip["object_pose"][:3]) if grip else np.array([0.055, 0.0, 0.04])
+    held = place[2] > rule["below"] and np.linalg.norm(place - begun) < rule["distance"]
+    return {"ended": report.ended, "held": bool(held) and report.ended == "done",
+            "goals": int(report.counts["goals_reached"]), "counts": dict(report.counts)}  # fmt: skip
+
+
+def main(argv: list[str]) -> int:
+    """Prints a line a way, and writes all episodes."""
+    given = DEFAULTS | dict(a.split("=", 1) for a in argv)
+    torch.set_num_threads(1)
+    n, first = int(given["episodes"]), int(given["seed"])
+    with tempfile.TemporaryDirectory() as folder:
+        b = bundle.load(export.export(given["checkpoint"], Path(folder) / "bundle", steps=2))
+        rows: dict[str, list[dict]] = {}
+        for way in given["ways"].split(","):
+            began = time.perf_counter()
+            rows[way] = []
+            for k in range(n):
+                rows[way].append(episode(b, way, first + k, float(given["seconds"]), given["faults"]))
+            held = sum(r["held"] for r in rows[way])
+            low, high = intervals.share(held, n)
+            goals = np.array([r["goals"] for r in rows[way]])
+            ended = {r["ended"] for r in rows[way]} - {"done"}
+            print(f"{way:<8} held {held} of {n} (95 % {low:.2f} to {high:.2f}), goals {goals.mean():.2f} +- "
+                  f"{goals.std() / max(n - 1, 1) ** 0.5:.2f}, {time.perf_counter() - began:.0f} s; ended otherwise:"
+                  f" {'; '.join(sorted(ended)) or 'none'}", flush=True)  # fmt: skip
+    if given["out"]:
+        Path(given["out"]).write_text(json.dumps({"settings": given, "rows": rows}, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
