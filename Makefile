@@ -1,6 +1,6 @@
 # make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
 # make test    the tests, a process a core (up to 4): one alone, to debug it: make test ARGS="-n 0 -k name"
-# make lint    ruff over everything, mypy over the package
+# make lint    ruff over everything, mypy over the package, the English, the results page
 # make wheel   what `pip install` takes, in dist/
 # make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
 # make docs    this documentation as a site, in out/site/
@@ -33,6 +33,8 @@ test: $(VENV)/.installed-test
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .
 	$(PY) -m mypy
+	$(PY) -m tools.prose
+	$(PY) -m tools.results check
 
 wheel: $(VENV)/.installed
 	$(PY) -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .

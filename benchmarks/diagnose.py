@@ -37,7 +37,7 @@ DEFAULTS = {
 
 
 def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool, seed: int) -> tuple[list[Path], str]:
-    """`recordings` recordings of `count` joints, `seconds` in all; returns their paths and the joint that hides
+    """Return `recordings` recordings of `count` joints, `seconds` in all; returns their paths and the joint that hides
     something."""
     from dexsim.assets import xhand
     from dexsim.recording import write
@@ -81,7 +81,7 @@ def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool
 
 
 def cores() -> int:
-    """CPU cores that this process may use."""
+    """Return CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

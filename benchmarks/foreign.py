@@ -41,7 +41,7 @@ SETTINGS = {
 
 
 def seed_of_sources(folder: Path = ROOT / "dexsim") -> int:
-    """A number of five digits that every change of a source or a setting changes."""
+    """Return a number of five digits that every change of a source or a setting changes."""
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".yaml")):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
@@ -123,7 +123,8 @@ def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
 
 
 def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:
-    """Rates of names by the confidence asked of them, false alarms, confident and wrong names, coverage and times."""
+    """Return the rates of names by the confidence asked of them, false alarms, confident and wrong names, coverage and
+    times."""
     out: dict[str, object] = {"cases": len(truths), "answered": sum(a is not None for a in answers.values())}
     for tier in ("easy", "medium"):
         singles = [t for t in truths if t["kind"] == "single" and t["tier"] == tier]
@@ -145,7 +146,7 @@ def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:
 
 
 def _names(truth: dict) -> set[str]:
-    """Effects that are a right name: the hidden ones, and what the scorer takes as well."""
+    """Return the effects that are a right name: the hidden ones, and what the scorer takes as well."""
     return {e["effect"] for e in truth["effects"]}
 
 
@@ -159,7 +160,7 @@ def _first(answer: dict | None, least: float) -> str:
 
 
 def _alarm(answer: dict | None) -> bool:
-    """Where nothing is missing: a verdict that explains, a name of 0.5 and more, or no answer."""
+    """Return where nothing is missing: a verdict that explains, a name of 0.5 and more, or no answer."""
     return (
         answer is None
         or answer["verdict"] in ("explained", "partly_explained")
@@ -168,7 +169,7 @@ def _alarm(answer: dict | None) -> bool:
 
 
 def table(truths: Sequence[dict], answers: dict[str, dict | None], seconds: dict[str, float]) -> str:
-    """One line a case: what was hidden, what was said, errors in mrad before / after / floor, seconds."""
+    """Return one line a case: what was hidden, what was said, errors in mrad before / after / floor, seconds."""
     lines = [
         "| case | rig | tier | hidden | verdict | said | before / after / floor | s |",
         "|---|---|---|---|---|---|---|---|",

@@ -112,7 +112,7 @@ class Clock:
 
 
 def _timed(runner: Runner, env: Any, iterations: int) -> dict[str, float]:
-    """Medians over iterations: seconds of an iteration, of env.step, of the update; the rest is inference."""
+    """Return medians over iterations: seconds of an iteration, of env.step, of the update; the rest is inference."""
     clock = Clock(str(env.device))
     step, update = env.step, runner._updater.update
 
@@ -164,7 +164,7 @@ def _settings(cfg: dict, changes: dict[str, Any]) -> dict:
 
 
 def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, variants: dict[str, dict]) -> dict:
-    """One row of the table: seconds, rates and the ratio at `worlds` worlds."""
+    """Return one row of the table: seconds, rates and the ratio at `worlds` worlds."""
     cfg = {**cfg, "worlds": worlds}
     device, length = cfg["device"], cfg["agent"]["num_steps_per_env"]
     torch.manual_seed(0)

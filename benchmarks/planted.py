@@ -138,7 +138,7 @@ SERVO = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "visco
 
 
 def plan(seed: int, effects: set[str]) -> list[dict]:
-    """One round after another: {kind, tier}; kind '' has nothing planted."""
+    """Return one round after another: {kind, tier}; kind '' has nothing planted."""
     names = [n for n, p in PLANTS.items() if not effects or p.effect in effects or n in effects]
     tiers, out = list(TIERS), []
     for turn in range(40):
@@ -150,7 +150,8 @@ def plan(seed: int, effects: set[str]) -> list[dict]:
 
 
 def rig(rng: np.random.Generator, needs: str) -> dict:
-    """Believed figures of a pendulum of random size on a servo, of which there are two where `pair` is needed."""
+    """Return the believed figures of a pendulum of random size on a servo, of which there are two where `pair` is
+    needed."""
     b = {"mass": rng.uniform(0.08, 0.3), "length": rng.uniform(0.07, 0.14), "rotor": rng.uniform(2e-4, 8e-4)}
     b["weight"] = b["mass"] * 9.81 * b["length"]
     b["inertia"] = b["mass"] * b["length"] ** 2 + b["rotor"]
@@ -172,8 +173,8 @@ NO_CONTACT = 'contype="0" conaffinity="0"'
 
 
 def model_xml(b: dict, true: dict | None = None) -> str:
-    """The pendulum(s) as MJCF; a second one hangs beside the first and shares nothing with it but the supply. true: by
-    joint what differs from `b`, and a payload [kg] at the believed centre."""
+    """Return the pendulum(s) as MJCF; a second one hangs beside the first and shares nothing with it but the supply.
+    true: by joint what differs from `b`, and a payload [kg] at the believed centre."""
 
     def load(kg: float) -> str:
         return (
@@ -199,7 +200,8 @@ def model_xml(b: dict, true: dict | None = None) -> str:
 
 
 def servo(b: dict) -> dict:
-    """The believed servo table. How the simulator's drives brake is not left to be guessed: nothing of it is hidden."""
+    """Return the believed servo table. How the simulator's drives brake is not left to be guessed: nothing of it is
+    hidden."""
     brakes = {} if b["voltage"] else {"braking_slope": 1.0}
     return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO} | brakes},
             "loop_rate": RATE,
@@ -207,7 +209,7 @@ def servo(b: dict) -> dict:
 
 
 def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
-    """Targets sent at 100 Hz [K]."""
+    """Return the targets sent at 100 Hz [K]."""
     t = np.arange(0.0, SECONDS, 0.01)
     knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 40)])
     levels = np.r_[0.0, rng.uniform(-0.9, 0.9, len(knots) - 1)]
@@ -223,7 +225,7 @@ def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
 
 
 def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
-    """Four runs with commands, times and temperature, the measured motion still to be simulated."""
+    """Return four runs with commands, times and temperature, the measured motion still to be simulated."""
     from dexsim.actuator.table import ServoTable
     from dexsim.gap.read import Run
 
@@ -248,7 +250,7 @@ def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
 
 
 def _apply(params: np.ndarray, change: dict) -> np.ndarray:
-    """Plant parameters [..., C] with the changes made."""
+    """Return the plant parameters [..., C] with the changes made."""
     from dexsim.gap.plant.columns import INDEX
 
     out = params.copy()
@@ -259,8 +261,8 @@ def _apply(params: np.ndarray, change: dict) -> np.ndarray:
 
 
 def _simulate(b: dict, runs: list, changes: list[dict], dt: float, passes: int) -> tuple[list, np.ndarray, np.ndarray]:
-    """(cases, position [H, n], torque [H, n]) of the first joint under each of the changes, all joints moving as the
-    first change of the first joint makes them."""
+    """Return (cases, position [H, n], torque [H, n]) of the first joint under each of the changes, all joints moving
+    as the first change of the first joint makes them."""
     import mujoco
 
     from dexsim.gap.plant.case import build
@@ -355,8 +357,9 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
 
 
 def _not_the_hardest_last(b: dict, runs: list) -> list:
-    """The runs such that the one that is held out asks for much, but for the most in nothing: what it alone reaches (a
-    limit, braking at full speed) could be known by nobody. By the largest errors, speeds and torques of the loop as
+    """Return the runs such that the one that is held out asks for much, but for the most in nothing: what it alone
+    reaches (a limit, braking at full speed) could be known by nobody. By the largest errors, speeds and torques of
+    the loop as
     believed, of which each has one run that leads: of four runs one is always left."""
     _simulate(b, runs, [b["off"]], 1e-3, 2)
     reached = np.array(
@@ -378,7 +381,7 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
 
 
 def _off(rng: np.random.Generator, b: dict) -> dict:
-    """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for
+    """Return what the believed figures are off by, as plant columns: draws from the tolerance that the tool states for
     each."""
     from dexsim.gap.rules import BELIEF
 
@@ -398,7 +401,8 @@ def _off(rng: np.random.Generator, b: dict) -> dict:
 
 
 def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:
-    """What is left of recordings q [n], simulated in the search's own plant, in times the noise, when all that the
+    """Return what is left of recordings q [n], simulated in the search's own plant, in times the noise, when all
+    that the
     tool refits with every hypothesis is fitted to the first three: of those or of the last, whichever is less (what
     only the last shows could be known by nobody, what it does not show not be judged). Begun at the values under the
     effect; none [C]: without it."""
@@ -508,14 +512,14 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
 
 
 def _believed_now(b: dict) -> dict:
-    """The true values under the effect, of the figures that are a little off and that an effect adds to."""
+    """Return the true values under the effect, of the figures that are a little off and that an effect adds to."""
     return {
         k: b[k] * b["off"][f"*{k}"] for k in ("coulomb_friction", "viscous_friction", "torque_limit", "no_load_speed")
     }
 
 
 def _joined(off: dict, change: dict) -> dict:
-    """Both changes, factors on the same column multiplied, additions to it added."""
+    """Return both changes, factors on the same column multiplied, additions to it added."""
     out = dict(off)
     for k, v in change.items():
         out[k] = v if k not in out else out[k] * v if k[0] == "*" else out[k] + v if k[0] == "+" else v
@@ -523,7 +527,7 @@ def _joined(off: dict, change: dict) -> dict:
 
 
 def score(truth: dict, d: dict) -> dict:
-    """What the table needs of one diagnosis (as diagnosis.json holds it)."""
+    """Return what the table needs of one diagnosis (as diagnosis.json holds it)."""
     from dexsim.gap.effects.catalogue import confusable
 
     found = d.get("findings", [])
@@ -608,7 +612,7 @@ def _one(job: tuple) -> dict:
 
 
 def table(results: list[dict]) -> dict:
-    """The figures of the JSON line."""
+    """Return the figures of the JSON line."""
     planted = [r for r in results if r["effect"] != "none"]
     rate = lambda x: round(float(np.mean(x)), 3) if len(x) else None  # noqa: E731
     covered = [c for r in planted for c in r["covered"].values()]
@@ -637,7 +641,7 @@ def table(results: list[dict]) -> dict:
 
 
 def show(results: list[dict]) -> str:
-    """One line a case."""
+    """Return one line a case."""
     out = [
         f"{'no':>4} {'planted':<31}{'tier':<7}{'x noise':>7}  {'verdict':<17}{'found':<42}{'after':>6}"
         f" {'sizes: error (covered)'}"

@@ -28,9 +28,9 @@ TIP = "tip"  # name of the tip's first geom
 def spec(
     finger: str = "index", hand: Hand | None = None
 ) -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
-    """The rig: the distal body of a hand's finger (the xHand's) fixed at the origin, a ball on a slide against the
-    pad's middle and one along it. Also the pressed point [3] m, the direction in which the ball presses [3] and the one
-    in which it slides [3]."""
+    """Return the rig: the distal body of a hand's finger (the xHand's) fixed at the origin, a ball on a slide
+    against the pad's middle and one along it. Also the pressed point [3] m, the direction in which the ball presses
+    [3] and the one in which it slides [3]."""
     hand = hand or load_hand()
     f = hand.finger_names.index(finger)
     sensors = Sensors(hand)
@@ -171,8 +171,8 @@ def record(
 
 
 def as_trained(content: dict) -> dict:
-    """The settings of `record` for the rig that training would have with a tactile.yaml (its content): every best
-    guess, and what was believed elsewhere."""
+    """Return the settings of `record` for the rig that training would have with a tactile.yaml (its content): every
+    best guess, and what was believed elsewhere."""
 
     def value(x):
         if not isinstance(x, dict):

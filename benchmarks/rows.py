@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -110,28 +111,27 @@ TABLES = {
 
 
 def measured(path: Path, measure: str) -> float:
-    """Return a measure from a metrics.json; of counts of successes, the mean."""
+    """Return a measure from a metrics.json, nan where it has none (nothing was held); of counts, the mean."""
     value = json.loads(path.read_text(encoding="utf-8"))[measure]
-    return float(value["average"] if isinstance(value, dict) else value)
+    value = value["average"] if isinstance(value, dict) else value
+    return float("nan") if value is None else float(value)
 
 
 def train_and_judge(folder: Path, task: str, settings: list[str], judge: list[str], gpu: str | None) -> Path:
     """Train and judge one row with one seed, unless that was done; return its metrics.json. Raises UserError."""
-    metrics, last = folder / "judged" / "metrics.json", folder / "last.pt"
+    metrics, run = folder / "judged" / "metrics.json", folder / "run"
     if metrics.is_file():
         return metrics
     device, env = ("cpu", {}) if gpu is None else ("cuda", {"CUDA_VISIBLE_DEVICES": gpu})
-    begin = [f"resume={last}"] if last.is_file() else [f"task={task}", f"device={device}", *settings]
+    if (run / "last.pt").is_file():
+        begin = [f"resume={run / 'last.pt'}"]
+    else:
+        shutil.rmtree(run, ignore_errors=True)  # it ended before it had saved anything
+        begin = [f"task={task}", f"device={device}", *settings]
+    judging = [f"checkpoint={run / 'policy.pt'}", f"device={device}", "video=false", *judge]
     commands = (
-        ["train", *begin, "final_episodes=0", f"out={folder}"],
-        [
-            "play",
-            f"checkpoint={folder / 'policy.pt'}",
-            f"device={device}",
-            "video=false",
-            *judge,
-            f"out={metrics.parent}",
-        ],
+        ["train", *begin, "final_episodes=0", f"out={run}"],
+        ["play", *judging, f"out={metrics.parent}"],
     )
     folder.mkdir(parents=True, exist_ok=True)
     for command in commands:

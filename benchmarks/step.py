@@ -25,7 +25,7 @@ from dexsim.tasks import make_env
 
 
 def measure(env: Any, steps: int, rounds: int) -> dict[str, list[float]]:
-    """Seconds a control step, of each round, by name (see above), from the state the worlds are in."""
+    """Return the seconds a control step, of each round, by name (see above), from the state the worlds are in."""
     device, worlds = env.device, env.num_envs
     action = torch.zeros(worlds, env.num_actions, device=device)
     e, k = env.engine, env.decimation

@@ -36,7 +36,7 @@ def command(main: Callable[[list[str]], object], about: str | None = None) -> No
 
 
 def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], list[str]]:
-    """(the benchmark's own settings, `own` being their defaults; what is left for train.py)."""
+    """Return (the benchmark's own settings, `own` being their defaults; what is left for train.py)."""
     rest, values = [], dict(own)
     for a in argv:
         key, equals, value = a.partition("=")
@@ -48,7 +48,7 @@ def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], lis
 
 
 def numbers(text: str, name: str) -> list[int]:
-    """Whole numbers from "8192,16384"; raises UserError naming the setting."""
+    """Return the whole numbers from "8192,16384"; raises UserError naming the setting."""
     try:
         found = [int(x) for x in str(text).strip("[]").split(",")]
     except ValueError:
@@ -59,14 +59,14 @@ def numbers(text: str, name: str) -> list[int]:
 
 
 def config(argv: Sequence[str]) -> dict[str, Any]:
-    """The resolved settings of `dexsim train ARGV`; torch's threads set as there."""
+    """Return the resolved settings of `dexsim train ARGV`; torch's threads set as there."""
     cfg = start_up.for_train(list(argv), CONFIGS).cfg
     machine.set_threads(cfg["device"])
     return cfg
 
 
 def about(device: str) -> dict[str, Any]:
-    """Hardware and versions, for the JSON line."""
+    """Return the hardware and versions, for the JSON line."""
     cuda = device.startswith("cuda")
     name = (
         torch.cuda.get_device_name(device)
@@ -77,7 +77,7 @@ def about(device: str) -> dict[str, Any]:
 
 
 def load() -> float | None:
-    """Programs that wanted a processor in the last minute, on average; None where the system does not say."""
+    """Return programs that wanted a processor in the last minute, on average; None where the system does not say."""
     return round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
 
 
@@ -88,7 +88,7 @@ def wait(device: str) -> None:
 
 
 def seconds(device: str, call: Callable[[], object], repeats: int, warm: int = 2) -> float:
-    """Seconds a call, of `repeats` calls in a row."""
+    """Return the seconds a call, of `repeats` calls in a row."""
     for _ in range(warm):
         call()
     wait(device)

@@ -31,7 +31,7 @@ POINTS = 14  # of a random hull
 
 
 def seed_of(checkpoint: Path) -> int:
-    """A number of this file and the checkpoint. Raises UserError where there is none."""
+    """Return a number of this file and the checkpoint. Raises UserError where there is none."""
     if not checkpoint.is_file():
         raise UserError(f"checkpoint={checkpoint}: no such file")
     digest = hashlib.sha256(Path(__file__).read_bytes() + checkpoint.read_bytes())
@@ -78,7 +78,7 @@ def generate(seed: int, count: int, folder: Path) -> list[Path]:
 
 
 def said(metrics: dict, key: str) -> str:
-    """A share held, with its 95 % interval."""
+    """Return a share held, with its 95 % interval."""
     share = metrics[key]
     if share is None:
         return "no such episodes"

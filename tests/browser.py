@@ -59,7 +59,7 @@ class Page:
         self.call("Page.navigate", url=url)
 
     def call(self, method: str, **params):
-        """One command of the protocol and its result; errors of the page are kept in `log`."""
+        """Return one command of the protocol and its result; errors of the page are kept in `log`."""
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
@@ -80,7 +80,7 @@ class Page:
         self.wait("!window.before && document.readyState === 'complete'")
 
     def js(self, expression: str):
-        """The value of a JavaScript expression."""
+        """Return the value of a JavaScript expression."""
         found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")

@@ -37,7 +37,7 @@ QUIET_TURN = (
 
 
 def make_checkpoint(path: Path, *settings: str, seed: int = 0, task: str = "grasp") -> Path:
-    """A policy checkpoint of a task with random weights."""
+    """Return a policy checkpoint of a task with random weights."""
     from rsl_rl.utils import resolve_class
 
     from dexsim.learning.ppo import agent_errors

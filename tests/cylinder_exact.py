@@ -22,7 +22,8 @@ SAMPLES = 96
 
 
 def features(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(edges [m, 2], triangles [k, 3]) of the hull of corners [n, 3]; of one or two corners no hull is needed."""
+    """Return (edges [m, 2], triangles [k, 3]) of the hull of corners [n, 3]; of one or two corners no hull is
+    needed."""
     if len(corners) < 3:
         return np.array([[0, 1]] if len(corners) == 2 else np.zeros((0, 2), int)), np.zeros((0, 3), int)
     triangles = ConvexHull(corners).simplices
@@ -31,9 +32,9 @@ def features(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def answer(radius: float, half: float, corners: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """(distance in m, negative if they overlap; unit direction from the cylinder to the polytope; the place halfway
-    between their nearest points in m), in the cylinder's frame: axis z, radius and half length in m, corners [n, 3] of
-    the polytope."""
+    """Return (distance in m, negative if they overlap; unit direction from the cylinder to the polytope; the place
+    halfway between their nearest points in m), in the cylinder's frame: axis z, radius and half length in m, corners
+    [n, 3] of the polytope."""
     edges, triangles = features(corners)
     dist, u, x = _apart(radius, half, corners, edges, triangles)
     if dist > 1e-12 and not _crosses(radius, half, u, corners):
@@ -43,8 +44,8 @@ def answer(radius: float, half: float, corners: np.ndarray) -> tuple[float, np.n
 
 
 def _between(radius: float, half: float, corners: np.ndarray, dist: float, u: np.ndarray) -> np.ndarray:
-    """The place halfway between the furthest points along u of the cylinder and against it of the polytope: one point
-    of the rim, or the polytope's one corner, or where its lowest edge crosses a line of the side."""
+    """Return the place halfway between the furthest points along u of the cylinder and against it of the polytope:
+    one point of the rim, or the polytope's one corner, or where its lowest edge crosses a line of the side."""
     flat = float(np.hypot(u[0], u[1]))
     if min(2 * half * abs(u[2]), 2 * radius * flat) > LEVEL:
         return _furthest(radius, half, u) + 0.5 * dist * u
@@ -65,18 +66,18 @@ def _off(radius: float, half: float, x: np.ndarray) -> np.ndarray:
 
 
 def _furthest(radius: float, half: float, u: np.ndarray) -> np.ndarray:
-    """The cylinder's furthest point along each u [..., 3]."""
+    """Return the cylinder's furthest point along each u [..., 3]."""
     k = radius / np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-300)
     return np.stack([k * u[..., 0], k * u[..., 1], np.where(u[..., 2] > 0, half, -half)], -1)
 
 
 def _crosses(radius: float, half: float, u: np.ndarray, corners: np.ndarray) -> bool:
-    """Whether the polytope reaches into the cylinder's side of the gap that was found along u."""
+    """Return whether the polytope reaches into the cylinder's side of the gap that was found along u."""
     return bool((corners @ u).min() < (_furthest(radius, half, u) @ u) - 1e-9)
 
 
 def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray, np.ndarray]:
-    """Distance, direction, and the polytope's nearest point."""
+    """Return the distance, direction, and the polytope's nearest point."""
     found = [corners]
     if len(edges):
         a, e = corners[edges[:, 0]], corners[edges[:, 1]] - corners[edges[:, 0]]

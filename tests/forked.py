@@ -47,7 +47,7 @@ class Forked:
         return self._process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Its status. Raises TimeoutExpired after `timeout` s."""
+        """Return its status. Raises TimeoutExpired after `timeout` s."""
         self._process.join(timeout)
         if self._process.exitcode is None:
             raise subprocess.TimeoutExpired(str(self._process), timeout)
@@ -57,14 +57,14 @@ class Forked:
         self._process.terminate()
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:
-        """What it printed. Raises TimeoutExpired after `timeout` s."""
+        """Return what it printed. Raises TimeoutExpired after `timeout` s."""
         self.wait(timeout)
         out, err = (path.read_text() if path.exists() else "" for path in self._texts)
         return out, err
 
 
 def run(module: str, *arguments: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
-    """`python -m module arguments` in the repository's folder. Raises TimeoutExpired after `timeout` s."""
+    """Return `python -m module arguments` in the repository's folder. Raises TimeoutExpired after `timeout` s."""
     program = Forked(_program, module, arguments)
     try:
         out, err = program.communicate(timeout)

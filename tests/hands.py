@@ -34,7 +34,7 @@ def _joint(name: str, parent: str, child: str, at: str, axis: str, low: float, h
 
 
 def urdf(mesh: str = "meshes/tip.stl", left: bool = False) -> str:
-    """The text: x along the fingers, z out of the palm, the thumb at negative y (a right hand) or mirrored."""
+    """Return the text: x along the fingers, z out of the palm, the thumb at negative y (a right hand) or mirrored."""
     s = -1 if left else 1
     out = ['<robot name="claw">']
     out.append(
@@ -84,7 +84,7 @@ def tip(path: Path, hole: bool = False, scale: float = 1.0) -> None:
 
 
 def write(folder: Path, left: bool = False, mesh: str = "meshes/tip.stl") -> Path:
-    """The hand's file with its mesh; returns the URDF's path."""
+    """Return the hand's file with its mesh; returns the URDF's path."""
     folder.mkdir(parents=True, exist_ok=True)
     tip(folder / mesh.removeprefix("package://claw/"))
     path = folder / "claw.urdf"

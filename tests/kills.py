@@ -340,7 +340,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], int]] = {
 
 
 def run(count: int, kinds: list[str], seed: int, folder: Path) -> tuple[Counter[str], list[str]]:
-    """(outcomes, what was lost)."""
+    """Return (outcomes, what was lost)."""
     import torch
 
     import dexsim.cli.train

@@ -47,13 +47,13 @@ class Count(TorchDispatchMode):
 
 
 def _reshaped(func: Any, args: Any, out: Any) -> bool:
-    """Whether an operation that could copy gave a view."""
+    """Return whether an operation that could copy gave a view."""
     own = func._overloadpacket.__name__ in ("_reshape_alias", "reshape", "_unsafe_view", "_to_copy", "contiguous")
     return own and isinstance(out, torch.Tensor) and out.data_ptr() == args[0].data_ptr()
 
 
 def _line() -> str:
-    """The innermost line of dexsim that is being run."""
+    """Return the innermost line of dexsim that is being run."""
     for frame in reversed(traceback.extract_stack()[:-2]):
         path = Path(frame.filename)
         if PACKAGE in path.parents:

@@ -60,7 +60,8 @@ _MODEL = """<mujoco model="made">
 
 
 def taxels(axis: str) -> str:
-    """A pad's CSV: 4 columns of 5 taxels on the palmar half of the end's capsule, along y (normal +z) or z (+x)."""
+    """Return a pad's CSV: 4 columns of 5 taxels on the palmar half of the end's capsule, along y (normal +z) or z
+    (+x)."""
     rows = ["x,y,z,nx,ny,nz,area"]
     for angle in np.radians([-45.0, -15.0, 15.0, 45.0]):
         for along in np.linspace(0.012, 0.025, 5):
@@ -73,7 +74,7 @@ def taxels(axis: str) -> str:
 
 
 def content(pads: bool = True) -> dict:
-    """What its hand.yaml says."""
+    """Return what its hand.yaml says."""
     pad = {"taxels": "finger.csv", "kind": "finger", "rows": 5}
     fingers = [
         {

@@ -40,7 +40,7 @@ def _constant(breaks: str, file: str, name: str, old: str, new: str, test: str) 
 
 
 def _never_drawn(task: str, name: str, instead: str, columns: str = "") -> Mutation:
-    """A range of which every world gets the same value."""
+    """Return a range of which every world gets the same value."""
     drawn = f's.draw("{name}"{columns})'
     return Mutation(
         f"{name} of {task} is never drawn",
@@ -417,7 +417,8 @@ MUTATIONS = (
 
 
 def mutated(m: Mutation, root: Path = ROOT) -> str:
-    """The text of a mutation's file with it. Raises ValueError where its old text does not stand there exactly once."""
+    """Return the text of a mutation's file with it. Raises ValueError where its old text does not stand there
+    exactly once."""
     text = (root / m.file).read_text(encoding="utf-8")
     if text.count(m.old) != 1:
         raise ValueError(

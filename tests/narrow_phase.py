@@ -69,7 +69,7 @@ ROUND = tuple(int(GEOM[k]) for k in ("sphere", "capsule"))
 
 
 def scene(kind: str) -> tuple[mujoco.MjModel, list[int], list[int]]:
-    """A model of two bodies with a geom each, of the types that `kind` names; meshes that A and B may be."""
+    """Return a model of two bodies with a geom each, of the types that `kind` names; meshes that A and B may be."""
     spec = mujoco.MjSpec()
     spec.option.ccd_tolerance, spec.option.ccd_iterations = REFERENCE
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
@@ -118,8 +118,8 @@ class Poses:
 
 
 def draw(model: mujoco.MjModel, kind: str, a: list[int], b: list[int], n: int, rng: np.random.Generator) -> Poses:
-    """Turned at random, moved along a random direction until the gap along it is -2 to 1.5 mm; a tenth with faces
-    parallel."""
+    """Return the turned at random, moved along a random direction until the gap along it is -2 to 1.5 mm; a tenth with
+    faces parallel."""
     q = rng.normal(size=(n, 2, 4))
     q /= np.linalg.norm(q, axis=-1, keepdims=True)
     rot = np.empty((n, 2, 9))
@@ -149,7 +149,7 @@ def draw(model: mujoco.MjModel, kind: str, a: list[int], b: list[int], n: int, r
 def _reach(
     model: mujoco.MjModel, k: int, mesh: np.ndarray, size: np.ndarray, rot: np.ndarray, u: np.ndarray
 ) -> np.ndarray:
-    """How far geom k reaches along u from its place [n], in m."""
+    """Return how far geom k reaches along u from its place [n], in m."""
     d = np.einsum("nji,nj->ni", rot, u)
     kind = model.geom_type[k]
     if kind == GEOM["sphere"]:
@@ -169,7 +169,7 @@ def _reach(
 
 
 def reference(model: mujoco.MjModel, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(distance [n], normal from A to B [n, 3], point halfway [n, 3]) of C MuJoCo, in float64."""
+    """Return (distance [n], normal from A to B [n, 3], point halfway [n, 3]) of C MuJoCo, in float64."""
     data = mujoco.MjData(model)
     n = len(poses.pos)
     dist, ends = np.empty(n), np.empty((n, 6))
@@ -222,7 +222,8 @@ class Worlds:
                     mjw.collision(self.m, self.d)
 
     def found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(distance [n], inf where there is no contact; normal from A to B [n, 3]; position [n, 3]) of each pair's
+        """Return (distance [n], inf where there is no contact; normal from A to B [n, 3]; position [n, 3]) of each
+        pair's
         deepest contact: MuJoCo-Warp's closed forms make two of some pairs."""
         c, number = self.d.contact, int(self.d.nacon.numpy()[0])
         found = c.dist.numpy()[:number]
@@ -236,7 +237,7 @@ class Worlds:
 
 
 def compare(model: mujoco.MjModel, poses: Poses, want, got) -> dict[str, np.ndarray]:
-    """Errors of all poses that either side calls a contact: m, rad, m; NaN where that is not well-posed."""
+    """Return the errors of all poses that either side calls a contact: m, rad, m; NaN where that is not well-posed."""
     dist, normal, pos = want
     near = dist < MARGIN - 1e-6
     missed = near & ~np.isfinite(got[0])
@@ -265,12 +266,12 @@ def well_posed(model: mujoco.MjModel, poses: Poses, want) -> tuple[np.ndarray, n
 
 
 def _radius(model: mujoco.MjModel, poses: Poses) -> np.ndarray:
-    """What surfaces are nearer than cores [n], in m."""
+    """Return what surfaces are nearer than cores [n], in m."""
     return (poses.size[:, :, 0] * np.isin(model.geom_type, ROUND)).sum(1)
 
 
 def _rivals(model: mujoco.MjModel, k: int, poses: Poses, u: np.ndarray) -> np.ndarray:
-    """1 if the core's furthest feature along u is a point, 2 if it is an edge or face (within 1e-3 rad)."""
+    """Return 1 if the core's furthest feature along u is a point, 2 if it is an edge or face (within 1e-3 rad)."""
     d = np.einsum("nji,nj->ni", poses.rot[:, k], u)
     kind = model.geom_type[k]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -291,9 +292,9 @@ def _rivals(model: mujoco.MjModel, k: int, poses: Poses, u: np.ndarray) -> np.nd
 
 
 def confirmed(model: mujoco.MjModel, poses: Poses, normal: np.ndarray) -> np.ndarray:
-    """Depth [m] along a direction from A to B, in float64: how far A must move against it to be free of B. The true
-    depth is the least over all directions, so that this never is too small; of bodies apart it is minus a gap that no
-    other direction need have, so that their distance never is smaller."""
+    """Return the depth [m] along a direction from A to B, in float64: how far A must move against it to be free of B.
+    The true depth is the least over all directions, so that this never is too small; of bodies apart it is minus a
+    gap that no other direction need have, so that their distance never is smaller."""
     reach = sum(
         _reach(model, k, poses.mesh[:, k], poses.size[:, k], poses.rot[:, k], s * normal)
         for k, s in ((0, 1.0), (1, -1.0))
@@ -302,7 +303,7 @@ def confirmed(model: mujoco.MjModel, poses: Poses, normal: np.ndarray) -> np.nda
 
 
 def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """(what is compared with, where C MuJoCo itself was wrong by more than 1e-7 m [n]). answers: its own first.
+    """Return (what is compared with, where C MuJoCo itself was wrong by more than 1e-7 m [n]). answers: its own first.
 
     Each answer of C MuJoCo is looked at by itself: along its normal the bodies must reach just as far as it says. Where
     that fails, or another answer differs by more than 1e-7 m (MuJoCo-Warp's own: 1e-6, its tolerance), the exact one
@@ -328,8 +329,8 @@ def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.
 
 
 def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> dict:
-    """Errors and times of one pair of types under both settings (under one where both are MuJoCo-Warp's), over n random
-    poses, `worlds` at a time."""
+    """Return the errors and times of one pair of types under both settings (under one where both are MuJoCo-Warp's),
+    over n random poses, `worlds` at a time."""
     model, a, b = scene(kind)
     rng = np.random.default_rng(seed)
     both = {s: Worlds(model, worlds, device, s) for s in (SETTINGS if kind in OURS else SETTINGS[1:])}
@@ -376,7 +377,7 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
 
 
 def spread(x: np.ndarray) -> dict[str, float]:
-    """Median, 99th and 99.99th percentile, and worst, of the finite magnitudes; how many there are."""
+    """Return the median, 99th and 99.99th percentile, and worst, of the finite magnitudes; how many there are."""
     x = np.abs(x[np.isfinite(x)])
     if not len(x):
         return {"number": 0}

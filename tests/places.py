@@ -45,7 +45,7 @@ def radius(kind: int, size: np.ndarray) -> float:
 
 
 def core(model: mujoco.MjModel, poses, k: int, i: int) -> np.ndarray:
-    """Corners of geom k in pose i, in the world [n, 3], in m."""
+    """Return the corners of geom k in pose i, in the world [n, 3], in m."""
     kind, size = model.geom_type[k], poses.size[i, k]
     if kind == SPHERE:
         corners = np.zeros((1, 3))
@@ -61,9 +61,9 @@ def core(model: mujoco.MjModel, poses, k: int, i: int) -> np.ndarray:
 
 
 def exact(model: mujoco.MjModel, poses, i: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """(distance in m, normal from A to B [3], place in m [3]) of pose i in float64. Where neither geom is a cylinder:
-    of overlapping bodies by the nearest facet of the hull of all differences of corners (Qhull), of others by the
-    nearest point of that hull (Lawson and Hanson's least distance programming)."""
+    """Return (distance in m, normal from A to B [3], place in m [3]) of pose i in float64. Where neither geom is a
+    cylinder: of overlapping bodies by the nearest facet of the hull of all differences of corners (Qhull), of others
+    by the nearest point of that hull (Lawson and Hanson's least distance programming)."""
     own = [radius(model.geom_type[k], poses.size[i, k]) for k in (0, 1)]
     for k in np.flatnonzero(model.geom_type == CYLINDER):
         turn = poses.rot[i, k]
@@ -103,8 +103,8 @@ def changed(poses, i: int, n: int = CHANGED):
 
 
 def furthest(model: mujoco.MjModel, poses, k: int, i: int, u: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Corners [n, 3] of what of geom k's surface in pose i is furthest along u, to `LEVEL`. Of what is so high of a
-    cylinder's cap a polygon and the point nearest to `at`."""
+    """Return the corners [n, 3] of what of geom k's surface in pose i is furthest along u, to `LEVEL`. Of what is so
+    high of a cylinder's cap a polygon and the point nearest to `at`."""
     own = radius(model.geom_type[k], poses.size[i, k]) * u
     if model.geom_type[k] != CYLINDER:
         c = core(model, poses, k, i)
@@ -125,7 +125,7 @@ def furthest(model: mujoco.MjModel, poses, k: int, i: int, u: np.ndarray, at: np
 
 
 def error(model: mujoco.MjModel, poses, i: int, normal: np.ndarray, at: np.ndarray) -> float:
-    """How far [m] a place is from the nearest of those halfway between the points that face each other along the
+    """Return how far [m] a place is from the nearest of those halfway between the points that face each other along the
     normal (from A to B) in pose i."""
     a, b = furthest(model, poses, 0, i, normal, at), furthest(model, poses, 1, i, -normal, at)
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
@@ -143,13 +143,13 @@ def error(model: mujoco.MjModel, poses, i: int, normal: np.ndarray, at: np.ndarr
 
 
 def errors(model: mujoco.MjModel, poses, i: int, normals: list[np.ndarray], at: np.ndarray) -> float:
-    """The least `error` along any of the normals."""
+    """Return the least `error` along any of the normals."""
     return min(error(model, poses, i, n, at) for n in normals)
 
 
 def described(model: mujoco.MjModel, poses, i: int, got: tuple) -> dict:
-    """Pose i as a case of tests/contact_places.json, whose numbers a float32 has exactly, and what was answered there:
-    distance [m], how much more than exact that is [m], normal from A to B, place [m]."""
+    """Return the pose i as a case of tests/contact_places.json, whose numbers a float32 has exactly, and what was
+    answered there: distance [m], how much more than exact that is [m], normal from A to B, place [m]."""
     dist, normal, _ = exact(model, poses, i)
     return {
         "meshes": [model.mesh(m).name if m >= 0 else None for m in poses.mesh[i]],

@@ -31,7 +31,7 @@ def signal(
     seed: int = 0,
     tactile: bool = False,
 ) -> Recording:
-    """Joints that follow sines with a lag; an effort like a proportional servo's; nothing wrong with it."""
+    """Return the joints that follow sines with a lag; an effort like a proportional servo's; nothing wrong with it."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / rate)
     f, size = rng.uniform(0.3, 0.9, len(joints)), rng.uniform(0.1, 0.16, len(joints))

@@ -22,7 +22,7 @@ presets:
 
 
 def configs(folder: Path) -> Path:
-    """A copy of configs/ with `task=dummy` and without what other tasks need."""
+    """Return a copy of configs/ with `task=dummy` and without what other tasks need."""
     target = folder / "configs"
     shutil.copytree(CONFIGS, target)
     for group in ("task", "servo", "tactile", "randomize"):

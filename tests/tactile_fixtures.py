@@ -12,7 +12,7 @@ SPRING = {"sum": "spring", "law": "linear", "stiffness": {"linear": 2.0e8, "hert
 
 
 def touch(n: int, layout: TaxelLayout, shapes: list, cfg: dict, **kw) -> tuple[PosedEngine, Tactile]:
-    """An engine with the layout's bodies and `object`, and touch on it, one pair "pad" a pad."""
+    """Return an engine with the layout's bodies and `object`, and touch on it, one pair "pad" a pad."""
     bodies = ["world", *dict.fromkeys(layout.bodies), "object"]
     engine = PosedEngine(n, bodies, layout.names, kw.pop("device", "cpu"))
     tactile = Tactile(engine, layout, ShapeSet(shapes, engine.device), "object", cfg, pairs=list(layout.names), **kw)
@@ -24,7 +24,7 @@ def primitives() -> list[TouchShape]:
 
 
 def flat_layout(half: float = 8e-3, n: int = 81) -> TaxelLayout:
-    """A flat square pad in the plane z = 0, +z outward, n x n taxels that tile it evenly."""
+    """Return a flat square pad in the plane z = 0, +z outward, n x n taxels that tile it evenly."""
     pitch = 2 * half / n
     x = -half + pitch * (np.arange(n) + 0.5)
     p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((n, n))], -1).reshape(-1, 3)

@@ -491,7 +491,7 @@ print(json.dumps([shown[0].tolist(), servo.velocity()[0].tolist(), rows.numpy()[
 
 @pytest.fixture(scope="module")
 def grown(tmp_path_factory) -> Path:
-    """A folder with a copy of the package that has all of them."""
+    """Return a folder with a copy of the package that has all of them."""
     folder = tmp_path_factory.mktemp("grown")
     package = folder / "dexsim"
     shutil.copytree(Path(dexsim.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -506,7 +506,7 @@ def grown(tmp_path_factory) -> Path:
 
 
 def told(folder: Path, *command: str) -> str:
-    """What a Python command prints with the copy."""
+    """Return what a Python command prints with the copy."""
     env = os.environ | {"PYTHONPATH": str(folder)}
     done = subprocess.run([sys.executable, *command], cwd=folder, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

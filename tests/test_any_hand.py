@@ -49,7 +49,7 @@ def config(folder, task: str, *more: str) -> dict:
 
 @pytest.fixture(scope="module")
 def hands(tmp_path_factory):
-    """Folders by pads (True, False); held poses are found once and serve both."""
+    """Return the folders by pads (True, False); held poses are found once and serve both."""
     at = tmp_path_factory.mktemp("hands")
     folders = {pads: made_hand(at / f"made_{pads}", pads=pads) for pads in (True, False)}
     hand = load_hand(folders[False])

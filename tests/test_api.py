@@ -21,7 +21,7 @@ NAMES = [n for n in dexsim.__all__ if n != "__version__"]
 
 
 def cells(notebook: Path) -> list[str]:
-    """The code cells of a notebook."""
+    """Return the code cells of a notebook."""
     return [
         "".join(c["source"])
         for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"]

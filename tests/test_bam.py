@@ -50,14 +50,14 @@ KP, VOLT, MASS, LENGTH = 1.15, 5.0, 0.3, 0.1
 
 
 def of(model: str, **terms: float) -> dict:
-    """A file of a model: M2's figures and the model's load terms, but for those given."""
+    """Return a file of a model: M2's figures and the model's load terms, but for those given."""
     own = {k: v for k, v in M2.items() if model not in ("m1", "m3") or k not in FALL}
     return own | OF[model] | terms | {"model": model}
 
 
 def budget(p: dict, motor: float, external: float, v: float) -> float:
-    """What friction can hold, by the models' equations as published (arXiv 2410.08650, section III; m5's and m6's
-    loads as the method's code has them: weighted, then subtracted). A term that p does not name is 0."""
+    """Return what friction can hold, by the models' equations as published (arXiv 2410.08650, section III; m5's and
+    m6's loads as the method's code has them: weighted, then subtracted). A term that p does not name is 0."""
     falls = p["model"] not in ("m1", "m3")
     peak = math.exp(-(abs(v / p["dtheta_stribeck"]) ** p["alpha"])) if falls else 0.0
     said = lambda name: p.get(f"load_friction_{name}", 0.0)  # noqa: E731
@@ -74,8 +74,8 @@ def budget(p: dict, motor: float, external: float, v: float) -> float:
 
 
 def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: float = 1e-4) -> tuple:
-    """BAM's pendulum: torque kt U / R - kt^2 / R dq; friction is what would stop the joint within the step, at most the
-    budget. Semi-implicit Euler in steps of h [s]."""
+    """Return BAM's pendulum: torque kt U / R - kt^2 / R dq; friction is what would stop the joint within the step,
+    at most the budget. Semi-implicit Euler in steps of h [s]."""
     inertia, q, v = MASS * LENGTH**2 + p["armature"], 0.0, 0.0
     out = np.zeros(int(seconds / h))
     at = np.maximum(np.searchsorted(stamps, h * np.arange(len(out)), side="right") - 1, 0)
@@ -91,7 +91,7 @@ def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: fl
 
 
 def ours(tmp_path, file: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, step: float = 5e-4):
-    """The same by the servo table of the file, on the pendulum as a MuJoCo model."""
+    """Return the same by the servo table of the file, on the pendulum as a MuJoCo model."""
     (tmp_path / "m.json").write_text(json.dumps(file))
     table = bam.to_servo(bam.read(tmp_path / "m.json"), KP, VOLT)
     (tmp_path / "rig.xml").write_text(
@@ -105,7 +105,7 @@ def ours(tmp_path, file: dict, stamps: np.ndarray, goals: np.ndarray, seconds: f
 
 
 def both(tmp_path, file: dict, terms) -> tuple[float, dict[str, float]]:
-    """Root mean square, over the range, of how far our motion is from BAM's, and BAM's own without a term."""
+    """Return root mean square, over the range, of how far our motion is from BAM's, and BAM's own without a term."""
     t = np.arange(0.0, 3.0, 0.01)
     goals = 1.2 * np.sin(2 * np.pi * 0.4 * t) + 0.15 * np.sin(2 * np.pi * 1.7 * t)
     run = ours(tmp_path, file, t, goals, 3.0)

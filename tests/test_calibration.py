@@ -33,7 +33,7 @@ torch.set_num_threads(1)
 
 
 def levels(slope=4.0, offset=0.0, friction=0.0, noise=0.05, n=8, seed=0, top=2.0) -> Levels:
-    """A press up a ladder and down again: force = slope * (effort -+ friction) + offset."""
+    """Return a press up a ladder and down again: force = slope * (effort -+ friction) + offset."""
     rng = np.random.default_rng(seed)
     number = np.concatenate([np.arange(1, n + 1), np.arange(n - 1, 0, -1)])
     up = np.arange(len(number)) < n
@@ -92,7 +92,7 @@ def test_hysteresis_is_the_width_of_the_loop():
 
 @pytest.fixture(scope="module")
 def pressed():
-    """A simulated press of a second and a first joint of one finger."""
+    """Return a simulated press of a second and a first joint of one finger."""
     return {j: simulate.press_recording(HAND, j) for j in ("mid_joint2", "mid_joint1")}
 
 
@@ -156,7 +156,8 @@ def test_a_lost_sign_is_refused_and_the_wrong_kind_named(pressed, tmp_path):
 
 
 def pushed(alpha=3.0, seed=0) -> Recording:
-    """A finger pressed from outside while its commands stand still: force steps, current of two joints follows."""
+    """Return a finger pressed from outside while its commands stand still: force steps, current of two joints
+    follows."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, 12, 0.01)
     force = np.repeat([0, 1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 1], 100).astype(float)

@@ -41,14 +41,14 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def run_folder(configs, tmp_path_factory):
-    """One finished run."""
+    """Return one finished run."""
     where = tmp_path_factory.mktemp("runs") / "done"
     assert shell.call("train", configs, *QUICK, f"out={where}", "save_interval=1") == 0
     return where
 
 
 def refused(capfd, configs, *argv, script="train"):
-    """The one line on stderr of a refused command; it exits with 2 and never shows a traceback."""
+    """Return the one line on stderr of a refused command; it exits with 2 and never shows a traceback."""
     capfd.readouterr()
     assert shell.call(script, configs, *argv) == 2
     out, err = capfd.readouterr()

@@ -277,7 +277,7 @@ def test_the_exact_reference_of_cylinders():
 
 @pytest.fixture(scope="module", params=["capsule-hull", "box-hull", "hull-hull", "fingertip-cylinder"])
 def two_poses(request):
-    """Poses, and the same a step later: 1 mm and 0.03 rad further."""
+    """Return the poses, and the same a step later: 1 mm and 0.03 rad further."""
     model, a, b = bench.scene(request.param)
     rng = np.random.default_rng(5)
     before = bench.draw(model, request.param, a, b, POSES, rng)
@@ -333,7 +333,7 @@ def test_corners_of_another_mesh_are_forgotten(two_poses):
 
 @pytest.fixture(scope="module")
 def grasping():
-    """A closing hand of each setting, the same worlds: (hand, mujoco)."""
+    """Return a closing hand of each setting, the same worlds: (hand, mujoco)."""
     return tuple(
         grasp_env("task.objects.baked_scales=[1.25]", f"sim.collision={c}", worlds=9, engine="warp")
         for c in ("hand", "mujoco")

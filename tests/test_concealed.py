@@ -28,7 +28,7 @@ BOB = plant.pendulum(0.1)
 def run(
     rows: int, steps: int, command: float | np.ndarray = 0.0, rig=BOB, q0=0.0, driven: bool = True, **values
 ) -> dict[str, np.ndarray]:
-    """One-joint rows of the plant; outputs [rows, steps]."""
+    """Return one-joint rows of the plant; outputs [rows, steps]."""
     c = np.broadcast_to(np.asarray(command, float), (rows, 1, steps))
     p = plant.rows(rows, len(rig.names), **values)
     return {
@@ -208,7 +208,7 @@ def quick(monkeypatch):
 
 @pytest.fixture(scope="module")
 def some(tmp_path_factory):
-    """One case of several kinds from one seed, with the fast settings of a test."""
+    """Return one case of several kinds from one seed, with the fast settings of a test."""
     root = tmp_path_factory.mktemp("cases")
     seconds, generate.SECONDS = generate.SECONDS, 0.6
     sizes, generate.SIZES = generate.SIZES, 2

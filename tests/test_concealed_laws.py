@@ -21,7 +21,7 @@ NOWHERE = np.zeros(3)
 def run(
     rows: int, steps: int, goal=0.0, q0=0.0, external=None, gravity=NOWHERE, joints: int = 1, **values
 ) -> dict[str, np.ndarray]:
-    """Outputs [rows, J, steps] of pendulums, without gravity; goal: command, broadcast."""
+    """Return the outputs [rows, J, steps] of pendulums, without gravity; goal: command, broadcast."""
     rig = plant.pendulum(0.1, names=tuple("abcd"[:joints]))
     c = np.broadcast_to(np.asarray(goal, float), (rows, joints, steps))
     push = None if external is None else np.broadcast_to(np.asarray(external, float), (rows, joints, steps))
@@ -35,7 +35,7 @@ def last(x: np.ndarray) -> np.ndarray:
 
 
 def drag(speed: np.ndarray, external=0.0, **values) -> np.ndarray:
-    """[rows] torque that moves rows at steady speeds, pushed by `external` (a number or one a row)."""
+    """Return [rows] torque that moves rows at steady speeds, pushed by `external` (a number or one a row)."""
     t = np.arange(1500) * 1e-3
     push = np.broadcast_to(external, len(speed))[:, None, None]
     o = run(len(speed), 1500, (speed[:, None] * t)[:, None], external=push, **(FREE | values))
@@ -357,7 +357,7 @@ def quick(monkeypatch):
 
 
 def case(kind: str, number: int, which: str, where, shape: str = "one") -> tuple[dict, dict, bytes]:
-    """(truth, the case's own files' texts and commands, reported positions) of one case of seed 3."""
+    """Return (truth, the case's own files' texts and commands, reported positions) of one case of seed 3."""
     entry = {"group": "effect", "kinds": [kind], "tier": "easy", "shape": shape, "joints": []}
     made = generate.build(entry, number, 3, where / "cases", where / "truth", which)
     folder = where / "cases" / made["name"]

@@ -75,7 +75,7 @@ class Twin:
         w.engine.refresh()
 
     def step(self, action: torch.Tensor) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """What each engine makes of one control step, before resets, as (C, Warp)."""
+        """Return what each engine makes of one control step, before resets, as (C, Warp)."""
         self.copy()
         seen = {}
         for name, env in (("c", self.c), ("w", self.w)):
@@ -117,7 +117,8 @@ class Twin:
 
 @pytest.fixture(scope="module", params=["hand", "mujoco"])
 def record(request):
-    """A catch: objects fall, the hand closes, then moves at random; each step's two outcomes, [STEPS, N, ...]."""
+    """Return a catch: objects fall, the hand closes, then moves at random; each step's two outcomes, [STEPS, N,
+    ...]."""
     twin = Twin(request.param)
     g = torch.Generator().manual_seed(2)
     everything = []
@@ -138,7 +139,7 @@ def record(request):
 
 
 def error(record, name: str) -> torch.Tensor:
-    """Largest difference of each world and step [STEPS * N]."""
+    """Return the largest difference of each world and step [STEPS * N]."""
     c, w = record[name]
     return (c - w).abs().flatten(2).amax(2).flatten()
 
@@ -232,7 +233,8 @@ def test_contact_sums_agree_more_than_single_contacts(record):
 
 
 def thrown(steps: int, *settings: str) -> set[int]:
-    """Worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than 1.5 m/s in
+    """Return the worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than
+    1.5 m/s in
     one control step: gravity adds 0.2 m/s, a firm catch takes 0.6."""
     env, policy = play_env("grasp", 64, *settings)
     env.reset_all()

@@ -31,8 +31,8 @@ def poses_of(model: mujoco.MjModel, cases: list[dict]) -> bench.Poses:
 
 
 def neighbours(poses: bench.Poses, n: int) -> bench.Poses:
-    """Each pose and n more whose numbers differ from its by at most a unit in the last place of a float32: what another
-    rounding makes of the first is what this one makes of some of these."""
+    """Return each pose and n more whose numbers differ from its by at most a unit in the last place of a float32:
+    what another rounding makes of the first is what this one makes of some of these."""
     rng = np.random.default_rng(0)
     out = poses[np.repeat(np.arange(len(poses.pos)), n + 1)]
     for x in (out.pos, out.rot):

@@ -32,7 +32,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A bundle whose training had quiet sensors and kept every taxel."""
+    """Return a bundle whose training had quiet sensors and kept every taxel."""
     folder = tmp_path_factory.mktemp("deploy")
     source = make_checkpoint(
         folder / "policy.pt", *QUIET, "tactile.raw=true", "task.command.low=0.6", "task.command.high=0.6"
@@ -42,7 +42,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def episode(made, tmp_path_factory):
-    """(recording of a simulated episode, its observations [K, 66], its actions, its targets)."""
+    """Return (recording of a simulated episode, its observations [K, 66], its actions, its targets)."""
     from dexsim.learning import checkpoint
     from dexsim.learning.ppo import load_policy
     from dexsim.recording.tap import PlayRecorder

@@ -48,8 +48,8 @@ def b(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """One hand model for all loops here, and no collection of torch's whole heap before each: a run is then a tenth of
-    a second."""
+    """Yield one hand model for all loops here, and no collection of torch's whole heap before each: a run is then a
+    tenth of a second."""
     from dexsim.deploy import loop, measure
 
     with pytest.MonkeyPatch.context() as patch:
@@ -115,7 +115,7 @@ def check_sent(hand, guard):
 
 
 def change(**fields):
-    """A spoiler that sets these fields of a reading; a function gets (old value, now)."""
+    """Return a spoiler that sets these fields of a reading; a function gets (old value, now)."""
 
     def spoil(state, now, kept=None):
         for name, value in fields.items():
@@ -129,7 +129,7 @@ def one(value, joint=4):
 
 
 def frozen(**fields):
-    """The same reading again and again, with these fields changed."""
+    """Return the same reading again and again, with these fields changed."""
 
     def spoil(state, now, kept):
         kept.append(dataclasses.replace(state))

@@ -80,7 +80,7 @@ def test_check_notices_a_changed_orientation_or_history(made, tmp_path):
 
 @pytest.fixture(scope="module")
 def episode(made, tmp_path_factory):
-    """(recording of the second of two worlds, its observations [K, D], actions, targets before and after)."""
+    """Return (recording of the second of two worlds, its observations [K, D], actions, targets before and after)."""
     from dexsim.learning import checkpoint
     from dexsim.learning.ppo import load_policy
     from dexsim.recording.tap import PlayRecorder

@@ -116,7 +116,7 @@ def test_tighter_limits_make_smaller_motions(wide):
 
 
 def two_links(gap):
-    """Two parallel fingers that meet when the first swings more than `gap` rad toward the second."""
+    """Return two parallel fingers that meet when the first swings more than `gap` rad toward the second."""
     x = 0.1 * np.sin(gap) + 0.02
     joint = 'axis="0 1 0" range="-1 1" limited="true"'
     geom = 'type="capsule" size="0.01" mass="0.02" contype="4" conaffinity="8"'

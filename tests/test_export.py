@@ -22,7 +22,7 @@ from dexsim.tasks import observations
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """(checkpoint, bundle folder)."""
+    """Return (checkpoint, bundle folder)."""
     folder = tmp_path_factory.mktemp("bundle")
     source = make_checkpoint(folder / "policy.pt")
     return source, export.export(str(source), folder / "out", steps=20)

@@ -48,7 +48,7 @@ WARP = re.compile(r"@wp\.(kernel|func|func_native|struct)\b|wp\.kernel\(")
 
 
 def door(node: ast.AST) -> bool:
-    """Whether a statement is `if __name__ == "__main__":` or `if TYPE_CHECKING:`."""
+    """Return whether a statement is `if __name__ == "__main__":` or `if TYPE_CHECKING:`."""
     return isinstance(node, ast.If) and (
         "TYPE_CHECKING" in ast.unparse(node.test)
         or ast.unparse(node.test).replace('"', "'") == "__name__ == '__main__'"
@@ -56,7 +56,7 @@ def door(node: ast.AST) -> bool:
 
 
 def modules(root: Path, package: str = "dexsim") -> dict[str, Path]:
-    """Module name -> file of a package in the folder root, without the package's own `__main__.py`."""
+    """Return the module name -> file of a package in the folder root, without the package's own `__main__.py`."""
     found = {}
     for path in sorted((root / package).rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
@@ -66,7 +66,7 @@ def modules(root: Path, package: str = "dexsim") -> dict[str, Path]:
 
 
 def imported(path: Path, known: dict[str, Path], package: str = "dexsim") -> set[str]:
-    """Modules of the package that a file imports, wherever in it."""
+    """Return the modules of the package that a file imports, wherever in it."""
     out: set[str] = set()
     waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while waiting:
@@ -97,7 +97,7 @@ def part(module: str) -> str:
 
 
 def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """One closed path, as short as there is, through each file that lies on one; every set of files once."""
+    """Return one closed path, as short as there is, through each file that lies on one; every set of files once."""
     found: dict[frozenset[str], list[str]] = {}
     for start in graph:
         before: dict[str, str] = {}
@@ -141,7 +141,7 @@ def test_imports_run_down(graph):
 
 
 def step(module: str) -> tuple[str, int] | None:
-    """The room of a step of the diagnosis, `dexsim.gap` or `dexsim.gap.touch`, and which one it is there."""
+    """Return the room of a step of the diagnosis, `dexsim.gap` or `dexsim.gap.touch`, and which one it is there."""
     names = module.removeprefix("dexsim.gap.").split(".")
     room = "dexsim.gap.touch" if names[0] == "touch" else "dexsim.gap"
     name = names[len(names) > 1 and names[0] == "touch"]
@@ -149,7 +149,7 @@ def step(module: str) -> tuple[str, int] | None:
 
 
 def reached(graph: dict[str, set[str]], module: str) -> set[str]:
-    """All modules that one imports, itself or by what it imports."""
+    """Return all modules that one imports, itself or by what it imports."""
     found: set[str] = set()
     waiting = [module]
     while waiting:
@@ -188,8 +188,8 @@ def test_no_circles_of_files(graph):
 
 
 def untyped(path: Path) -> list[str]:
-    """Public functions and methods of a file that leave out the type of an argument or of what they return. Warp's own
-    say what they return by themselves."""
+    """Return the public functions and methods of a file that leave out the type of an argument or of what they return.
+    Warp's own say what they return by themselves."""
     found = []
 
     def visit(node: ast.Module | ast.ClassDef) -> None:

@@ -58,9 +58,9 @@ def plant_run(
     servo: dict | None = None,
     temperature: bool | float = False,
 ) -> Run:
-    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name'). servo:
-    believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than the one
-    before; a number: by so many degrees more."""
+    """Return a run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name').
+    servo: believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than
+    the one before; a number: by so many degrees more."""
     t_cmd, cmd = motion(kind, seconds, seed)
     t = np.arange(0.0, seconds - 0.02, 0.01) + (
         np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01)))
@@ -93,7 +93,7 @@ def plant_run(
 
 
 def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds=(0, 1, 3), seconds: float = 4.0):
-    """The search's outcome on runs of our own plant, its nominal a few percent off."""
+    """Return the search's outcome on runs of our own plant, its nominal a few percent off."""
     off = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96} if off is None else off
     runs = [plant_run(f"run{k}", k, seconds, off | changes, seed=k) for k in kinds]
     for r in runs:

@@ -25,7 +25,8 @@ def rig(tmp_path_factory):
 
 
 def judged(rig, tmp_path, change, keep=(0, 2), **settings):
-    """The diagnosis of two recordings, both changed, with one effect to consider: the signals are what is tested."""
+    """Return the diagnosis of two recordings, both changed, with one effect to consider: the signals are what is
+    tested."""
     folder, paths, model, servo = rig
     out = []
     for k in keep:

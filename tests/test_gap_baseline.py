@@ -71,7 +71,7 @@ def test_a_friction_that_forbids_a_fall_that_was_recorded_is_refused_with_the_re
 
 
 def moved(case, seconds: float = 6.0, seed: int = 0, **true: float) -> Run:
-    """A recording of steps and a wave by the plant itself, with columns at their true values."""
+    """Return a recording of steps and a wave by the plant itself, with columns at their true values."""
     rng, t = np.random.default_rng(seed), np.arange(0, seconds, 5e-3)
     cmd = 0.4 * np.sin(2 * np.pi * (0.4 + 0.1 * seed) * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.55 * t + seed))
     blank = case_of(run(f"m{seed}.mcap", t, np.zeros(len(t)), cmd))

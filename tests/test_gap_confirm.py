@@ -68,7 +68,7 @@ def test_a_freed_joint_swings():
 
 @pytest.fixture(scope="module")
 def answer(tmp_path_factory):
-    """A diagnosis of dry friction in a simulated pendulum, and what it wrote."""
+    """Return a diagnosis of dry friction in a simulated pendulum, and what it wrote."""
     folder = tmp_path_factory.mktemp("confirm")
     paths, model, servo, _ = demo.make(folder, "coulomb_friction", seconds=4.0)
     allowed = {"coulomb_friction", "stribeck_friction", "viscous_friction"}
@@ -122,7 +122,7 @@ def replayed(
     servo: dict | None = None,
     temperature: bool = False,
 ):
-    """Recordings of the gap's own plant with an effect, and the confirmation of the very same hypothesis."""
+    """Return the recordings of the gap's own plant with an effect, and the confirmation of the very same hypothesis."""
     runs = [plant_run(f"r{k}", k, 4.0, hidden, seed=k, servo=servo, temperature=temperature) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()

@@ -20,7 +20,8 @@ GPU = wp.get_cuda_device_count() > 0
 
 @pytest.fixture(scope="module")
 def guesses():
-    """A joint's plant, windows of a second, guesses [9, R, C] of which some differ between runs, initial states."""
+    """Return a joint's plant, windows of a second, guesses [9, R, C] of which some differ between runs, initial
+    states."""
     import mujoco
 
     runs = [plant_run(f"r{k}", k, 4.0, {}, seed=k) for k in (0, 1, 3)]

@@ -20,7 +20,8 @@ def rig(tmp_path_factory):
 
 
 def named(rig, folder, changes):
-    """The first finding of the recordings, each as its own change makes it (None: as it is), and the diagnosis."""
+    """Return the first finding of the recordings, each as its own change makes it (None: as it is), and the
+    diagnosis."""
     recordings, model, servo, known = rig
     folder.mkdir(parents=True)
     paths = []

@@ -34,8 +34,8 @@ COLUMNS = {*NAMES, *SERIES}  # some effects are called as the column that they w
 
 
 def asked_by_name(source: str) -> list[str]:
-    """Ids of effects that a source names: any that is no column's name, and those in comparisons with a finding's or a
-    member's effect, by a constant that stands for one too."""
+    """Return the ids of effects that a source names: any that is no column's name, and those in comparisons with a
+    finding's or a member's effect, by a constant that stands for one too."""
     out = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in IDS - COLUMNS:
@@ -86,7 +86,7 @@ def test_every_effect_is_one_class_of_one_file_and_says_what_it_is():
 
 
 def found(changes: dict[str, float], servo: dict | None = None, allowed: set[str] | None = None, seconds: float = 5.0):
-    """The search's outcome on three runs of our own plant whose other figures are a few percent off."""
+    """Return the search's outcome on three runs of our own plant whose other figures are a few percent off."""
     off = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
     runs = [plant_run(f"run{k}", k, seconds, off | changes, seed=k, servo=servo) for k in (0, 1, 3)]
     for r in runs:
@@ -109,8 +109,8 @@ TWO = """<mujoco><worldbody>
 
 
 def moving(**servo: float) -> Case:
-    """Joint a of two that jump and swing at their limits while they grow warm, torques logged, as the plant itself
-    moves them. servo: columns other than SERVO's."""
+    """Return the joint a of two that jump and swing at their limits while they grow warm, torques logged, as the plant
+    itself moves them. servo: columns other than SERVO's."""
     t = np.arange(0.0, 3.0, 0.01)
     jumps = np.stack([steps(k, 3.0)[1] for k in (0, 1)], 1)
     command = jumps + 0.3 * np.sin(2 * np.pi * 2 * t)[:, None]
@@ -130,12 +130,12 @@ def moving(**servo: float) -> Case:
 
 @pytest.fixture(scope="module")
 def drives() -> tuple[Case, Case]:
-    """A drive at its limits, and a loop so soft that a spring can work against it."""
+    """Return a drive at its limits, and a loop so soft that a spring can work against it."""
     return moving(torque_limit=0.4, braking_slope=0.5), moving(kp=0.02, kd=0.004)
 
 
 def shown(case: Case, variant: Variant | None = None, x: Sequence[float] = ()) -> np.ndarray:
-    """[2, n] motion (rad) and the effort shown (N.m) with a variant of these sizes, or with what is believed."""
+    """Return [2, n] motion (rad) and the effort shown (N.m) with a variant of these sizes, or with what is believed."""
     params, fixed = (list(variant.params), variant.fixed) if variant else ([], ())
     return np.stack(free_run(case, params, np.array(x, float), case.plant.windows(None), fixed))
 

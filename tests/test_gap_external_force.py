@@ -18,7 +18,7 @@ SPANS = ((4.0, 6.5), (11.0, 12.5), (16.0, 18.0))
 
 
 def shove(t: np.ndarray, size: float = 6.0) -> np.ndarray:
-    """N.m on the elbow: half waves within SPANS."""
+    """Return N.m on the elbow: half waves within SPANS."""
     return sum(size * np.where((t > a) & (t < b), np.sin(np.pi * (t - a) / (b - a)), 0.0) for a, b in SPANS)
 
 

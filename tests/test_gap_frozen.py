@@ -24,8 +24,8 @@ def goal(kind: int) -> np.ndarray:
 
 
 def follow(target: np.ndarray, stiction: float = 0.0) -> np.ndarray:
-    """A joint of second order behind its target; it stays where it is until the target is `stiction` away, then it goes
-    all the way."""
+    """Return a joint of second order behind its target; it stays where it is until the target is `stiction` away,
+    then it goes all the way."""
     q, v, out, stuck = target[0], 0.0, [], False
     for c in np.repeat(target, 10):
         stuck = abs(c - q) < stiction if stuck else stiction > 0 and abs(v) < 0.02 and abs(c - q) < stiction

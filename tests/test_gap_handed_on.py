@@ -31,7 +31,7 @@ JOINT = "index_joint2"
 
 @pytest.fixture(scope="module")
 def hand_servo(tmp_path_factory):
-    """The servo.yaml of a diagnosis of one xHand joint that hides dry friction, and the folder."""
+    """Return the servo.yaml of a diagnosis of one xHand joint that hides dry friction, and the folder."""
     folder = tmp_path_factory.mktemp("handed")
     m = mechanism()
     m.table.set(JOINT, "coulomb_friction", 0.06)

@@ -48,7 +48,7 @@ class Judged(JointAnswer):
 
 
 def judged(answer: Judged) -> dict:
-    """The finding of an answer."""
+    """Return the finding of an answer."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(joint_answer, "free_run", lambda *_: (answer.without, None))
         patch.setattr(joint_answer, "intervals_of", lambda *_: [])
@@ -87,8 +87,9 @@ def test_what_removes_much_of_all_that_was_held_out_needs_no_moments_left_out():
 
 
 def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=False) -> confidence.Evidence:
-    """The evidence of a name against which nothing else speaks. fitted, reported: which of the two intervals, the fit's
-    and the reported one, holds the size at which nothing is missing; blurred: why the encoder does not resolve it."""
+    """Return the evidence of a name against which nothing else speaks. fitted, reported: which of the two intervals,
+    the fit's and the reported one, holds the size at which nothing is missing; blurred: why the encoder does not
+    resolve it."""
     answer = Judged(1.0, 0.1)
     answer.widest, answer.bounds = fitted, reported
     answer._fitted = lambda mm, bounds: ({}, bounds)

@@ -23,7 +23,8 @@ RATE = 3.0  # rad/s2 of joint b
 
 
 def plant(loop: str = "joint"):
-    """Joint a's plant along a run in which it stands still and b speeds up evenly; its drive does nothing by itself."""
+    """Return the joint a's plant along a run in which it stands still and b speeds up evenly; its drive does nothing by
+    itself."""
     t = np.arange(0.0, 1.0, 0.01)
     servo = {"joints": {"*": {"kp": 0.0, "kd": 0.0, "torque_limit": 1.0}}, "loop_encoder": loop}
     q = np.stack([0 * t, 0.5 * RATE * t**2], 1)
@@ -123,7 +124,7 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
 
 
 def several(ratio: float = 0.0):
-    """Cases of six joints side by side, a to f, that move at their own rates; a's motor is linked with f."""
+    """Return the cases of six joints side by side, a to f, that move at their own rates; a's motor is linked with f."""
     names, rates = "abcdef", (3.0, 4.1, 5.3, 6.7, 7.9, 2.3)
     bodies = "".join(
         f'<body pos="{k} 0 0"><joint name="{n}" axis="0 1 0" armature="5e-4"/>'

@@ -24,7 +24,7 @@ LOAD = 0.2 * 9.81 * 0.1  # N.m of the level arm
 
 
 def arm(torque: np.ndarray, **columns) -> np.ndarray:
-    """Angle [n] of a level arm whose drive gives `torque` [n] N.m every 10 ms: a weak loop with far targets."""
+    """Return angle [n] of a level arm whose drive gives `torque` [n] N.m every 10 ms: a weak loop with far targets."""
     t = np.arange(len(torque)) * 0.01
     servo = ServoTable.from_dict({"joints": {"*": {"kp": 1e-3, "kd": 0.0, "torque_limit": 5.0}}})
     q = np.zeros((len(t), 1))
@@ -64,7 +64,7 @@ def test_a_power_is_of_the_load_over_its_unit():
 
 @pytest.fixture(scope="module")
 def searched():
-    """A search of friction on runs of a gear that loses more than its load."""
+    """Return a search of friction on runs of a gear that loses more than its load."""
     off = {"*kp": 1.03, "*inertia_scale": 0.97}
     runs = [plant_run(f"run{k}", k, 5.0, off | gear(1.3, gear_load_unit=0.05), seed=k) for k in (0, 1, 3)]
     for r in runs:

@@ -26,8 +26,8 @@ OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 
 
 def found(changes: dict[str, float], effect: str, seconds: float = 4.0) -> tuple[dict, str]:
-    """(parameters as reported, variant's label) of the search for one effect on recordings with figures a few percent
-    off."""
+    """Return (parameters as reported, variant's label) of the search for one effect on recordings with figures a few
+    percent off."""
     runs = [plant_run(f"run{k}", k, seconds, OFF | changes, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
@@ -48,7 +48,7 @@ def found(changes: dict[str, float], effect: str, seconds: float = 4.0) -> tuple
 
 
 def mass_matrix(m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """(inertia, bias with gravity) at a pose and speed away from zero."""
+    """Return (inertia, bias with gravity) at a pose and speed away from zero."""
     d = mujoco.MjData(m)
     d.qpos[:], d.qvel[:] = m.qpos0 + 0.2, 0.5
     mujoco.mj_forward(m, d)
@@ -119,7 +119,7 @@ CHAIN = """<mujoco><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0" arm
 
 
 def chain_case(spec: mujoco.MjSpec):
-    """Joint a's case along motions of both joints."""
+    """Return the joint a's case along motions of both joints."""
     t = np.arange(0.0, 3.0, 0.01)
     q = np.stack([0.6 * np.sin(4 * t), 0.5 * np.sin(3 * t + 1)], 1)
     servo = ServoTable.from_dict(
@@ -222,7 +222,7 @@ def _scales():
 
 
 def jittered(kind: int, sd: float) -> Run:
-    """A run whose commands act 20 ms and a normal time of `sd` s later than they were sent."""
+    """Return a run whose commands act 20 ms and a normal time of `sd` s later than they were sent."""
     run = plant_run(f"run{kind}", kind, 4.0, {"delay": 0.02}, seed=kind, noisy=False)
     rng = np.random.default_rng(kind + 50)
     acts = np.maximum.accumulate(run.cmd_t + 0.02 + np.maximum(sd * rng.standard_normal(len(run.cmd_t)), -0.02))

@@ -20,8 +20,8 @@ from dexsim.recording.mechanism import Mechanism
 
 @pytest.fixture(scope="module")
 def hypotheses():
-    """A search whose recordings are one slow motion, with two hypotheses fitted to it: dry friction, and friction that
-    grows with speed."""
+    """Return a search whose recordings are one slow motion, with two hypotheses fitted to it: dry friction, and
+    friction that grows with speed."""
     import mujoco
 
     runs = [plant_run(f"r{k}", 0, 5.0, {"coulomb_friction": 0.05}, seed=k) for k in range(2)]

@@ -39,7 +39,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A page of a joint, one of touch, and one of recordings that cannot be used."""
+    """Return a page of a joint, one of touch, and one of recordings that cannot be used."""
     folder = tmp_path_factory.mktemp("pages")
     out = {}
     paths, model, servo, _ = demo.make(folder / "joint", "command_delay", seconds=4.0, joint="knuckle")
@@ -74,7 +74,7 @@ def pages(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page_of_all(tmp_path_factory):
-    """The page of touch where every effect was tried."""
+    """Return the page of touch where every effect was tried."""
     folder = tmp_path_factory.mktemp("all")
     paths, model, servo = press_rig.record(folder, 2, 5.0, gains={54: 0.4, 66: 0.0})
     s = Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False)

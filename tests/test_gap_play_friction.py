@@ -59,7 +59,7 @@ def test_friction_on_the_motor_is_the_servos_and_makes_no_difference_without_a_p
 
 @pytest.fixture(scope="module")
 def found():
-    """A play with most of the model's friction before it: (runs, case, search, without it, with it)."""
+    """Return a play with most of the model's friction before it: (runs, case, search, without it, with it)."""
     with pytest.MonkeyPatch.context() as patch:
         runs, case = runs_of(patch, PLAY | {"motor_share": 0.8})
     search = JointSearch(case, [0, 2], None, conditions(runs))

@@ -25,7 +25,7 @@ SERVO = {"joints": {"*": {"kp": 2.0, "kd": 0.1, "torque_limit": 2.0}}}
 
 
 def run_of(name: str, seed: int, seconds: float = 6.0, rate: float = 100.0) -> Run:
-    """Two joints that follow smooth targets with a lag of 30 ms."""
+    """Return two joints that follow smooth targets with a lag of 30 ms."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / rate)
     f = rng.uniform(0.3, 0.9, 2)
@@ -79,7 +79,7 @@ def test_a_joint_that_dry_friction_holds_is_not_called_stuck():
 
 
 def plain_lead(run: Run) -> float:
-    """The lead by its definition, one shift after another."""
+    """Return the lead by its definition, one shift after another."""
     grid = np.arange(run.t[0], run.t[-1], 0.005)
     dq = np.gradient(np.interp(grid, run.t, run.q[:, 0]))
     shifts = np.arange(-0.6, 0.401, 0.005)

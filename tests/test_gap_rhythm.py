@@ -21,7 +21,7 @@ def motion(seconds: float = 4.0, rate: float = 240.0, seed: int = 0) -> tuple[np
 
 
 def held(t: np.ndarray, q: np.ndarray, period: float, begin: float = 0.013) -> np.ndarray:
-    """What is logged of an encoder that is read every `period` s."""
+    """Return what is logged of an encoder that is read every `period` s."""
     beat = np.floor((t - begin) / period)
     first = np.searchsorted(beat, beat)
     return q[first]

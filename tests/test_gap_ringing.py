@@ -27,8 +27,8 @@ SOFT = {"softness": 0.1, "rebound": 0.16}
 
 @pytest.fixture(scope="module")
 def soft() -> JointSearch:
-    """Three recordings of a drive whose transmission gives, so that its loop rings once a step has begun it; the last
-    is held out."""
+    """Return three recordings of a drive whose transmission gives, so that its loop rings once a step has begun it;
+    the last is held out."""
     runs = [plant_run(f"run{k}", k, 4.0, SOFT, seed=k, servo=SERVO) for k in (1, 3, 2)]
     for r in runs:
         r.smooth()

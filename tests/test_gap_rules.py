@@ -802,7 +802,7 @@ def test_a_law_that_training_lacks_is_asked_in_the_place_of_what_imitates_its_li
 
 
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
-    """What a search of a joint ended with, at `loss`; and now, with what is known of the others."""
+    """Return what a search of a joint ended with, at `loss`; and now, with what is known of the others."""
     one = SimpleNamespace(members=members, fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)))
     return SimpleNamespace(none=one, best=one)
 
@@ -856,8 +856,8 @@ def test_a_motion_that_settles_it_is_planned_alone():
 
 
 def takes_part(here: float, now: float, draft: float | None = None) -> bool:
-    """Whether a rival counts that leaves `now` where it was fitted, the hypothesis leaving `here`; draft: what its
-    draft leaves on short windows, where it has not been fitted yet."""
+    """Return whether a rival counts that leaves `now` where it was fitted, the hypothesis leaving `here`; draft:
+    what its draft leaves on short windows, where it has not been fitted yet."""
     search = Made()
     mine, other = (SimpleNamespace(id=n, variant=SimpleNamespace(params=())) for n in ("lag", "backlash"))
     current, rival = (SimpleNamespace(loss=np.ones(40), fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)),
@@ -994,7 +994,7 @@ def test_a_condition_that_is_most_of_the_time_is_fitted():
 
 
 def moving_case(**regimes):
-    """A joint of which a regime's variable rises evenly."""
+    """Return a joint of which a regime's variable rises evenly."""
     n = 1000
     given = {k: np.linspace(0.0, 1.0, n) for k in ("_speed", "speed", "load", "acceleration", "position")}
     given |= {"saturation": np.full(n, 2.0), "_asked": np.full(n, -1.0)} | regimes

@@ -24,7 +24,7 @@ def test_a_figure_within_its_tolerance_is_no_finding():
 
 
 def timing(kd: float = 0.0):
-    """What is refitted of when a drive with a loop of 1 kHz acts and reads, by key."""
+    """Return what is refitted of when a drive with a loop of 1 kHz acts and reads, by key."""
     case = SimpleNamespace(
         loop_rate=1000.0, scales=SimpleNamespace(nominal={"delay": 0.01, "kd": kd, "speed_lag": 0.0})
     )
@@ -55,13 +55,13 @@ def test_sensors_have_zeros():
 
 
 def _told(t: np.ndarray, q: np.ndarray) -> float | None:
-    """What `quiet_noise` says of one recording q [S] rad of an encoder without counts."""
+    """Return what `quiet_noise` says of one recording q [S] rad of an encoder without counts."""
     return quiet_noise([(t, q, misfit(t, q[:, None])[:, 0])], 0.0)
 
 
 def restless(loud: float, share: float, speed: float = 0.0) -> float | None:
-    """What `quiet_noise` says of 100 half seconds of a joint that swings slowly, with noise of 1 mrad: in a share of
-    them, here and there, `loud` times as much, and while moving faster by `speed` rad/s."""
+    """Return what `quiet_noise` says of 100 half seconds of a joint that swings slowly, with noise of 1 mrad: in a
+    share of them, here and there, `loud` times as much, and while moving faster by `speed` rad/s."""
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = (np.arange(5000) // 50 * 37) % 100 < 100 * share
     way = 0.3 * np.sin(0.4 * t) + np.cumsum(0.01 * speed * on)
@@ -76,7 +76,8 @@ def test_a_joint_that_rings_is_not_noisy():
 
 
 def with_quiet_parts(count: int) -> float | None:
-    """What `quiet_noise` says of 100 half seconds with noise of 1 mrad, of which a few, the fastest, have a tenth."""
+    """Return what `quiet_noise` says of 100 half seconds with noise of 1 mrad, of which a few, the fastest, have a
+    tenth."""
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = np.arange(5000) // 50 >= 100 - count
     return _told(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))
@@ -99,9 +100,10 @@ def test_what_noise_is_usual_is_told_by_several_joints():
 
 def rattling(loud: float, swings: float, others: float = 0.3, torque: float | None = None,
              steady: bool = False) -> float | None:  # fmt: skip
-    """What `usual_noise` says of the last of four joints with noise of 1 mrad, which scatters by `loud` times as much:
-    a share `swings` of its square by swings of 31 Hz, the rest as white noise does. others: rad that they move; torque:
-    by how much its motor's torque scatters, x what theirs do, its limit being a half of theirs; None: not logged;
+    """Return what `usual_noise` says of the last of four joints with noise of 1 mrad, which scatters by `loud` times
+    as much: a share `swings` of its square by swings of 31 Hz, the rest as white noise does. others: rad that they
+    move; torque: by how much its motor's torque scatters, x what theirs do, its limit being a half of theirs; None:
+    not logged;
     steady: the rest is of swings of one size, each sample at another time of one."""
     rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
     q = np.outer(np.sin(0.4 * t), [others, others, others, 0.3]) + 1e-3 * rng.normal(size=(2000, 4))

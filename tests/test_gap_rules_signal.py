@@ -18,22 +18,22 @@ SERVO = {"drive": "torque", "joints": {"*": {"kp": 1.0, "torque_limit": 100.0, "
 
 
 def model(span: float = 1.0, mass: float = 1.0) -> mujoco.MjModel:
-    """A joint of the range -span .. span whose load of `mass` kg lies 0.1 m beside its axis."""
+    """Return a joint of the range -span .. span whose load of `mass` kg lies 0.1 m beside its axis."""
     return mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><worldbody><body>
       <joint name="j" axis="0 1 0" limited="true" range="{-span} {span}"/>
       <geom size="0.01" pos="0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>""")
 
 
 def run(q: np.ndarray, target: np.ndarray, step: float = STEP) -> Run:
-    """Positions and targets of one joint, every `step` s."""
+    """Return the positions and targets of one joint, every `step` s."""
     t = step * np.arange(len(q))
     return Run("a", ("j",), t, np.asarray(target, float)[:, None], t.copy(), np.asarray(q, float)[:, None],
                ServoTable.from_dict(SERVO), np.array([0.0, 0.0, -9.81]))  # fmt: skip
 
 
 def wrong(r: Run, span: float = 1.0, lead: float = 0.0, sign: float = 0.0) -> str:
-    """The kind of what is wrong with a run's joint, empty for nothing; lead [s], sign: of its position beside its
-    target."""
+    """Return the kind of what is wrong with a run's joint, empty for nothing; lead [s], sign: of its position beside
+    its target."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(channels, "_lead", lambda *_: lead)
         patch.setattr(channels, "_sign", lambda *_: sign)
@@ -73,8 +73,8 @@ def test_a_joint_that_moves_before_its_target_is_on_another_clock():
 
 
 def stopped(at: float, moved: float, further: float) -> bool:
-    """Whether a position is said to have stopped for good that moves by `moved` until the share `at` of a recording,
-    its target by `further` of it more then."""
+    """Return whether a position is said to have stopped for good that moves by `moved` until the share `at` of a
+    recording, its target by `further` of it more then."""
     k = int(400 * at)
     way = np.r_[np.linspace(0, moved, k), np.full(400 - k, moved)]
     with pytest.MonkeyPatch.context() as patch:
@@ -89,7 +89,7 @@ def test_a_position_stops_for_good_early_and_after_moving():
 
 
 def smooth(rng: np.random.Generator, n: int) -> np.ndarray:
-    """A motion [n] of no period, in steps of 5 ms."""
+    """Return a motion [n] of no period, in steps of 5 ms."""
     window = np.hanning(61)
     return np.convolve(rng.normal(size=n), window / window.sum(), "same")
 
@@ -136,8 +136,8 @@ def test_a_rest_lasts_a_while():
 
 
 def frozen(stands: int = 8, jump: float = 4.0, before: float = 1.0) -> bool:
-    """Whether old readings are seen where a joint that moves by a step a sample stands for so many samples, twice, and
-    then jumps by so many steps; before: its steps just before."""
+    """Return whether old readings are seen where a joint that moves by a step a sample stands for so many samples,
+    twice, and then jumps by so many steps; before: its steps just before."""
     steps = np.ones(200)
     for a in (60, 120):
         steps[a - 5 : a] = before
@@ -154,8 +154,9 @@ def test_readings_that_stand_while_a_joint_moves_are_old_ones():
 
 
 def stretches(stands: float = 0.3, jump: float = 0.0, held: float = 0.0, span: float = 1.0) -> bool:
-    """Whether a joint's encoder is seen to freeze that stands for so many s while its target goes 1 rad, and then jumps
-    there; jump [rad]: another, without a rest; held [rad]: what its target goes while it rests and moves on slowly;
+    """Return whether a joint's encoder is seen to freeze that stands for so many s while its target goes 1 rad, and
+    then jumps there; jump [rad]: another, without a rest; held [rad]: what its target goes while it rests and moves
+    on slowly;
     span [rad]: of the target in all."""
     n = round(stands / STEP)
     target = np.concatenate([np.zeros(100), np.linspace(0, 1, n), np.ones(100)])
@@ -188,8 +189,8 @@ def test_a_few_repeated_samples_say_nothing():
 
 
 def seldom(sizes: np.ndarray, period: int = 100, late: int = 0, early: float = 0.0) -> float:
-    """Period [samples] of an encoder's readings, of changes of these sizes every `period` samples, two of four later by
-    `late`; early: share of changes that come between, small ones."""
+    """Return the period [samples] of an encoder's readings, of changes of these sizes every `period` samples, two of
+    four later by `late`; early: share of changes that come between, small ones."""
     at = period * np.arange(1, len(sizes) + 1) + late * np.array([1, 1, -1, -1])[np.arange(len(sizes)) % 4]
     step = np.zeros(period * (len(sizes) + 2))
     step[at] = sizes
@@ -215,8 +216,8 @@ def test_an_encoder_that_is_read_seldom_leaps_in_a_rhythm():
 
 
 def end(error: float, usual: float = 0.05, meeting: int = 30, times: int = 3, hard: bool = True) -> bool:
-    """Whether an end is seen where a joint of 1 rad of motion meets it so often, each time for so many samples, its
-    target that far beyond it; usual: its error at rest elsewhere."""
+    """Return whether an end is seen where a joint of 1 rad of motion meets it so often, each time for so many
+    samples, its target that far beyond it; usual: its error at rest elsewhere."""
     q, target = [np.full(200, 0.0)], [np.full(200, usual)]
     for _ in range(times):
         q += [np.linspace(0, 1, 100), np.full(meeting, 1.0), np.linspace(1, 0, 100), np.zeros(100)]

@@ -27,8 +27,8 @@ T = STEP * np.arange(BLOCKS * A_BLOCK)
 
 
 def recorded(push: np.ndarray, noise: float, own: float = 1.0, standing: int = 0) -> Columns:
-    """A joint that swings under friction of rms `own`, with uniform noise of rms `noise` and a push [m] on its torque;
-    in its last `standing` samples it stands and its torque is the push alone."""
+    """Return a joint that swings under friction of rms `own`, with uniform noise of rms `noise` and a push [m] on
+    its torque; in its last `standing` samples it stands and its torque is the push alone."""
     rng = np.random.default_rng(4)
     v = np.sin(2 * np.pi * 0.31 * T)
     v[len(T) - standing :] = 0.0
@@ -48,7 +48,7 @@ def pushed(of: Columns):
 
 
 def stretches(share: float) -> np.ndarray:
-    """[m] 1 in `share` of the blocks, spread over the recording, else 0."""
+    """Return [m] 1 in `share` of the blocks, spread over the recording, else 0."""
     on = np.zeros(BLOCKS)
     on[np.random.default_rng(2).permutation(BLOCKS)[: round(share * BLOCKS)]] = 1.0
     return np.repeat(on, A_BLOCK)
@@ -191,7 +191,8 @@ def test_a_drive_may_act_late_by_its_loops_period_or_the_readings():
 
 
 def handed(after: float, plain: float, sigma: float) -> bool:
-    """Whether an answer with an error `after` on what was held out is handed on beside the plain model's `plain`."""
+    """Return whether an answer with an error `after` on what was held out is handed on beside the plain model's
+    `plain`."""
     scales = SimpleNamespace(nominal={"coulomb_friction": 1.0}, slide=False)
     case = SimpleNamespace(joint="j", plant=None, scales=scales)
     trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
@@ -237,7 +238,7 @@ def test_a_weight_is_believed_where_the_torque_cannot_tell():
 
 
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
-    """Whether friction that differs by direction is named, of this column, beside a constant torque."""
+    """Return whether friction that differs by direction is named, of this column, beside a constant torque."""
     own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {"viscous_friction": 10.0})
     name = ViscousFriction.by_torque
     found, *_ = inverse_dynamics._name(own, own, {name: column}, {name: column}, np.random.default_rng(seed))
@@ -295,7 +296,8 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
 
 
 def told(after: float) -> float:
-    """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held out."""
+    """Return the confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held
+    out."""
     n = SimpleNamespace(effect=LoadFriction.id, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
                         after=after, rival=None, text="friction that grows with the load",
                         removed=(0.1, 0.2))  # fmt: skip
@@ -331,7 +333,7 @@ def test_what_the_torque_names_is_a_part_of_the_answer():
 
 
 def fitted_from_torque(samples=1000, seconds=10.0) -> bool:
-    """Whether a joint's logged torque of 100 Hz is fitted."""
+    """Return whether a joint's logged torque of 100 Hz is fitted."""
     case = SimpleNamespace(joint="j", index=0, moved=True, scales=SimpleNamespace(nominal={}))
     run = SimpleNamespace(name="a", t=0.01 * np.arange(samples))
     of = SimpleNamespace(u=np.zeros(samples), seconds=seconds, loaded=False)
@@ -359,7 +361,8 @@ def test_a_torque_is_fitted_where_enough_was_logged():
 
 
 def forbidden(friction: float, speed: float = 0.5, way: float = 0.5, slide: bool = False) -> bool:
-    """Whether a dry friction [N.m] is forbidden by a motion that 1 N.m began, of a joint whose large speed is 1."""
+    """Return whether a dry friction [N.m] is forbidden by a motion that 1 N.m began, of a joint whose large speed is
+    1."""
     t = 0.01 * np.arange(300)
     on = (t >= 1.0) & (t < 2.0)
     q = way * np.clip((t - 1.0) / 0.99, 0.0, 1.0)

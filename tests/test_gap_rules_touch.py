@@ -41,7 +41,7 @@ def test_a_touch_effect_must_help_in_nearly_all_bootstraps():
 
 
 def rest(gains, width=0.05):
-    """What is said of taxels that felt nothing, the others' gains [n] being these."""
+    """Return what is said of taxels that felt nothing, the others' gains [n] being these."""
     count = len(gains)
     pad = SimpleNamespace(
         silent={}, runs=[SimpleNamespace(z=np.ones((3, count)))], gain_width=lambda t: np.full(count, width)
@@ -169,8 +169,8 @@ def test_touch_rivals_are_told_apart_by_what_they_lose():
 
 
 def claimed(after=0.5, share=0.0):
-    """The finding of a pad's gain that leaves so much of 1 N on what was held out, its like having a share of the
-    draws."""
+    """Return the finding of a pad's gain that leaves so much of 1 N on what was held out, its like having a share of
+    the draws."""
     of = lambda x: (x, np.full(20, x * x), np.arange(20))  # noqa: E731
     left = lambda _, trial, stage: of(after if trial == "best" else 1.0)  # noqa: E731
     best = SimpleNamespace(ids=("tactile_gain",))
@@ -207,7 +207,7 @@ def test_exchanged_taxels_fit_in_the_place_of_each_other():
 
 
 def sigma_of(z, t):
-    """The noise [N] that the fit gives readings z [S, 1] at times t [S], a sensor without noise or counts."""
+    """Return the noise [N] that the fit gives readings z [S, 1] at times t [S], a sensor without noise or counts."""
     run = SimpleNamespace(t=t, z=z, lsb=0.0, full=np.zeros(z.shape, bool), recording="a")
     pad = SimpleNamespace(runs=[run], base={}, silent={}, noise=1e-9, load=False, shear=False)
     pad._sample = lambda *given: PadFit._sample(pad, *given)
@@ -331,8 +331,8 @@ def test_a_touch_effect_must_promise_something():
 
 
 def silent(pressed=1.0, beside=1.0, lsb=0.0, reading=0.0):
-    """Taxels that are called silent, the second of three reading the same for ever: with what the plant presses it and
-    what its neighbours read at most, in a noise of 0.01 N."""
+    """Return the taxels that are called silent, the second of three reading the same for ever: with what the plant
+    presses it and what its neighbours read at most, in a noise of 0.01 N."""
     rise = np.linspace(0.0, 1.0, 20)[:, None]
     run = SimpleNamespace(z=rise * [beside, 0.0, beside] + [0.0, reading, 0.0], lsb=lsb, beside=[[1], [0, 2], [1]])
     pad = SimpleNamespace(runs=[run], noise=0.01, base={})

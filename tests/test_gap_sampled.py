@@ -67,7 +67,7 @@ def sampled(eccentric: tuple[float, float] = (0.0, 0.0), seconds: float = 4.0) -
 
 
 def left(run: Run, **columns: float) -> tuple[float, np.ndarray]:
-    """(rms of the position error, simulated torque) of the plant run free with these columns."""
+    """Return (rms of the position error, simulated torque) of the plant run free with these columns."""
     plant = build(model(), [run])[0].plant
     params = plant.base()[None].copy()
     for name, value in columns.items():

@@ -142,7 +142,7 @@ def test_temperature_counts_from_that_of_a_data_sheet():
 
 
 def valley(n: int = 400) -> tuple[Fitter, list[Param]]:
-    """A fitter whose residual knows a belief and an effect by their sum alone."""
+    """Return a fitter whose residual knows a belief and an effect by their sum alone."""
     rng = np.random.default_rng(0)
     a, c, noise = rng.standard_normal(n), rng.standard_normal(n), 0.02 * rng.standard_normal(n)
     fitter = Fitter.__new__(Fitter)

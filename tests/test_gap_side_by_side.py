@@ -19,7 +19,7 @@ SERVO = {"drive": "torque", "joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit
 
 
 def two_runs() -> list[Run]:
-    """Two recordings of the linkage's two joints."""
+    """Return two recordings of the linkage's two joints."""
     out = []
     for k in range(2):
         t = np.arange(0.0, 2.0, 0.01)

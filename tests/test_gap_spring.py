@@ -35,7 +35,7 @@ def model_text(spring: str = "", angle: str = "degree") -> str:
 
 
 def case_of(text: str):
-    """The joint's case along a motion of its own; its drive is off."""
+    """Return the joint's case along a motion of its own; its drive is off."""
     q = 0.5 + 0.3 * np.sin(9 * TIMES)
     run = Run("x", ("a",), TIMES, np.zeros((len(TIMES), 1)), TIMES, q[:, None], OFF, np.zeros(3))
     return build(mujoco.MjModel.from_xml_string(text), [run])[0]
@@ -123,7 +123,7 @@ FREE = ServoTable.from_dict({"joints": {"*": {"kp": KP, "kd": 0.0, "torque_limit
 
 
 def driven(seed: int, **columns) -> Run:
-    """4 s of steps of torque, open loop, of the plant with some columns changed."""
+    """Return 4 s of steps of torque, open loop, of the plant with some columns changed."""
     rng = np.random.default_rng(seed)
     t, at = np.arange(0.0, 4.0, 0.01), np.arange(0.0, 4.0, 0.25)
     torque = rng.uniform(0.02, 0.12, len(at)) * np.where(np.arange(len(at)) % 2, -1.0, 1.0)
@@ -160,7 +160,8 @@ def test_a_spring_is_named_and_sized_where_no_loop_holds_the_joint():
 
 
 def grown(better: bool, left: float = 9.0) -> tuple:
-    """(what one effect more beside what pulls alike makes of an answer, which of them was asked): with fits by hand."""
+    """Return (what one effect more beside what pulls alike makes of an answer, which of them was asked): with fits
+    by hand."""
     search, asked = object.__new__(JointSelection), []
     trial = lambda ids, loss: SimpleNamespace(ids=ids, members=ids, fit=SimpleNamespace(loss=loss))  # noqa: E731
     current, fork = trial(("coulomb_friction",), 5.0), trial(("joint_spring",), 6.0)
@@ -199,8 +200,8 @@ def test_a_friction_that_differs_by_direction_is_a_spring_without_stiffness():
 
 
 def as_pull(times: float, *, level_known: bool = False, stiff: bool = False) -> tuple:
-    """(what an answer with uneven friction becomes, where a spring was begun from): with fits by hand, the spring's
-    loss being `times` the other's."""
+    """Return (what an answer with uneven friction becomes, where a spring was begun from): with fits by hand, the
+    spring's loss being `times` the other's."""
     case = build(mujoco.MjModel.from_xml_string(model_text()), [driven(0)])[0]
     if stiff:
         case = replace(case, scales=replace(case.scales, stiffness=2.0 * case.scales.tau / case.scales.span))

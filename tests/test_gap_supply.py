@@ -16,7 +16,7 @@ SAGS = {"sag_torque": 0.15, "sag_own": 0.3}
 
 
 def sagging_case(sags: dict[str, float]):
-    """A joint beside another one whose motor gives up to 2 N.m; its supply sags."""
+    """Return a joint beside another one whose motor gives up to 2 N.m; its supply sags."""
     runs = [plant_run(f"r{k}", k, 5.0, {}, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()

@@ -37,7 +37,7 @@ def run(
     viscous=VISCOUS,
     pushed=None,
 ):
-    """A recording of the arm by exact inverse dynamics; pushed(t) [S]: what something outside adds to the elbow,
+    """Return a recording of the arm by exact inverse dynamics; pushed(t) [S]: what something outside adds to the elbow,
     N.m."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / rate)

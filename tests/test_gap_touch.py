@@ -35,7 +35,7 @@ def collected(paths, model, servo):
 
 
 def found(folder, seconds=4.0, allowed=None, count=3, **planted):
-    """The touch of some rig recordings with what was planted."""
+    """Return the touch of some rig recordings with what was planted."""
     paths, model, servo = press_rig.record(folder, count, seconds, seed=4, **planted)
     m = mechanism(model, servo)
     return diagnose_touch([read(p, joints=m.joints, audit=False) for p in paths], m, set(), allowed=allowed)

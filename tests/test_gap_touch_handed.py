@@ -43,13 +43,13 @@ def diagnosed(folder, allowed=None, seconds=7.0, **planted):
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory):
-    """The diagnosis of an index finger whose touch is late, and its tactile.yaml."""
+    """Return the diagnosis of an index finger whose touch is late, and its tactile.yaml."""
     few = {"tactile_delay", "tactile_hysteresis", "contact_stiffness"}
     return diagnosed(tmp_path_factory.mktemp("late"), few, 5.0, sensor={"delay": 0.06})
 
 
 def within(drawn: torch.Tensor, p: dict) -> bool:
-    """Whether draws lie in a range and fill it."""
+    """Return whether draws lie in a range and fill it."""
     wide = p["high"] - p["low"]
     return (
         float(drawn.min()) >= p["low"] - 1e-6

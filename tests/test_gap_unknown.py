@@ -23,7 +23,7 @@ RUNS = (0, 1, 3)
 
 
 def searched(unknown: tuple[str, ...], changes: dict[str, float], **more):
-    """The search of a joint whose servo.yaml says `unknown` of some columns, on motions with others."""
+    """Return the search of a joint whose servo.yaml says `unknown` of some columns, on motions with others."""
     runs = [
         plant_run(
             f"run{k}",

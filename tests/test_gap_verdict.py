@@ -37,7 +37,7 @@ def test_names_on_joints_that_need_no_effect_are_hints():
 
 
 def told(effect: str, confidence: float, joint: str = "a", **held) -> dict:
-    """A finding as the page has it."""
+    """Return a finding as the page has it."""
     return {
         "effect": effect,
         "where": {"joints": [joint], "taxels": [], "topics": []},
@@ -50,7 +50,7 @@ def told(effect: str, confidence: float, joint: str = "a", **held) -> dict:
 
 
 def decided(*found: dict, before=4.0, after=1.0, floor=1.0, touch=None, **judged) -> SimpleNamespace:
-    """A diagnosis of these findings, decided; errors in rad."""
+    """Return a diagnosis of these findings, decided; errors in rad."""
     position = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after}
     d = SimpleNamespace(
         data=empty() | {"findings": list(found), "noise_floor": {"position_rad": floor}},

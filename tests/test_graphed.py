@@ -20,7 +20,7 @@ MODEL = {"class_name": "MLPModel", "hidden_dims": [16, 8], "activation": "elu", 
 
 
 def ppo(**settings) -> PPO:
-    """A small PPO; the same settings give the same weights."""
+    """Return a small PPO; the same settings give the same weights."""
     torch.manual_seed(0)
     obs = observations()
     env = SimpleNamespace(num_envs=WORLDS, num_actions=3)

@@ -30,7 +30,7 @@ SLICES = observations.slices(observations.rows(12, 5, 5))
 
 @pytest.fixture(scope="module")
 def quiet():
-    """Sensors without noise or bias, so that every slice has one right value."""
+    """Return the sensors without noise or bias, so that every slice has one right value."""
     return grasp_env(*QUIET, *NO_BIAS, worlds=N)
 
 
@@ -125,7 +125,7 @@ def test_every_slice_holds_what_its_name_says(env):
 
 
 def _site(env, w: int) -> torch.Tensor:
-    """Fingertip sites [5, 3] by C MuJoCo's kinematics of world w."""
+    """Return the fingertip sites [5, 3] by C MuJoCo's kinematics of world w."""
     import mujoco
 
     m = env.engine.batch.get_model(w)

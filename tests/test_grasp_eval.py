@@ -54,7 +54,7 @@ class Stage:
 
 
 def play(away=0.0, touched=True) -> tuple[Stage, dict]:
-    """One episode in every world of a stage."""
+    """Return one episode in every world of a stage."""
     stage = Stage(torch.as_tensor(away).expand(N), torch.as_tensor(touched).expand(N, 5))
     out = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
     stage.gravity, stage.force = torch.stack(stage.gravity), torch.stack(stage.force)

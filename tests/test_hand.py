@@ -95,7 +95,7 @@ def test_mirror_and_scale_move_as_the_original(tmp_path, mirror, scale):
 
 
 def _changed(path, value):
-    """Content of hand.yaml with one place changed; value None: taken out."""
+    """Return the content of hand.yaml with one place changed; value None: taken out."""
     data = content()
     *way, last = path
     node = data

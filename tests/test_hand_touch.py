@@ -24,14 +24,14 @@ from tests import hands
 
 @pytest.fixture(scope="module")
 def claw(tmp_path_factory) -> Hand:
-    """Four fingers, the thumb first, pads of 8 x 6 taxels."""
+    """Return four fingers, the thumb first, pads of 8 x 6 taxels."""
     place = tmp_path_factory.mktemp("claw")
     import_hand(hands.write(place / "robot"), place / "hand", Settings(pads=(8, 6), drops=0), picture=False)
     return load_hand(place / "hand")
 
 
 def pressed(folder: Path, hand: Hand, finger: str, seconds: float, **planted):
-    """(mechanism, recordings) of a press rig of that hand's finger."""
+    """Return (mechanism, recordings) of a press rig of that hand's finger."""
     paths, model, servo = press_rig.record(folder, 3, seconds, seed=4, finger=finger, hand=hand, **planted)
     m = mechanism(model, servo, hand=hand)
     return m, [read(p, joints=m.joints, audit=False) for p in paths]

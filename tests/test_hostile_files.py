@@ -59,7 +59,7 @@ class Net:
 
 
 def bait(ran):
-    """An object whose unpickling writes the file."""
+    """Return an object whose unpickling writes the file."""
 
     class Bait:
         def __reduce__(self):
@@ -135,7 +135,7 @@ def test_a_class_that_the_user_types_is_used(payload, trap, tmp_path, capsys):
 
 
 def config_of_a_run(cfg):
-    """The whole config of a run on the dummy task, with the agent of `cfg`."""
+    """Return the whole config of a run on the dummy task, with the agent of `cfg`."""
     base = {
         "choices": {"task": "dummy"},
         "worlds": 4,

@@ -33,7 +33,7 @@ from tests.made_hand import made_hand
 
 @pytest.fixture(scope="module", autouse=True)
 def nothing_dropped():
-    """The search for where objects are held, which takes half a minute, has a test of its own."""
+    """Yield the search for where objects are held, which takes half a minute, has a test of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importing, "DROPS", 0)
         yield
@@ -41,7 +41,7 @@ def nothing_dropped():
 
 @pytest.fixture(scope="module")
 def claw(tmp_path_factory) -> Path:
-    """The made-up hand imported once; not to be changed."""
+    """Return the made-up hand imported once; not to be changed."""
     place = tmp_path_factory.mktemp("claw")
     import_hand(hands.write(place / "robot"), place / "hand", picture=False)
     return place / "hand"
@@ -149,7 +149,7 @@ def test_fingertips_are_laid_against_the_sides_of_a_cube(claw):
 
 
 def _briefly(real, *args):
-    """What a search keeps after a moment, whether it holds or not."""
+    """Return what a search keeps after a moment, whether it holds or not."""
     out = real(*args)
     return (out[0], torch.ones_like(out[1])) if isinstance(out, tuple) else torch.ones_like(out)
 
@@ -358,7 +358,7 @@ BAD = {
 
 
 def _scaled(text: str) -> str:
-    """A hand drawn in millimetres, read as metres."""
+    """Return a hand drawn in millimetres, read as metres."""
 
     def times(match: re.Match[str]) -> str:
         return f'{match[1]}="{" ".join(str(1000 * float(x)) for x in match[2].split())}"'

@@ -57,7 +57,7 @@ def start(cfg, barrier, answers):
 
 
 def at_once(**cfg) -> list[str]:
-    """What STARTS processes that start together are given."""
+    """Return what STARTS processes that start together are given."""
     fork = multiprocessing.get_context("fork")
     barrier, answers = fork.Barrier(STARTS), fork.Queue()
     cfg = {"out": None, "run": None, "choices": {"task": "dummy"}} | cfg

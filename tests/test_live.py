@@ -28,7 +28,7 @@ from dexsim.view.live_meshes import body_meshes
 
 
 def volume(vertices, faces):
-    """Signed volume of a closed surface: positive where its triangles turn outwards."""
+    """Return the signed volume of a closed surface: positive where its triangles turn outwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
@@ -425,7 +425,7 @@ def test_only_the_page_that_is_served_may_connect(view):
 
 
 def hostile(ids: dict[str, str]):
-    """1,000 messages that no page of ours sends."""
+    """Yield 1,000 messages that no page of ours sends."""
     values = [
         -1000,
         10**9,

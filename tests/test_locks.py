@@ -15,7 +15,7 @@ AGAIN = "make the locks again: python tools/lock.py wheels=FOLDER"
 
 
 def locked(*names: str) -> dict[str, list[str]]:
-    """Versions by package of these files, after a look at each entry's hashes."""
+    """Return the versions by package of these files, after a look at each entry's hashes."""
     out: dict[str, list[str]] = {}
     for name in names:
         text = (ROOT / "locks" / f"{name}.txt").read_text(encoding="utf-8")

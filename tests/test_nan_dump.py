@@ -20,7 +20,7 @@ def env():
 
 
 def blow_up(env, world: int) -> dict[str, np.ndarray]:
-    """One control step in which a huge force tears the object of one world; returns its state just before."""
+    """Return one control step in which a huge force tears the object of one world; returns its state just before."""
     env.outside_force[world, 0] = 1e8  # N
     t = env.engine.t
     before = {"qpos": t.qpos[world].numpy().copy(), "qvel": t.qvel[world].numpy().copy(),

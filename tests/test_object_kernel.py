@@ -15,7 +15,7 @@ NAMES = (
 
 
 def primitive_inertia(kind: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
-    """Principal inertia per kg [N, 3] m^2 of box (0), sphere (1), capsule (2) with MuJoCo's sizes [N, 3]."""
+    """Return the principal inertia per kg [N, 3] m^2 of box (0), sphere (1), capsule (2) with MuJoCo's sizes [N, 3]."""
     a, b, c = size.unbind(1)
     box = torch.stack([b**2 + c**2, a**2 + c**2, a**2 + b**2], 1) / 3
     sphere = (0.4 * a**2)[:, None].expand(-1, 3)
@@ -28,7 +28,7 @@ def primitive_inertia(kind: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
 
 
 def expected(objects, scene, before: dict, mask, variant, scale, mass, com, friction, stiffness, damping_ratio) -> dict:
-    """The fields, and what is remembered, after a write over `before`."""
+    """Return the fields, and what is remembered, after a write over `before`."""
     kinds = {"box": 0, "sphere": 1, "capsule": 2}
     kind = torch.tensor([kinds.get(v.shape.kind, 3) for v in scene.variants])[variant]
     rows = [scene.variants[int(v)] for v in variant]

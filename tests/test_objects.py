@@ -41,7 +41,7 @@ def inside_any(hulls, points) -> np.ndarray:
 
 
 def near_surface(shape, n: int, band: float, seed: int = 1) -> np.ndarray:
-    """Random points within `band` of the exact surface, wherever they are along it."""
+    """Return the random points within `band` of the exact surface, wherever they are along it."""
     points = np.random.default_rng(seed).uniform(-0.55, 0.55, (60 * n, 3)) * (shape.extents + 2 * band)
     return points[np.abs(signed_distance(shape.hulls, points)) < band][:n]
 

@@ -32,7 +32,7 @@ def box(half, centre=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def u_shape() -> list[np.ndarray]:
-    """A U of three bars that touch and do not overlap, 60 mm wide."""
+    """Return a U of three bars that touch and do not overlap, 60 mm wide."""
     return [box((0.03, 0.015, 0.005), (0, 0, -0.025)), box((0.006, 0.015, 0.02), (-0.024, 0, 0)),
             box((0.006, 0.015, 0.02), (0.024, 0, 0))]  # fmt: skip
 
@@ -243,8 +243,8 @@ BAND = 0.008  # m from the mesh to the ball's surface, at most
 
 
 def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Winding number [P] of a closed surface about points [P, 3]: 1 inside, 0 outside (Van Oosterom and Strackee 1983,
-    The solid angle of a plane triangle)."""
+    """Return the winding number [P] of a closed surface about points [P, 3]: 1 inside, 0 outside (Van Oosterom and
+    Strackee 1983, The solid angle of a plane triangle)."""
     out = np.empty(len(points))
     for k, p in enumerate(points):
         a, b, c = (triangles[:, i] - p for i in range(3))
@@ -256,7 +256,7 @@ def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def mesh_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Exact signed distance [P] m, negative inside."""
+    """Return the exact signed distance [P] m, negative inside."""
     far = np.concatenate([_triangle_distance(points[k : k + 1000], triangles) for k in range(0, len(points), 1000)])
     return np.where(winding(points, triangles) > 0.5, -far, far)
 
@@ -272,7 +272,7 @@ def places(triangles: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
 
 
 def model_of(shape):
-    """The object, fixed, and a ball."""
+    """Return the object, fixed, and a ball."""
     spec = mujoco.MjSpec()
     for k, hull in enumerate(shape.hulls):
         spec.add_mesh(name=f"part{k}", uservert=np.asarray(hull).ravel())
@@ -283,7 +283,7 @@ def model_of(shape):
 
 
 def contact_distance(shape, centres):
-    """What MuJoCo measures [P] m from the ball's surface to the nearest of the object's geoms."""
+    """Return what MuJoCo measures [P] m from the ball's surface to the nearest of the object's geoms."""
     spec_model = model_of(shape)
     data = mujoco.MjData(spec_model)
     body, ball = spec_model.body("ball").id, spec_model.geom("ball").id

@@ -26,7 +26,7 @@ ONLY_HERE = (
 
 
 def run(name: str, folder: Path, *commands: list[str]) -> subprocess.CompletedProcess:
-    """The commands on a lesser system, in a folder."""
+    """Return the commands on a lesser system, in a folder."""
     env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")} | {
         "PYTHONPATH": str(ROOT), "PYTHONWARNDEFAULTENCODING": "1", "PYTHONUTF8": "0", "LC_ALL": "C",
         "PYTHONCOERCECLOCALE": "0", "OMP_NUM_THREADS": "1",
@@ -38,7 +38,7 @@ def run(name: str, folder: Path, *commands: list[str]) -> subprocess.CompletedPr
 
 
 def code_lines(path: Path):
-    """Lines of a file that are neither comment nor docstring, roughly: those with a call or an attribute."""
+    """Return the lines of a file that are neither comment nor docstring, roughly: those with a call or an attribute."""
     return [line.split("#")[0] for line in path.read_text("utf-8").splitlines()]
 
 
@@ -147,7 +147,7 @@ def test_a_container_without_shared_memory(tmp_path):
 
 
 def bundle(folder: Path) -> Path:
-    """A bundle of the included policy of the grasp."""
+    """Return a bundle of the included policy of the grasp."""
     done = subprocess.run(
         [sys.executable, "-m", "dexsim", "export", f"checkpoint={ROOT / 'checkpoints/grasp.pt'}", "out=bundle"],
         cwd=folder, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)},

@@ -50,14 +50,14 @@ def torchrun(configs, folder, mode, *settings) -> subprocess.Popen:
 
 
 def forks(configs, folder, mode, *settings) -> forked.Forked:
-    """The same, but that torchrun and its ranks are forks: three times less to import."""
+    """Return the same, but that torchrun and its ranks are forks: three times less to import."""
     argv = [str(configs), mode, *QUICK, *settings]
     env = {"OMP_NUM_THREADS": "1", "REPORT": str(folder / "report")}
     return forked.Forked(rank_main.launched, list(TORCHRUN), argv, cwd=folder, env=env)
 
 
 def finish(process, seconds=100):
-    """(status, stdout, stderr) of a run; killed with its children where it does not end in time."""
+    """Return (status, stdout, stderr) of a run; killed with its children where it does not end in time."""
     try:
         out, err = process.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
@@ -163,7 +163,7 @@ def test_the_first_of_a_machine_says_what_all_find_wrong(monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def learned(configs, tmp_path_factory):
-    """A folder in which two ranks trained into run/, and what they printed."""
+    """Return a folder in which two ranks trained into run/, and what they printed."""
     folder = tmp_path_factory.mktemp("learned")
     status, out, err = finish(forks(configs, folder, "report", "iterations=3", "out=run"))
     assert status == 0, err

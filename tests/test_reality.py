@@ -18,7 +18,7 @@ from dexsim.tasks import make_env, reality
 
 
 def world(*overrides: str) -> dict:
-    """The resolved config of `play.py policy=zero reality=bench`."""
+    """Return the resolved config of `play.py policy=zero reality=bench`."""
     return start.for_play(["policy=zero", "reality=bench", "episodes=4", *overrides], CONFIGS).cfg
 
 

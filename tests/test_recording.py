@@ -27,7 +27,7 @@ HEADER = {"stamp": {"sec": 12, "nanosec": 34}, "frame_id": "palm"}
 
 
 def ros2_bytes(kind, definition, message):
-    """A message as mcap_ros2 encodes it, read back from a file that its writer wrote."""
+    """Return a message as mcap_ros2 encodes it, read back from a file that its writer wrote."""
     file = io.BytesIO()
     w = Ros2Writer(file)
     w.write_message("/any", w.register_msgdef(kind, definition), message, 1)
@@ -107,7 +107,7 @@ def test_messages_are_the_bytes_that_mcap_ros2_writes():
 
 
 def plain(m):
-    """A message of either library as plain data."""
+    """Return a message of either library as plain data."""
     if hasattr(m, "__slots__") or hasattr(m, "__dataclass_fields__"):
         names = getattr(m, "__dataclass_fields__", None) or m.__slots__
         return {n: plain(getattr(m, n)) for n in names if not n.startswith("_")}
@@ -237,7 +237,7 @@ def foreign(
     count=50,
     effort=True,
 ):
-    """A bag as rosbag2 would write it: no metadata of ours, a prefix, a namespace, no velocity."""
+    """Return a bag as rosbag2 would write it: no metadata of ours, a prefix, a namespace, no velocity."""
     with open(path, "wb") as file:
         w = Ros2Writer(file, chunk_size=2000)
         kind = w.register_msgdef(JOINT_STATE, DEFINITIONS[JOINT_STATE] + "# a comment\n")
@@ -489,8 +489,8 @@ uint32 nanosec
 
 
 def write_idl(path, definition):
-    """A bag whose joint states are of a type of its own, described in IDL, beside commands of the standard type, also
-    in IDL."""
+    """Return a bag whose joint states are of a type of its own, described in IDL, beside commands of the standard
+    type, also in IDL."""
     with open(path, "wb") as file:
         w = McapWriter(file)
         w.start(profile="ros2")
@@ -601,7 +601,7 @@ def test_a_recording_without_joints_lists_what_it_has(tmp_path):
 
 @pytest.fixture(scope="module")
 def chunked(tmp_path_factory):
-    """A file of about ten chunks, its bytes and the offsets of its chunk records."""
+    """Return a file of about ten chunks, its bytes and the offsets of its chunk records."""
     path = tmp_path_factory.mktemp("chunked") / "whole.mcap"
     write(path, recordings.signal(10.0))
     data = path.read_bytes()

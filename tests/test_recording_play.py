@@ -255,7 +255,7 @@ def test_a_model_without_its_servo_or_joints(tmp_path):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """Two worlds of the grasp task, recorded through one episode, and what the environment itself showed."""
+    """Return two worlds of the grasp task, recorded through one episode, and what the environment itself showed."""
     from dexsim.recording.tap import PlayRecorder
     from dexsim.tasks import make_env
 
@@ -354,7 +354,7 @@ def test_a_play_is_recorded_as_it_was(played):
 
 
 def r_offset(env, world):
-    """What the encoders add to the joint position (nothing, unless randomized)."""
+    """Return what the encoders add to the joint position (nothing, unless randomized)."""
     return env.servo.column("position_offset")[world].numpy() if not env.done[world] else 0.0
 
 

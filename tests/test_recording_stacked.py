@@ -21,7 +21,7 @@ STAMPS = [1_700_000_000_123_456_789 + 10_000_000 * i for i in range(40)]
 
 
 def bits(x):
-    """Anything that a reader or a recording holds, its numbers as bytes."""
+    """Return the anything that a reader or a recording holds, its numbers as bytes."""
     if isinstance(x, np.ndarray):
         return x.dtype.str, x.shape, x.tobytes()
     if isinstance(x, float):
@@ -36,7 +36,7 @@ def bits(x):
 
 
 def made(kind):
-    """Forty messages of a type that we write, and what reads them."""
+    """Return the forty messages of a type that we write, and what reads them."""
     x = np.random.default_rng(0).standard_normal((len(STAMPS), 37))
     x[3, 2], x[7] = np.nan, 0.0
     channel = Channel(id=1, schema_id=1, topic="/any", message_encoding="cdr", metadata={})
@@ -106,7 +106,7 @@ def test_a_count_that_reaches_beyond_the_message():
 
 
 def again(source, path, edit):
-    """A recording with its messages (topic, log time, bytes) edited, in the order that `edit` gives them."""
+    """Return a recording with its messages (topic, log time, bytes) edited, in the order that `edit` gives them."""
     with open(source, "rb") as file:
         reader = make_reader(file)
         found = [(s, c, m) for s, c, m in reader.iter_messages(log_time_order=False)]

@@ -33,7 +33,7 @@ HULL = ["object_scale=0.001", "object_hulls=1"]
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory):
-    """Paths of a cube of 50 mm, a flat plate and a block, in millimetres."""
+    """Return the paths of a cube of 50 mm, a flat plate and a block, in millimetres."""
     at = tmp_path_factory.mktemp("meshes")
     for name, size in (("cube", (50, 50, 50)), ("plate", (60, 44, 12)), ("block", (48, 44, 40))):
         trimesh.creation.box(size).export(at / f"{name}.stl")

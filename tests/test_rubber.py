@@ -16,9 +16,9 @@ DRAG = 30.0  # N.s/m on the object, so that it stays where it was put
 
 
 def _press(env, seed: int) -> dict[str, torch.Tensor]:
-    """Objects of 30 to 500 g pressed on the middle fingertip, along its pad's normal, by weight and 0 to 4 N more,
-    until at rest; the hand is locked in random postures. Friction of 2 makes contacts stick (they creep, as MuJoCo's
-    friction does)."""
+    """Return the objects of 30 to 500 g pressed on the middle fingertip, along its pad's normal, by weight and 0 to 4 N
+    more, until at rest; the hand is locked in random postures. Friction of 2 makes contacts stick (they creep, as
+    MuJoCo's friction does)."""
     g = torch.Generator().manual_seed(seed)
 
     def u(low, high, *shape):
@@ -68,7 +68,7 @@ def _press(env, seed: int) -> dict[str, torch.Tensor]:
 
 
 def _depth(env, w: int, twin) -> float:
-    """Depth [m] of world w's contact of tip and object, by C MuJoCo's collision of the same state."""
+    """Return the depth [m] of world w's contact of tip and object, by C MuJoCo's collision of the same state."""
     m = twin.engine.batch.get_model(w)
     d = mujoco.MjData(m)
     d.qpos[:] = env.engine.t.qpos[w]

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module", autouse=True)
 def fibers():
-    """The solver's lanes on a CPU."""
+    """Yield the solver's lanes on a CPU."""
     before, wp.config.enable_cpu_blocks = wp.config.enable_cpu_blocks, True
     yield
     wp.config.enable_cpu_blocks = before
@@ -59,7 +59,8 @@ def test_a_held_grasp_creeps_alike(fibers):
 
 
 def bouncing(thing: str) -> mujoco.MjModel:
-    """A hull of the library or a cylinder above a box, a contact that gives back most of its energy, no friction."""
+    """Return a hull of the library or a cylinder above a box, a contact that gives back most of its energy, no
+    friction."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.cone = 5e-4, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.integrator, spec.option.jacobian = (
@@ -129,7 +130,8 @@ def test_what_bounces_keeps_as_much_energy(fibers, thing):
 
 
 def pinched() -> mujoco.MjModel:
-    """A cylinder lying between a fingertip and a capsule that press it with 3 N from both sides, and nothing below."""
+    """Return a cylinder lying between a fingertip and a capsule that press it with 3 N from both sides, and nothing
+    below."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.cone, spec.option.impratio = 2e-3, mujoco.mjtCone.mjCONE_ELLIPTIC, 5
     spec.option.integrator, spec.option.jacobian = (

@@ -170,8 +170,8 @@ def test_collision_surface_is_where_touch_has_it(scene):
 
 
 def _march(kind, size, grid, p, u):
-    """The point nearest to the end of the ray p + s u through the origin's neighbourhood where touch's distance is
-    0."""
+    """Return the point nearest to the end of the ray p + s u through the origin's neighbourhood where touch's
+    distance is 0."""
     inside, outside = p + u * np.linalg.norm(p), p
     assert (
         reference.distance(kind, size, inside[None], grid)[0]
@@ -203,7 +203,7 @@ def _floor(spec: mujoco.MjSpec) -> None:
 
 
 def _lowest(variant, size: np.ndarray, rot: np.ndarray) -> float:
-    """Height of the lowest point below the body frame, of the shape turned by rot [3, 3]."""
+    """Return the height of the lowest point below the body frame, of the shape turned by rot [3, 3]."""
     down = -rot[2]  # world -z in the body frame
     if variant.shape.kind == "grid":
         return max(float((h * variant.scale @ down).max()) for h in variant.shape.hulls)

@@ -54,7 +54,8 @@ class StubEngine:
 
 
 def link_spec(inertia: float, dt: float, gravity: float = 0.0, friction: str = "") -> mujoco.MjSpec:
-    """One hinge `joint` with the given inertia about it [kg.m2]; with gravity, 0.1 kg at 8 mm (along x at q = 0)."""
+    """Return one hinge `joint` with the given inertia about it [kg.m2]; with gravity, 0.1 kg at 8 mm (along x at q =
+    0)."""
     offset, mass = (0.008, 0.1) if gravity else (0.0, 0.001)
     own = inertia - mass * offset**2
     return mujoco.MjSpec.from_string(f"""
@@ -68,7 +69,7 @@ STICKS = 'solimpfriction="0.9999 0.9999 0.001 0.5 2"'  # a stuck joint holds ins
 
 
 def drive(columns: dict, inertia=1e-4, dt=0.005, n=1, voltage=False, gravity=0.0, control_rate=None, friction=STICKS):
-    """A C MuJoCo engine with one link, and its servo."""
+    """Return a C MuJoCo engine with one link, and its servo."""
     spec = link_spec(inertia, dt, gravity, friction)
     engine = make_engine(spec, n, engine="mujoco", fields=FIELDS, threads=1)
     raw = {"drive": "voltage" if voltage else "torque", "joints": {"joint": columns}, "control_rate": control_rate}
@@ -90,7 +91,7 @@ WHOLE = ("deadband_kind", "coupling_from")  # numbers of a kind, and of a joint
 
 
 def random_params(rng, shape) -> np.ndarray:
-    """Params that exercise every column in every regime, to each side of neutral that its limits leave; some
+    """Return the params that exercise every column in every regime, to each side of neutral that its limits leave; some
     neutral."""
     out = np.empty((*shape, len(COLUMNS)))
     for i, c in enumerate(COLUMNS):
@@ -294,7 +295,7 @@ def test_stable_at_any_inertia(inertia, target):
 
 
 def trajectory(dt, columns, inertia, voltage=False):
-    """Positions at every 10 ms for targets that jump between +-0.6 rad every 150 ms, with no dry friction."""
+    """Return positions at every 10 ms for targets that jump between +-0.6 rad every 150 ms, with no dry friction."""
     engine, servo = drive(columns, inertia=inertia, dt=dt, voltage=voltage)
     steps = round(0.01 / dt)
     out = []

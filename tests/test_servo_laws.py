@@ -143,8 +143,8 @@ TERMS = [
 
 
 def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5) -> np.ndarray:
-    """[n] q at every `fine` s of the same link: explicit Euler of the controller's law as `laws.py` states it, written
-    apart."""
+    """Return [n] q at every `fine` s of the same link: explicit Euler of the controller's law as `laws.py` states
+    it, written apart."""
     c = {
         "speed_feedforward": 0.0,
         "acceleration_feedforward": 0.0,
@@ -246,7 +246,8 @@ COAST = {"kp": 0.0}
 
 
 def coast(torque, v0: float, seconds: float, fine: float = 1e-5) -> np.ndarray:
-    """[ms] q of the link under torque(q, v), by the midpoint rule in steps of 10 us; it stands once its speed turns."""
+    """Return [ms] q of the link under torque(q, v), by the midpoint rule in steps of 10 us; it stands once its speed
+    turns."""
     q, v, out = 0.0, v0, []
     for i in range(round(seconds / fine)):
         if i % round(1e-3 / fine) == 0:
@@ -337,7 +338,7 @@ def test_ripple_shape(shape):
 
 
 def dahl(amount: float, level: float, times, targets, seconds: float, fine: float = 1e-5) -> np.ndarray:
-    """[ms] q of the link on a PD (2, 0.02) with Dahl's friction level z, dz = (1 - z sign(v)) v dt / amount, by
+    """Return [ms] q of the link on a PD (2, 0.02) with Dahl's friction level z, dz = (1 - z sign(v)) v dt / amount, by
     explicit Euler."""
     q = v = z = 0.0
     out = []

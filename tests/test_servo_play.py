@@ -35,7 +35,7 @@ def rig(
     joints: int = 1,
     **table,
 ):
-    """An engine with hinges side by side (each a link on an arm, along x at q = 0) and their servo."""
+    """Return an engine with hinges side by side (each a link on an arm, along x at q = 0) and their servo."""
     own = LINK - MASS * ARM**2
     bodies = "".join(
         f"""<body pos="0 {k} 0"><joint name="j{k}" type="hinge" axis="0 -1 0" armature="{ROTOR}"
@@ -86,7 +86,8 @@ def explicit(
     seconds: float = 2.0,
     dt: float = 1e-5,
 ) -> np.ndarray:
-    """The same two bodies by small explicit steps: rotor with dry friction, spring with a gap, link under gravity."""
+    """Return the same two bodies by small explicit steps: rotor with dry friction, spring with a gap, link under
+    gravity."""
     total = LINK + ROTOR
     stiff = 1 / softness if softness else STOP_GAIN * kp + STOP_RATE**2 * total
     damp = 0.1 * math.sqrt(stiff * LINK) if softness else 2 * 0.1 * math.sqrt(stiff * ROTOR * LINK / total)

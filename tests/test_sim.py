@@ -35,7 +35,7 @@ FIELDS = ("opt.gravity", "body_mass", "body_inertia", "geom_friction", "geom_siz
 
 
 def stack_spec(cone: str = "elliptic", meshes: bool = False) -> mujoco.MjSpec:
-    """A slab (60 x 60 x 20 mm) on a floor, a ball (10 mm radius) on the slab, both free."""
+    """Return a slab (60 x 60 x 20 mm) on a floor, a ball (10 mm radius) on the slab, both free."""
     mesh = '<mesh name="low" vertex="{0}"/><mesh name="high" vertex="{1}"/>'.format(
         *(
             " ".join(f"{x} {y} {z}" for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-h, h))
@@ -80,7 +80,7 @@ def run(engine, seconds: float, chunk: int = 25) -> None:
 
 @pytest.fixture(scope="module", params=ENGINES)
 def engine(request):
-    """One engine a module; a test gets it at rest with nominal fields."""
+    """Return one engine a module; a test gets it at rest with nominal fields."""
     e = stack(request.param)
     e.nominal = {f: e.field(f).clone() for f in FIELDS}
     return e
@@ -343,7 +343,7 @@ def test_pair_forces_with_a_pyramidal_cone(kind):
 
 
 def centipede(kind: str, feet: int):
-    """A body of 0.2 kg on so many spherical feet."""
+    """Return a body of 0.2 kg on so many spherical feet."""
     foot = "".join(
         f'<geom type="sphere" size=".004" pos="{0.01 * (i - feet / 2 + 0.5)} {0.02 * (-1) ** i} 0" '
         f'mass="{0.2 / feet}"/>'

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def rows(leak_mib: float = 0.0, files: int = 0, n: int = 400) -> list[tuple[float, ...]]:
-    """A run of 200 s whose memory saws by 50 MiB and warms up, and what it loses over the whole of it."""
+    """Return a run of 200 s whose memory saws by 50 MiB and warms up, and what it loses over the whole of it."""
     rng, t = np.random.default_rng(0), np.arange(n) * 0.5
     heap = 400 + 200 * (1 - np.exp(-t / 5)) + 50 * (t % 3) / 3 + rng.normal(0, 2, n) + leak_mib * t / t[-1]
     opened = 5 + rng.integers(0, 2, n) + np.floor(files * t / t[-1])
@@ -115,7 +115,7 @@ def test_a_leak_of_a_piece_of_work_is_found_in_what_the_process_keeps(leak_mib, 
 
 
 def alive(group: int) -> bool:
-    """Whether a process of a group is left, but for those that wait to be asked how they ended."""
+    """Return whether a process of a group is left, but for those that wait to be asked how they ended."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             state, _, of = stat.read_text().rpartition(") ")[2].split()[:3]

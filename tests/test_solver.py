@@ -36,14 +36,14 @@ KINDS = f"""<mujoco><option timestep="0.005" {OPTION}/>
 
 @pytest.fixture(scope="module", autouse=True)
 def fibers():
-    """Blocks of 32 lanes on the CPU."""
+    """Yield the blocks of 32 lanes on the CPU."""
     before, wp.config.enable_cpu_blocks = wp.config.enable_cpu_blocks, True
     yield
     wp.config.enable_cpu_blocks = before
 
 
 def both(m, d, ours: NewtonSolver, warm: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-    """What each solver leaves behind, from the constraints in `d` and the start `warm` [N, nv]."""
+    """Return what each solver leaves behind, from the constraints in `d` and the start `warm` [N, nv]."""
     found = {}
     for name, call in (("theirs", lambda: theirs.solve(m, d)), ("ours", ours.launch)):
         d.qacc_warmstart.assign(warm.astype(np.float32))
@@ -78,7 +78,7 @@ def assert_same(found: dict, nefc: np.ndarray, tolerance: float) -> None:
 
 @pytest.fixture(scope="module")
 def catching(fibers):
-    """A hand environment with MuJoCo-Warp's solver, its contact constraints those of a catch."""
+    """Return a hand environment with MuJoCo-Warp's solver, its contact constraints those of a catch."""
     env = grasp_env("sim.solver=mujoco", worlds=WORLDS, engine="warp")
     close = torch.zeros(WORLDS, env.num_actions)
     close[:, :3], close[:, 4:] = 0.4, 0.5
@@ -138,7 +138,7 @@ def test_a_world_that_is_not_finite_ends_and_leaves_the_others_alone(catching):
 
 @pytest.fixture(scope="module")
 def kinds(fibers):
-    """(C model, model, data) of the scene with every kind of row; worlds at random places and speeds."""
+    """Return (C model, model, data) of the scene with every kind of row; worlds at random places and speeds."""
     mjm = mujoco.MjModel.from_xml_string(KINDS)
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, mujoco.MjData(mjm), nworld=WORLDS, nconmax=40, njmax=160)
     rng = np.random.default_rng(1)
@@ -211,7 +211,7 @@ def changed(**options) -> mujoco.MjModel:
 
 
 def model_with(end: str, more: str) -> mujoco.MjModel:
-    """The model with more before a closing tag."""
+    """Return the model with more before a closing tag."""
     return mujoco.MjModel.from_xml_string(KINDS.replace(end, more + end))
 
 

@@ -52,7 +52,7 @@ def tracking(x, command, x_max, sigma, low, high, contact):
 
 
 def rewards(env) -> tuple[dict, dict]:
-    """(terms, metrics) by the formulas in torch."""
+    """Return (terms, metrics) by the formulas in torch."""
     w, r, end = env.task["rewards"], env.task["reward"], env.task["termination"]
     force, contact = env.tip_force, env.tip_force > r["contact_threshold"]
     torque = env.torque[:, env.roots] * env.root_closes
@@ -245,7 +245,7 @@ def test_a_group_of_observations_is_emptied_where_it_is_not_finite(env):
 
 
 def orders(env, rng: torch.Generator, mask, due_push) -> dict[str, torch.Tensor]:
-    """A new command where mask holds and a new push where due_push does, drawn as the sampler draws."""
+    """Return a new command where mask holds and a new push where due_push does, drawn as the sampler draws."""
     c, s = env.task["command"], env.sampler
     s.rng.set_state(rng)
     value = c["low"] + (c["high"] - c["low"]) * s.uniform()

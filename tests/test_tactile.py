@@ -432,8 +432,8 @@ def test_several_objects_add_up():
 
 
 def _press_errors(mode: str, kind: str, size, depth: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the centre [mm] over random presses on thumb and index, through the kernel; and how far (m) the true
-    centre lies from the pad's border."""
+    """Return the errors of the centre [mm] over random presses on thumb and index, through the kernel; and how far (m)
+    the true centre lies from the pad's border."""
     rng = np.random.default_rng(12)
     layout = hand()
     shape = SimpleNamespace(name=kind, kind=kind, grid=None)

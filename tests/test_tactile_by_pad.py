@@ -27,8 +27,8 @@ INDEX, MID = 1, 2
 
 
 def ball(cfg: dict, n: int = 2, **kw):
-    """A ball at the middle of every pad of N hands, each 20 cm from the next; `press(depth, time)` moves it over the
-    index's and feels."""
+    """Return a ball at the middle of every pad of N hands, each 20 cm from the next; `press(depth, time)` moves it
+    over the index's and feels."""
     layout = hand_layout(load_hand())
     pads = [f"tip_{f}" for f in xhand.FINGERS]
     engine = PosedEngine(n, [*xhand.TIP_BODIES, "object"], pads)

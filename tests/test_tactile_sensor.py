@@ -14,7 +14,7 @@ BOX = torch.tensor([0.02, 0.02, 0.01])
 
 
 def pressed_box(n: int, cfg: dict, taxels: int = 5, **kw):
-    """A box's flat face against a small flat pad; `press(depth, time, x)` moves it and feels."""
+    """Return a box's flat face against a small flat pad; `press(depth, time, x)` moves it and feels."""
     layout = flat_layout(half=5e-3, n=taxels)
     engine, tactile = touch(n, layout, primitives(), {**SPRING, "raw": True, **cfg}, **kw)
     tactile.shape_id[:], tactile.shape_size[:] = 0, BOX

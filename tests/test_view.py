@@ -6,13 +6,14 @@ import math
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
 from dexsim.errors import UserError
-from dexsim.view import overlay, plots, render, video
+from dexsim.view import decor, overlay, plots, render, video
 
 XML = """<mujoco><worldbody><light pos="0 0 1"/><body pos="0 0 0"><freejoint/>
 <geom size="0.03" rgba="1 0 0 1"/></body></worldbody></mujoco>"""
@@ -131,7 +132,50 @@ def test_bars_follow_force_and_command():
     half, whole = blue([5.0]), blue([10.0])
     assert whole == pytest.approx(2 * half, rel=0.05) and blue([99.0]) == whole
     assert blue([0.0]) == blue([math.nan]) < 0.1 * half
-    assert (overlay.annotate(blank, text="hi") != blank).any() and not blank.any()  # a copy
+    assert not blank.any()
+
+
+def test_a_frame_is_not_covered():
+    frame = np.random.default_rng(0).integers(0, 255, (280, 300, 3), np.uint8)
+    above, below = overlay.room(280, True, True)
+    whole = overlay.annotate(frame, "a title", [1.0, 2.0], 1.5, ("thumb", "mid"), 10.0)
+    assert whole.shape == (280 + above + below, 300, 3) and (whole[above : above + 280] == frame).all()
+    for drawn in (whole[:above], whole[above + 280 :]):
+        assert (drawn != overlay.DARK).any()
+    assert (overlay.annotate(frame) == frame).all()
+
+
+def test_gravity_turns_to_straight_down():
+    for gravity in ([0.0, 0.0, -9.81], [0.0, 0.0, 9.81], [3.0, -2.0, 1.0], [9.81, 0.0, 0.0]):
+        turn = decor.turn_down(np.array(gravity))
+        assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(turn) == pytest.approx(1)
+        assert turn @ gravity / np.linalg.norm(gravity) == pytest.approx([0, 0, -1], abs=1e-12)
+
+
+def test_a_push_shows_and_taxels_light(tmp_path):
+    """An arrow is drawn while a force acts; a pad's picture changes where its taxels feel something."""
+    points = np.array([[[0.0, 0.0, 0.01], [0.0, 0.01, 0.01], [0.01, 0.0, 0.01]]])
+    normal = np.tile([0.0, 0.0, 1.0], (1, 3, 1))
+    layout = SimpleNamespace(point=points, normal=normal, ty=np.tile([0.0, 1.0, 0.0], (1, 3, 1)), count=np.array([3]),
+                             bodies=("object",))  # fmt: skip
+    push, taxels = np.zeros((7, 3)), np.zeros((7, 1, 3))
+    push[4:, 0], taxels[4:] = 3.0, 0.3
+    model = mujoco.MjModel.from_xml_string(XML.replace("<body", '<body name="object"', 1))
+    made = clip(force=np.ones((7, 1)), push=push, taxels=taxels, layout=layout, decor=True)
+    made.model = model
+    try:
+        video.render([made], tmp_path / "a.mp4", dt=0.05, size=(320, 320), names=("thumb",))
+    except video.NoRenderer as error:
+        pytest.skip(str(error))
+    _, frames = read(tmp_path / "a.mp4")
+    above, below = overlay.room(320, False, True)
+    scene = slice(above, 320 - below)
+    assert np.abs(frames[6][320 - below :].astype(int) - frames[2][320 - below :]).max() > 60
+    made.push[:] = 0
+    video.render([made], tmp_path / "b.mp4", dt=0.05, size=(320, 320), names=("thumb",))
+    _, without = read(tmp_path / "b.mp4")
+    assert np.abs(frames[6][scene].astype(int) - without[6][scene]).max() > 60
+    assert np.abs(frames[2][scene].astype(int) - without[2][scene]).max() < 40
 
 
 def test_clips_of_an_evaluation():

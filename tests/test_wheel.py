@@ -76,7 +76,7 @@ def test_hints_name_what_was_typed(monkeypatch):
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """The wheel, built from a copy so that nothing is left in the repository."""
+    """Return the wheel, built from a copy so that nothing is left in the repository."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
     shutil.copytree(ROOT / "dexsim", source / "dexsim", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -101,7 +101,8 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-    """The `bin` folder of a fresh environment with this wheel, and the dependencies of the one that runs the tests."""
+    """Return the `bin` folder of a fresh environment with this wheel, and the dependencies of the one that runs the
+    tests."""
     home = tmp_path_factory.mktemp("fresh")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True)
     python = home / "bin" / "python"
@@ -118,7 +119,7 @@ def installed(wheel, tmp_path_factory) -> Path:
 
 
 def call(installed: Path, folder: Path, *argv: str | Path) -> str:
-    """What a command of the fresh environment says, run in a folder."""
+    """Return what a command of the fresh environment says, run in a folder."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     done = subprocess.run(
         [installed / argv[0], *argv[1:]], cwd=folder, capture_output=True, text=True, timeout=600, env=clean

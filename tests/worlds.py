@@ -20,12 +20,13 @@ ALL = ["box", "sphere", "capsule", *(n for n, s in library().items() if s.kind =
 
 
 def grasp_cfg(*settings: str, worlds: int = 8) -> dict:
-    """The resolved configuration of `dexsim train task=grasp preset=none SETTINGS`: all objects, on the CPU too."""
+    """Return the resolved configuration of `dexsim train task=grasp preset=none SETTINGS`: all objects, on the CPU
+    too."""
     return task_cfg(*settings, worlds=worlds)
 
 
 def task_cfg(*settings: str, worlds: int = 8, task: str = "grasp") -> dict:
-    """The same of any task."""
+    """Return the same of any task."""
 
     from dexsim.cli import start
 
@@ -39,8 +40,8 @@ def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int
 
 
 def play_env(checkpoint: str, worlds: int, *settings: str, engine: str = "mujoco"):
-    """(environment, policy) of an included checkpoint, as `python play.py checkpoint=... device=cpu SETTINGS` has
-    them."""
+    """Return (environment, policy) of an included checkpoint, as `python play.py checkpoint=... device=cpu SETTINGS`
+    has them."""
     from dexsim.cli import start
     from dexsim.learning.ppo import load_policy
     from dexsim.paths import CONFIGS
@@ -63,7 +64,8 @@ def play_env(checkpoint: str, worlds: int, *settings: str, engine: str = "mujoco
 
 
 def hand_scene(n: int, shapes=ALL, kind: str = "mujoco", scales=(1.25,), timestep: float = 0.002, edit=None, **kw):
-    """(engine, scene, objects): the hand and one object of `shapes` a world; edit(spec) changes the spec first."""
+    """Return (engine, scene, objects): the hand and one object of `shapes` a world; edit(spec) changes the spec
+    first."""
     names = list(shapes)
     spec = xhand.hand_spec()
     lib = library()

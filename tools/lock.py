@@ -27,7 +27,7 @@ HEAD = "# Made by tools/lock.py. Install with: pip install --no-deps --require-h
 
 
 def compiled(uv: str, extras: tuple[str, ...], constraints: Path | None) -> list[str]:
-    """The lines of each package: version, marker, hashes. One may come more than once, for other Pythons."""
+    """Return the lines of each package: version, marker, hashes. One may come more than once, for other Pythons."""
     with tempfile.TemporaryDirectory() as folder:
         build = Path(folder) / "build.in"
         build.write_text(BUILD + HELD)

@@ -92,7 +92,8 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
 
 
 def _with_braking(case: Path, out: Path) -> Path:
-    """A case's servo.yaml that says how its drives brake, beside its answer; the case's own where there is none."""
+    """Return a case's servo.yaml that says how its drives brake, beside its answer; the case's own where there is
+    none."""
     path = case / "servo.yaml"
     if not path.is_file():
         return path
@@ -109,7 +110,7 @@ def _spent(s: dict, begun: float) -> bool:
 
 
 def _room(s: dict, begun: float) -> float:
-    """Seconds that what begins now may take."""
+    """Return the seconds that what begins now may take."""
     return min(s["limit"], max(s["until"] - (time.perf_counter() - begun), 1.0)) if s.get("until") else s["limit"]
 
 

@@ -47,7 +47,7 @@ def _moving(L, n, o):
 
 
 def _clipped(L, n, o):
-    """How much more the drive would have given as it is believed."""
+    """Return how much more the drive would have given as it is believed."""
     def give(p):
         if p["voltage"]:
             return p["torque_limit"] * (np.clip(L["asked"], -1, 1) - L["speed"] / p["no_load_speed"])
@@ -156,7 +156,7 @@ for _name, _kind in KINDS.items():
 
 
 def _after(x: np.ndarray, seconds: float) -> np.ndarray:
-    """True for some time around each moment of x."""
+    """Return true for some time around each moment of x."""
     n = max(int(seconds / 1e-3), 1)
     return np.convolve(x.astype(float), np.ones(2 * n + 1), "same") > 0
 

@@ -41,7 +41,7 @@ SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than 
 
 
 def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
-    """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
+    """Return what each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
     noise doubled), pair (two effects), outside (the catalogue), decoy, hand (a hand: of every six two with nothing
@@ -111,7 +111,7 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
 
 
 def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
-    """Targets of the recordings in every millisecond, [R, J, M]; sent at 100 Hz and held between."""
+    """Return the targets of the recordings in every millisecond, [R, J, M]; sent at 100 Hz and held between."""
     M = int(SECONDS * 1000)
     t = np.arange(0, SECONDS, 0.01)
     # a chain thrown about is chaotic, and no replay of it can be compared
@@ -159,8 +159,8 @@ class Bench:
     def run(
         self, variants: list[dict[str, np.ndarray]], commands: list[np.ndarray] | None = None, **kw
     ) -> dict[str, np.ndarray]:
-        """Outputs [V, R, J, M] of parameter sets [J]; position is as the encoder reports it. commands: one [R, J, M] a
-        variant."""
+        """Return the outputs [V, R, J, M] of parameter sets [J]; position is as the encoder reports it. commands: one
+        [R, J, M] a variant."""
         V, R = len(variants), len(self.command)
         values = {k: np.repeat(np.stack([v[k] for v in variants]), R, 0) for k in plant.DEFAULTS}
         values["warm"] = np.tile(self.warm[:, None] + np.zeros(self.d.joints), (V, 1))
@@ -180,7 +180,7 @@ class Bench:
     def changed(
         self, joint: int, change: dict[str, float], base: dict[str, np.ndarray] | None = None
     ) -> dict[str, np.ndarray]:
-        """The parameters with one joint's changed."""
+        """Return the parameters with one joint's changed."""
         out = {k: v.copy() for k, v in (base or self.base).items()}
         for k, x in change.items():
             out[k][joint] = x
@@ -214,7 +214,7 @@ class Bench:
         Q, R = np.linalg.qr(slopes / size_of)
 
         def hidden(x: np.ndarray) -> float:
-            """Held-out RMS of a change [R, M], what a refit on all within its bounds takes away taken away."""
+            """Return held-out RMS of a change [R, M], what a refit on all within its bounds takes away taken away."""
             if not np.isfinite(x).all() or np.abs(x).max() > 10.0:  # too much for the rig: it runs away
                 return np.nan
             fit = lsq_linear(R, Q.T @ x.reshape(-1), (low * size_of, high * size_of)).x / size_of
@@ -250,7 +250,8 @@ class Bench:
     def largest(
         self, kind: Kind, joints: list[int], ratio: float, seed: int, draw: Callable[[int], laws.Law | None]
     ) -> tuple[int, tuple[float, dict, dict]]:
-        """(joint, what `sized` says of it): the first at which the effect can be made about as large as the ratio, else
+        """Return (joint, what `sized` says of it): the first at which the effect can be made about as large as the
+        ratio, else
         that at which it becomes largest: an encoder's offset is nothing on a link that weighs nothing. draw: the law
         that it follows at a joint."""
         found: dict[int, tuple[float, dict, dict]] = {}
@@ -261,7 +262,7 @@ class Bench:
         return max(found.items(), key=lambda item: item[1][1]["ratio"])
 
     def stalls(self, size: float, seed: int) -> np.ndarray:
-        """The commands as they arrive on a bus that stalls; the same stalls whatever their length."""
+        """Return the commands as they arrive on a bus that stalls; the same stalls whatever their length."""
         return np.stack([stalled(c, size, np.random.default_rng([seed, 7, k])) for k, c in enumerate(self.command)])
 
 
@@ -271,14 +272,14 @@ def _over(count: int) -> np.ndarray:
 
 
 def metadata(effort: bool, hand: str) -> dict[str, str]:
-    """What every recording states: nothing of it depends on the effect."""
+    """Return what every recording states: nothing of it depends on the effect."""
     return {"source": "real", "robot": hand or "rig", "gravity": "0 0 -9.81",
             "effort_is": "torque_Nm" if effort else "none",
             "effort_sign": "+1"}  # fmt: skip
 
 
 def tier_of(ratio: float) -> str:
-    """The tier nearest to a size reached."""
+    """Return the tier nearest to a size reached."""
     return "silent" if ratio < 1.25 else min(("easy", "medium", "hard"), key=lambda t: abs(np.log(ratio / TIERS[t])))
 
 
@@ -391,8 +392,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
 
 
 def _also(kind: Kind, d: rigs.Drawn, j: int, source: int) -> list[str]:
-    """Other joints at which the effect is just as true: a linkage has two ends, and what a link carries its parents
-    carry."""
+    """Return the other joints at which the effect is just as true: a linkage has two ends, and what a link carries its
+    parents carry."""
     if kind.effect == "joint_coupling":
         return [d.rig.names[source]]
     chain, depth = d.rig.place[j]
@@ -420,8 +421,8 @@ def _logs(run: dict, command: np.ndarray, j: int, source: int) -> list[dict[str,
 
 
 def _when(strength: list[np.ndarray]) -> list[list]:
-    """True samples in the recordings to fit: [recording, start, end] s where the strength [M] of the effect in each
-    exceeds 25 % of its maximum."""
+    """Return true samples in the recordings to fit: [recording, start, end] s where the strength [M] of the effect
+    in each exceeds 25 % of its maximum."""
     strength = [np.asarray(x, float) for x in strength]
     most = max(float(np.percentile(np.concatenate(strength), 99.9)), 1e-12)
     out = []
@@ -504,7 +505,7 @@ def commit(answer: dict, folder: Path) -> str:
 
 
 def reveal(path: Path, digest: str) -> dict:
-    """The truth of a case; ValueError where the file is not the one that was committed to."""
+    """Return the truth of a case; ValueError where the file is not the one that was committed to."""
     text = path.read_text(encoding="utf-8")
     if hashlib.sha256(text.encode()).hexdigest() != digest:
         raise ValueError(f"{path}: is not the truth that was published before the diagnosis")

@@ -41,23 +41,23 @@ class Law:
 
 
 def _with(kind: str, **more) -> Callable:
-    """The form's own change, with parameters of the second law beside it."""
+    """Return the form's own change, with parameters of the second law beside it."""
     return lambda p, s, u, i: KINDS[kind].apply(p, s, u, i) | more
 
 
 def _share(x: np.ndarray, of: np.ndarray) -> float:
-    """Least-squares factor of x over `of`; 1 where there is nothing to compare."""
+    """Return least-squares factor of x over `of`; 1 where there is nothing to compare."""
     return float(np.sum(x * of) / np.sum(of * of)) if np.any(of) else 1.0
 
 
 def _viscous(L: Shown, n: dict) -> dict:
-    """The coefficient that takes as much energy from the recorded motion."""
+    """Return the coefficient that takes as much energy from the recorded motion."""
     v = np.abs(L["speed"])
     return {"coefficient": n["viscous"] + n["shear"] * _share(v / (1 + v / n["shear_speed"]), v)}
 
 
 def _load(L: Shown, n: dict) -> dict:
-    """The fractions that take as much energy, of motion that drives the load and of motion that it drives."""
+    """Return the fractions that take as much energy, of motion that drives the load and of motion that it drives."""
     out, force, speed = {}, np.abs(L["load"]), np.abs(L["speed"])
     for key, name, on in (("fraction", "load", L["load"] * L["speed"] >= 0),
                           ("fraction_backdriven", "load_back", L["load"] * L["speed"] < 0)):  # fmt: skip
@@ -76,7 +76,7 @@ def _stiffness(L: Shown, n: dict) -> dict:
 
 
 def chance_of(recording: int) -> int:
-    """Where the row of chance of a recording's delays begins."""
+    """Return where the row of chance of a recording's delays begins."""
     return 997 * recording
 
 
@@ -88,7 +88,7 @@ def late(delay: float, jitter: float, recordings: int, seconds: float) -> float:
 
 
 def _eccentricity(L: Shown, n: dict) -> dict:
-    """Amplitude of the one harmonic that comes nearest over the recorded angles."""
+    """Return the amplitude of the one harmonic that comes nearest over the recorded angles."""
     q = L["position"]
     error = plant.encoded(q, 0.0, 0.0, n["eccentric"], n["eccentric_at"], n["second_harmonic"])
     fit = np.linalg.lstsq(np.stack([np.sin(q), np.cos(q)], 1), error, rcond=None)[0]
@@ -104,7 +104,7 @@ def _tooth(L: Shown, n: dict, o: dict) -> np.ndarray:
 
 
 def _soft_own(L: Shown, n: dict, o: dict) -> np.ndarray:
-    """How much more the drive would have given as it is believed."""
+    """Return how much more the drive would have given as it is believed."""
     if n["voltage"]:
         gave = n["torque_limit"] * (plant.soft_limit(L["asked"], 1.0, n["knee"]) - L["speed"] / n["no_load_speed"])
         believed = o["torque_limit"] * (np.clip(L["asked"], -1, 1) - L["speed"] / o["no_load_speed"])
@@ -121,7 +121,7 @@ def _corner_own(L: Shown, n: dict, o: dict) -> np.ndarray:
 
 
 def effort(tau: np.ndarray, current: dict[str, float], at: np.ndarray) -> np.ndarray:
-    """Torque as a current sensor tells it; at [M]: share of the recording that is over."""
+    """Return the torque as a current sensor tells it; at [M]: share of the recording that is over."""
     full = current["current_full"]
     seen = full * np.tanh(tau / full) if full else tau
     return current["current_gain"] * seen + current["current_offset"] * (1 + current["current_drift"] * (2 * at - 1))
@@ -185,14 +185,16 @@ SECOND: dict[str, Law] = {
 
 
 def fault(kind: str, second: bool, size: float, unit: float) -> dict[str, float]:
-    """What a fault of a size changes of a HEALTHY current sensor: gain, or offset in typical torques `unit` [N.m]."""
+    """Return what a fault of a size changes of a HEALTHY current sensor: gain, or offset in typical torques `unit`
+    [N.m]."""
     if kind == "current_gain":
         return {"current_gain": 1 + size} | ({"current_full": 4 * unit} if second else {})
     return {"current_offset": size * unit} | ({"current_drift": 0.5} if second else {})
 
 
 def draw(kinds: list[str], p: list[dict], laws: str, seed: int, number: int) -> list[Law | None]:
-    """The second law, or None for the first, of each form at a joint with parameters p; even chances where it has two.
+    """Return the second law, or None for the first, of each form at a joint with parameters p; even chances where it
+    has two.
 
     laws: "two" draws, "one" gives the first. Raises ValueError for another.
     """
@@ -204,7 +206,7 @@ def draw(kinds: list[str], p: list[dict], laws: str, seed: int, number: int) -> 
 
 
 def has_two(kind: str, p: dict) -> bool:
-    """Whether a form has a second law at a joint with parameters p."""
+    """Return whether a form has a second law at a joint with parameters p."""
     return kind in SECOND and SECOND[kind].possible(p)
 
 
@@ -224,7 +226,7 @@ def reported(kind: Kind, law: Law | None, logs: list[Shown], n: dict, o: dict) -
 
 
 def told(kind: str, law: Law | None, p: dict) -> dict[str, str]:
-    """What the truth says of the law: "first", "second", or "only" where there is one, and in words."""
+    """Return what the truth says of the law: "first", "second", or "only" where there is one, and in words."""
     if not has_two(kind, p):
         return {"law": "only"}
     pair = SECOND[kind]

@@ -88,7 +88,7 @@ class Rig:
 def pendulum(
     length: float = 0.1, radius: float = 0.0, names: tuple[str, ...] = ("joint",), lengths: tuple[float, ...] = ()
 ) -> Rig:
-    """A bench of single pendulums about y that hang along -z: bobs of a radius [m] at their lengths [m]."""
+    """Return a bench of single pendulums about y that hang along -z: bobs of a radius [m] at their lengths [m]."""
     lengths = lengths or (length,) * len(names)
     n = len(names)
     one = lambda v: np.tile(np.asarray(v, float), (n, 1, 1))  # noqa: E731
@@ -109,7 +109,8 @@ def pendulum(
 
 
 def rows(count: int, joints: int = 1, **values) -> dict[str, np.ndarray]:
-    """Parameters [count, joints]: the defaults, with the given scalars, [count] or [count, joints] arrays in place."""
+    """Return the parameters [count, joints]: the defaults, with the given scalars, [count] or [count, joints] arrays in
+    place."""
     unknown = set(values) - set(DEFAULTS)
     if unknown:
         raise KeyError(f"the plant has no parameter {sorted(unknown)}")
@@ -121,7 +122,7 @@ def rows(count: int, joints: int = 1, **values) -> dict[str, np.ndarray]:
 
 
 def _rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """[B, C, 3, 3] about axis [C, 3] by angle [B, C] (Rodrigues)."""
+    """Return [B, C, 3, 3] about axis [C, 3] by angle [B, C] (Rodrigues)."""
     K = np.zeros((*axis.shape[:-1], 3, 3))
     K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -axis[..., 2], axis[..., 1], -axis[..., 0]
     K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = axis[..., 2], -axis[..., 1], axis[..., 0]
@@ -150,7 +151,8 @@ def soft_limit(x: np.ndarray, limit: np.ndarray | float, knee: np.ndarray | floa
 def encoded(
     q: np.ndarray, scale: np.ndarray, offset: np.ndarray, eccentric: np.ndarray, at: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """What an eccentric encoder makes of an angle [rad]; second: amplitude of its second harmonic over the first."""
+    """Return what an eccentric encoder makes of an angle [rad]; second: amplitude of its second harmonic over the
+    first."""
     seen = scale * q + offset + eccentric * np.sin(q + at)
     return seen + eccentric * second * np.sin(2 * (q + at)) if np.any(second) else seen
 
@@ -163,7 +165,7 @@ def angle_read_as(
     at: np.ndarray,
     second: np.ndarray,
 ) -> np.ndarray:
-    """The angle [rad] of which such an encoder makes `seen`: the inverse of `encoded`, by Newton's method."""
+    """Return the angle [rad] of which such an encoder makes `seen`: the inverse of `encoded`, by Newton's method."""
     q = (seen - offset) / scale
     for _ in range(20):
         slope = scale + eccentric * (np.cos(q + at) + 2 * second * np.cos(2 * (q + at)))
@@ -188,7 +190,7 @@ def dynamics(
     gravity: np.ndarray,
     radius: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mass matrix [B, C, D, D] and the torque [B, C, D] that gravity and the motion itself ask of each hinge.
+    """Return mass matrix [B, C, D, D] and the torque [B, C, D] that gravity and the motion itself ask of each hinge.
 
     mass, extra, reach, q, v: [B, C, D]; gravity [B, 3]; radius [B, C, D]: of the added mass, m; None: a point.
     """

@@ -45,7 +45,7 @@ class Drawn:
 
 
 def _chain(rng: np.random.Generator, axes: list[str], start: float) -> Rig:
-    """A serial arm that hangs along -z; each link shorter than the one before."""
+    """Return a serial arm that hangs along -z; each link shorter than the one before."""
     n, vectors = len(axes), {"x": [1.0, 0, 0], "y": [0, 1.0, 0], "z": [0, 0, 1.0]}
     lengths = start * np.cumprod(np.r_[1.0, rng.uniform(0.6, 0.9, n - 1)])
     if axes[0] != axes[-1]:
@@ -61,8 +61,8 @@ def _chain(rng: np.random.Generator, axes: list[str], start: float) -> Rig:
 
 
 def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Drawn:
-    """A rig of a shape. hand: which, as `dexsim.hand.Hand.identity` says it (None: the right xHand). Raises ValueError
-    for a shape that there is not."""
+    """Return a rig of a shape. hand: which, as `dexsim.hand.Hand.identity` says it (None: the right xHand). Raises
+    ValueError for a shape that there is not."""
     if shape == "hand":
         return _hand(rng, hand)
     if shape in ("one", "bench2", "bench4"):
@@ -98,7 +98,7 @@ def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Draw
 
 
 def _scales(rig: Rig, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weight [J] N.m (at its largest over some poses) and link inertia [J] seen by each hinge."""
+    """Return the weight [J] N.m (at its largest over some poses) and link inertia [J] seen by each hinge."""
     C, D = rig.com.shape[:2]
     m = np.zeros((1, C * D))
     m[0, rig.slots] = mass
@@ -128,7 +128,8 @@ def _finish(rng, rig, shape, b, unit, inertia, low, high, voltage, motor_side) -
 
 
 def _hand(rng: np.random.Generator, which: dict | None) -> Drawn:
-    """A hand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the palm."""
+    """Return a hand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the
+    palm."""
     import mujoco
 
     from dexsim.hand import load_hand

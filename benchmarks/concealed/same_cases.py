@@ -28,7 +28,7 @@ def value(line: str, x: float) -> str:
 
 
 def load(path: str) -> dict[str, dict]:
-    """Scored cases by name. Raises UserError."""
+    """Return the scored cases by name. Raises UserError."""
     try:
         if path.endswith(".tgz"):
             with tarfile.open(path) as archive:
@@ -44,7 +44,7 @@ def load(path: str) -> dict[str, dict]:
 
 
 def compared(before: dict[str, dict], after: dict[str, dict]) -> tuple[list[dict], list[dict]]:
-    """The cases that both answered, in one order. Raises UserError where they are not the same cases."""
+    """Return the cases that both answered, in one order. Raises UserError where they are not the same cases."""
     names = [n for n in before if n in after]
     for n in names:
         asked = [{k: r[k] for k in ASKED} for r in (before[n], after[n])]
@@ -54,13 +54,13 @@ def compared(before: dict[str, dict], after: dict[str, dict]) -> tuple[list[dict
 
 
 def said(r: dict) -> str:
-    """What a case was answered: verdict, then the names with their confidence."""
+    """Return what a case was answered: verdict, then the names with their confidence."""
     names = [f"{effect}@{joint} {sure:.2f}" for effect, joint, sure, *_ in r["said"]]
     return f"{r['verdict']}: {', '.join(names) or '-'}"
 
 
 def show(before: list[dict], after: list[dict]) -> str:
-    """The judging table of both, and what is answered otherwise, as Markdown."""
+    """Return the judging table of both, and what is answered otherwise, as Markdown."""
     old, new = score.table(before), score.table(after)
     out = [f"| {len(before)} cases | before | after | cases |", "|---|---|---|---|"]
     for line in dict.fromkeys([*old, *new]):

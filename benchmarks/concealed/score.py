@@ -28,7 +28,7 @@ CLASSES = tuple(
 
 
 def bootstrap(values: list[float], statistic: Callable, count: int = 2000) -> tuple[float, float]:
-    """95 % interval of a statistic of `values` by resampling; (nan, nan) without any."""
+    """Return 95 % interval of a statistic of `values` by resampling; (nan, nan) without any."""
     if not values:
         return math.nan, math.nan
     low, high = intervals.bootstrap(*intervals.of_rows(np.asarray(values), statistic), 0, count)
@@ -36,7 +36,7 @@ def bootstrap(values: list[float], statistic: Callable, count: int = 2000) -> tu
 
 
 def named_right(finding: dict | None, effect: str) -> bool:
-    """Whether the first finding holds the effect: by name, or in an allowed set that holds it."""
+    """Return whether the first finding holds the effect: by name, or in an allowed set that holds it."""
     if finding is None:
         return False
     group = set(finding.get("indistinguishable") or []) | {finding["effect"]}
@@ -46,7 +46,7 @@ def named_right(finding: dict | None, effect: str) -> bool:
 
 
 def sure(diagnosis: dict) -> list[dict]:
-    """Findings that name one effect with confidence."""
+    """Return the findings that name one effect with confidence."""
     return [
         f for f in diagnosis["findings"] if f["confidence"] >= SURE and len(set(f.get("indistinguishable") or [])) < 2
     ]
@@ -60,12 +60,12 @@ def _f1(hits: int, said: int, true: int) -> float:
 
 
 def _holds(f: dict, effect: str) -> bool:
-    """Whether a finding names the effect, alone or in an allowed set."""
+    """Return whether a finding names the effect, alone or in an allowed set."""
     return named_right(f, effect)
 
 
 def overlap(finding: dict, truth: list[list], step: float = 1e-3, seconds: float = 60.0) -> float:
-    """Intersection over union of the finding's `when` with the true stretches [[recording, start, end]]."""
+    """Return the intersection over union of the finding's `when` with the true stretches [[recording, start, end]]."""
     n = int(seconds / step)
     both = either = 0
     for letter in TRAIN:
@@ -81,7 +81,7 @@ def overlap(finding: dict, truth: list[list], step: float = 1e-3, seconds: float
 
 
 def _parameters(finding: dict | None, truth: dict) -> tuple[list[float], list[bool]]:
-    """Relative errors of the sizes, and whether their 90 % intervals hold the truth."""
+    """Return the relative errors of the sizes, and whether their 90 % intervals hold the truth."""
     errors, covered = [], []
     for key, value in truth["parameters"].items():
         got = ((finding or {}).get("parameters") or {}).get(key)
@@ -123,14 +123,15 @@ def _removed(d: dict, effects: list[dict], joints: int) -> float | None:
 
 
 def law_of(effect: dict) -> str:
-    """Which law a true effect follows: "first", "second", or "only" where it has one. Truths of before laws were drawn
+    """Return which law a true effect follows: "first", "second", or "only" where it has one. Truths of before laws
+    were drawn
     do not say: they are all of the first."""
     two = laws.SECOND.keys() | touch_cases.SECOND.keys()
     return effect.get("law") or ("first" if effect["kind"] in two else "only")
 
 
 def one(truth: dict, d: dict) -> dict:
-    """What the table needs of one case: truth and `diagnosis.json`. Missing figures are absent."""
+    """Return what the table needs of one case: truth and `diagnosis.json`. Missing figures are absent."""
     findings = list(d["findings"])  # in the tool's own order: its first name counts
     physics = [f for f in findings if f["effect"] != "bad_channel"]
     effects = truth["effects"]
@@ -228,13 +229,13 @@ def middle(values: list, statistic: Callable) -> dict | None:
 
 
 def alone_at(r: dict, least: float) -> bool:
-    """Whether the hidden effect was named first, alone, with at least this confidence."""
+    """Return whether the hidden effect was named first, alone, with at least this confidence."""
     return r["alone"] and r.get("confidence", r["said"][0][2] if r["said"] else 0.0) >= least
 
 
 def by_law(results: list[dict]) -> dict[str, dict[str, dict]]:
-    """Figures of the cases with one effect that has two laws, {line: {"first" or "second": {value, low, high, n}}};
-    and of those with but one ("only")."""
+    """Return figures of the cases with one effect that has two laws, {line: {"first" or "second": {value, low, high,
+    n}}}; and of those with but one ("only")."""
     lines: dict[str, dict[str, dict]] = {}
     for law in ("first", "second", "only"):
         mine = [r for r in results if "right" in r and r.get("laws") == [law]]
@@ -253,7 +254,7 @@ def by_law(results: list[dict]) -> dict[str, dict[str, dict]]:
 
 
 def table(results: list[dict]) -> dict[str, dict]:
-    """The lines of the table: {line: {value, low, high, n}}; a line without cases is left out."""
+    """Return the lines of the table: {line: {value, low, high, n}}; a line without cases is left out."""
     lines: dict[str, dict] = {}
 
     def put(line: str, value: dict | None) -> None:
@@ -329,7 +330,7 @@ def by_effect(results: list[dict]) -> list[tuple[str, str]]:
 
 
 def show(lines: dict[str, dict], results: list[dict], cases: bool = True) -> str:
-    """All as text."""
+    """Return all as text."""
     out = []
     if cases:
         out.append(f"{'case':<10}{'group':<9}{'rig':<8}{'tier':<8}{'hidden':<44}{'verdict':<18}said")

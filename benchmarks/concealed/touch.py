@@ -25,7 +25,8 @@ NEIGHBOUR = 4.6e-3  # m: taxels nearer than this are beside one another
 
 
 def triangle_distance(p: np.ndarray, tri: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [n] from points p [n, 3] to the nearest of triangles tri [m, 3, 3], and the nearest point [n, 3]."""
+    """Return the distance [n] from points p [n, 3] to the nearest of triangles tri [m, 3, 3], and the nearest point [n,
+    3]."""
     a, ab, ac = tri[:, 0], tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]
     normal = np.cross(ab, ac)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -69,7 +70,7 @@ class Pad:
         self.gap = gap.reshape(len(self.grid_press), len(self.grid_slide))
 
     def depth(self, press: np.ndarray, slide: np.ndarray) -> np.ndarray:
-        """Depth m of the ball in the tip (negative: apart), bilinear on the grid."""
+        """Return the depth m of the ball in the tip (negative: apart), bilinear on the grid."""
         x = np.clip(
             (press - self.grid_press[0]) / (self.grid_press[1] - self.grid_press[0]), 0, len(self.grid_press) - 1.001
         )
@@ -83,7 +84,8 @@ class Pad:
 
 
 def move(pad: Pad, p: dict[str, float], command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [2, M] m of (slide, press) and the contact's force [M] N every millisecond. command [2, M]: targets."""
+    """Return the positions [2, M] m of (slide, press) and the contact's force [M] N every millisecond. command [2, M]:
+    targets."""
     q, v = command[:, 0].copy(), np.zeros(2)
     mass = np.array([p["mass_slide"], p["mass_press"]])
     pull = mass * np.array([pad.gravity @ pad.slide, pad.gravity @ pad.press])
@@ -102,7 +104,7 @@ def move(pad: Pad, p: dict[str, float], command: np.ndarray) -> tuple[np.ndarray
 
 
 def readings(pad: Pad, p: dict[str, float], q: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """[M, K] N that the taxels read every millisecond, before noise and counts."""
+    """Return [M, K] N that the taxels read every millisecond, before noise and counts."""
     across = np.cross(pad.press, pad.slide)
     centre = (
         pad.start
@@ -133,8 +135,8 @@ def readings(pad: Pad, p: dict[str, float], q: np.ndarray, force: np.ndarray) ->
 
 
 def relaxing(p: dict[str, float], x: np.ndarray) -> np.ndarray:
-    """[M, K] what the branches add to forces x [M, K] of every millisecond: their fraction of what x has not held long
-    enough for them to let go."""
+    """Return [M, K] what the branches add to forces x [M, K] of every millisecond: their fraction of what x has not
+    held long enough for them to let go."""
     if p["branches"] > 1:
         half = p | {"fraction": p["fraction"] / 2, "branches": 1.0}
         return relaxing(half, x) + relaxing(half | {"time_constant": p["time_constant"] / 8}, x)

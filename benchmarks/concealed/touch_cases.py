@@ -21,7 +21,7 @@ FINGERS = ("index", "mid", "ring", "pinky")
 
 
 def _relaxed(f: np.ndarray, time_constant: float) -> np.ndarray:
-    """The force [M] as the rubber's slow branch follows it."""
+    """Return the force [M] as the rubber's slow branch follows it."""
     a, state, out = np.exp(-1e-3 / time_constant), 0.0, np.empty_like(f)
     for i, x in enumerate(f):
         state = a * state + (1 - a) * x
@@ -69,7 +69,8 @@ class TouchLaw:
 
 
 def _one_branch(pad: touch.Pad, force: list[np.ndarray], n: dict) -> dict[str, float]:
-    """Fraction and time constant of the one branch that adds most nearly what the two add in the recorded force."""
+    """Return the fraction and time constant of the one branch that adds most nearly what the two add in the recorded
+    force."""
     of = lambda p: np.concatenate([touch.relaxing(p, f[:, None])[:, 0] for f in force])  # noqa: E731
     truth = of(n)
     best = (np.inf, 0.0, 0.0)
@@ -93,7 +94,7 @@ REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across
 
 
 def bench(finger: str, where: Path):
-    """The rig as it is believed (rig.xml, rig's servo.yaml in `where`) and its pad for the plant."""
+    """Return the rig as it is believed (rig.xml, rig's servo.yaml in `where`) and its pad for the plant."""
     from benchmarks.press_rig import RADIUS, SERVO, spec
     from dexsim.assets import xhand
 
@@ -121,7 +122,7 @@ def bench(finger: str, where: Path):
 
 
 def motion(rng: np.random.Generator) -> np.ndarray:
-    """Targets [2, M] of (slide, press): presses of several depths, quick and slow, some held, each elsewhere."""
+    """Return targets [2, M] of (slide, press): presses of several depths, quick and slow, some held, each elsewhere."""
     t = np.arange(0, SECONDS, 0.01)
     q, at = np.zeros((2, len(t))), 0.2
     q[1] = 0.5e-3
@@ -156,7 +157,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     cache: dict[float, list] = {}
 
     def run(p: dict) -> list[tuple]:
-        """(positions, force, readings) of every recording."""
+        """Return (positions, force, readings) of every recording."""
         if p["stiffness"] not in cache:
             cache[p["stiffness"]] = [touch.move(pad, p, c) for c in commands]
         return [(q, f, touch.readings(pad, p, q, f) * own_gain) for q, f in cache[p["stiffness"]]]

@@ -100,7 +100,7 @@ class Queue:
         self.lock, self.begun = threading.Condition(), time.perf_counter()
 
     def _takes(self, job: Job) -> int:
-        """Cores of a job; a training on a GPU takes none."""
+        """Return the cores of a job; a training on a GPU takes none."""
         return 0 if job.gpu and self.with_gpus else min(job.cores, self.cores)
 
     def go(self) -> None:
@@ -176,7 +176,8 @@ class Loop:
         self.uses = {k: max(1, min(int(s[f"{k}_cores"]), self.cores)) for k in ("train", "judge", "diagnose")}
 
     def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 3600.0, threads: int = 1) -> int:
-        """A command of the product, its output in a file. gpu: the one that it sees; threads: OMP_NUM_THREADS."""
+        """Return a command of the product, its output in a file. gpu: the one that it sees; threads:
+        OMP_NUM_THREADS."""
         return 0 if self.first([(argv, log, gpu, threads)], limit) == 0 else 1
 
     def first(self, commands: list[tuple[list[str], Path, str, int]], limit: float) -> int | None:
@@ -247,7 +248,7 @@ class Loop:
         return run
 
     def _ranges(self, task: str, values: dict) -> dict:
-        """Those that the task's randomization has."""
+        """Return those that the task's randomization has."""
         own = yaml.safe_load(
             (CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(
                 encoding="utf-8"
@@ -289,9 +290,10 @@ class Loop:
         return run
 
     def fitted(self, base: Path, world: str) -> Path:
-        """The servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is that of one
-        figure with all others free (a longer delay goes with a shorter lag), and drawn at once their corners are drives
-        that no recording allows. A range that `diagnose` let reach the belief, being unsure, is cut like the others."""
+        """Return the servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is
+        that of one figure with all others free (a longer delay goes with a shorter lag), and drawn at once their
+        corners are drives that no recording allows. A range that `diagnose` let reach the belief, being unsure, is
+        cut like the others."""
         from dexsim.actuator.table import ServoTable
 
         belief, table = (
@@ -324,7 +326,7 @@ class Loop:
         return run
 
     def own(self, task: str, world: str):
-        """A naive policy's own run in the reality, recorded as its bus reads."""
+        """Return a naive policy's own run in the reality, recorded as its bus reads."""
 
         def run(slot: str) -> bool:
             where = self.out / f"own_{world}"
@@ -354,12 +356,13 @@ class Loop:
         return run
 
     def helper(self, world: str) -> str:
-        """The GPU on which a reality's diagnosis is computed too; "" for none."""
+        """Return the GPU on which a reality's diagnosis is computed too; "" for none."""
         gpus = [g for g in self.s["diagnose_gpus"].split(",") if g]
         return gpus[self.worlds.index(world) % len(gpus)] if gpus else ""
 
     def diagnose(self, world: str):
-        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast
+        """Return one reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say
+        how fast
         that has to be, and are not fitted: a joint is judged while nothing is touched, and most of what they touch
         carries no taxels. What they command, played again on the empty hand, throws the joints against the ends of
         their motion (lab/results/loop.md)."""
@@ -393,7 +396,7 @@ class Loop:
         return run
 
     def press(self, finger: str, world: str):
-        """A fingertip pressed in the reality, and its diagnosis."""
+        """Return a fingertip pressed in the reality, and its diagnosis."""
 
         def run(slot: str) -> bool:
             where = self.out / f"touch_{world}" / finger
@@ -421,7 +424,7 @@ class Loop:
         return run
 
     def touch(self, world: str):
-        """What was found on the five fingertips, as training takes it."""
+        """Return what was found on the five fingertips, as training takes it."""
 
         def run(slot: str) -> bool:
             where = self.out / f"touch_{world}"
@@ -443,8 +446,8 @@ class Loop:
         return run
 
     def jobs(self) -> list[Job]:
-        """All steps; those that others wait for come first, wide randomization last. Nothing is trained or judged that
-        would keep the diagnoses, or what is fitted, waiting for a GPU or for cores."""
+        """Return all steps; those that others wait for come first, wide randomization last. Nothing is trained or
+        judged that would keep the diagnoses, or what is fitted, waiting for a GPU or for cores."""
         out = []
         for w in self.worlds:
             for task in self.tasks:
@@ -551,7 +554,7 @@ class Loop:
         return [j for j in out if not left_out & set(j.name.split()[:2])]
 
     def report(self) -> dict:
-        """The table: by task, world and measure, the mean of each variant over seeds, and the share of the loss
+        """Return the table: by task, world and measure, the mean of each variant over seeds, and the share of the loss
         recovered."""
         lines = []
         for task in self.tasks:
@@ -630,7 +633,7 @@ def _share(r: dict) -> str:
 
 
 def markdown(data: dict) -> str:
-    """The table as Markdown."""
+    """Return the table as Markdown."""
     text = [
         "| task, reality | measure | naive | wide | fitted | true physics | recovered by fitted | by wide |",
         "|---|---|---|---|---|---|---|---|",

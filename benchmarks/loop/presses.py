@@ -40,7 +40,7 @@ DRAWN = 0.25  # share of what was found by which training draws about it, at mos
 
 
 def rig(finger: str):
-    """The press rig of `touch_rig` with a third slide, so that the ball reaches all of the pad: spec."""
+    """Return the press rig of `touch_rig` with a third slide, so that the ball reaches all of the pad: spec."""
     from benchmarks import press_rig
 
     s, _, direction, along = press_rig.spec(finger)
@@ -132,7 +132,7 @@ class Sensor:
         self.body = xhand.TIP_BODIES[self.pad]
 
     def feel_thumb(self, t: float, depth: float) -> np.ndarray:
-        """[5, K] N that are reported at time t s, with the thumb's tip pressed `depth` m into this one."""
+        """Return [5, K] N that are reported at time t s, with the thumb's tip pressed `depth` m into this one."""
         import torch
 
         from dexsim.assets import xhand
@@ -157,7 +157,7 @@ class Sensor:
         self.touch.reset(torch.ones(1, dtype=torch.bool))
 
     def feel(self, t: float, data, force: float) -> np.ndarray:
-        """[5, K] N that are reported at time t s, with the rig as it stands and this contact force [N]."""
+        """Return [5, K] N that are reported at time t s, with the rig as it stands and this contact force [N]."""
         import torch
 
         x, place, m = self.engine.t, self.pad, data.model
@@ -173,7 +173,7 @@ class Sensor:
 
 
 def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[3, 3] rotation that takes the unit vector a to b (not its opposite)."""
+    """Return [3, 3] rotation that takes the unit vector a to b (not its opposite)."""
     v, c = np.cross(a, b), float(a @ b)
     k = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.eye(3) + k + k @ k / (1 + c)
@@ -189,7 +189,7 @@ def _gap(model, data, q) -> float:
 
 
 def _onset(model, u: float, v: float) -> float:
-    """Position of `press` [m] at which the ball begins to touch at (u, v)."""
+    """Return the position of `press` [m] at which the ball begins to touch at (u, v)."""
     data, low, high = mujoco.MjData(model), -0.01, 0.02
     for _ in range(20):
         middle = 0.5 * (low + high)
@@ -272,8 +272,8 @@ def pinch(given: dict[str, str]) -> None:
 
 
 def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
-    """What training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip; felt:
-    taxels of each that felt anything; lsb N a count.
+    """Return what training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip;
+    felt: taxels of each that felt anything; lsb N a count.
 
     delay, hysteresis: the median of what was found, from the lowest to the highest, where most fingertips show it;
     where fewer do, from nothing to the highest. Gains: the normal spread that makes those listed, and that the others
@@ -320,8 +320,8 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
 
 
 def spread(listed: np.ndarray, others: int) -> tuple[float, float, float]:
-    """Standard deviation (value, low, high: 90 % by the likelihood ratio) of gains about 1: `listed` ones as they are,
-    `others` known to be within LISTED only."""
+    """Return the standard deviation (value, low, high: 90 % by the likelihood ratio) of gains about 1: `listed` ones as
+    they are, `others` known to be within LISTED only."""
     from scipy.stats import norm
 
     s = np.geomspace(1e-3, 1.0, 600)
@@ -333,7 +333,7 @@ def spread(listed: np.ndarray, others: int) -> tuple[float, float, float]:
 
 
 def _near(value: float, low: float, high: float) -> dict[str, float]:
-    """The range, no further than DRAWN of the value from it."""
+    """Return the range, no further than DRAWN of the value from it."""
     low, high = max(min(low, value), value * (1 - DRAWN)), min(max(high, value), value * (1 + DRAWN))
     return {k: float(f"{x:.5g}") for k, x in (("value", value), ("low", low), ("high", high))}
 
@@ -361,7 +361,7 @@ def summed(given: dict[str, str]) -> None:
 
 
 def feels_others(path: Path) -> bool:
-    """Whether a fingertip read anything while only another fingertip touched it, in a recording of `pinch`."""
+    """Return whether a fingertip read anything while only another fingertip touched it, in a recording of `pinch`."""
     from dexsim.recording import read
 
     return bool((read(path, audit=False).tactile.value[..., 2] > 1).any())

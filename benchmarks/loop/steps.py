@@ -168,8 +168,8 @@ def dashes(believed, way: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def used(own: list, believed) -> float:
-    """Largest speed that a joint reached in recordings (99 % of the time below it), as a share of its believed no-load
-    speed, from CAREFUL to 1."""
+    """Return the largest speed that a joint reached in recordings (99 % of the time below it), as a share of its
+    believed no-load speed, from CAREFUL to 1."""
     shares = [CAREFUL]
     for r in own:
         q = r.states.position

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def draw(name: str) -> dict:
-    """The numbers of a world."""
+    """Return the numbers of a world."""
     from dexsim.assets import xhand
     from dexsim.tasks.reality import draw as other
 

@@ -65,7 +65,7 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
 
 
 def _parts(work: Callable, given: Sequence[tuple], jobs: int):
-    """Results of work(x) for each x as they come, `jobs` at a time in processes of their own."""
+    """Yield the results of work(x) for each x as they come, `jobs` at a time in processes of their own."""
     with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(work, x) for x in given]):
             yield done.result()
@@ -76,7 +76,8 @@ def _named(f: dict) -> str:
 
 
 def emps(data: Path, out: Path, jobs: int) -> dict:
-    """Fitted on the estimation data, judged on the pulses; in closed loop, and driven by the recorded force alone."""
+    """Return the fitted on the estimation data, judged on the pulses; in closed loop, and driven by the recorded force
+    alone."""
     from benchmarks.real import emps_force as force
     from benchmarks.real.convert_emps import REFERENCE, convert
     from dexsim.gap.diagnosis import Settings, diagnose, save
@@ -150,8 +151,8 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
 
 
 def _emps_parameters(d) -> dict[str, float]:
-    """Mass, viscous and dry friction, offset of the fitted drive as servo.yaml and the nuisances have them, in the
-    literature's terms."""
+    """Return the mass, viscous and dry friction, offset of the fitted drive as servo.yaml and the nuisances have them,
+    in the literature's terms."""
     from dexsim.actuator.columns import INDEX
 
     row = d.servo.nominal(("carriage",))[0]
@@ -166,7 +167,8 @@ def _emps_parameters(d) -> dict[str, float]:
 
 
 def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
-    """Twenty motions to fit (or `fit` of them, evenly), ten held out; joint by joint, the others' motion prescribed."""
+    """Return the twenty motions to fit (or `fit` of them, evenly), ten held out; joint by joint, the others' motion
+    prescribed."""
     from benchmarks.real.convert_sage import JOINTS, convert
 
     made = convert(data, out / "recordings")
@@ -229,7 +231,8 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
 
 
 def ergocub(data: Path, out: Path, jobs: int) -> dict:
-    """Each run of a finger alone, every fourth clip kept out; and each finger's runs together, every third kept out."""
+    """Return each run of a finger alone, every fourth clip kept out; and each finger's runs together, every third
+    kept out."""
     from benchmarks.real.convert_ergocub import FINGERS, held_out
 
     work = [(data, out, run, which, (run,), ()) for which, runs in FINGERS.items() for run in runs]
@@ -297,8 +300,8 @@ def figure(result: dict, path: Path) -> None:
 
 
 def folder(name: str, given: str | None) -> Path | None:
-    """The folder of a data set; None where none was given and none lies beside the project. UserError where the given
-    one is not there."""
+    """Return the folder of a data set; None where none was given and none lies beside the project. UserError where
+    the given one is not there."""
     root = Path(given).expanduser() if given else Path("../shared/realdata")
     inner = root / FOLDERS[name]
     if inner.is_dir():

@@ -59,7 +59,7 @@ def save(
 
 
 def dump(path: Path, content: dict) -> Path:
-    """A YAML file."""
+    """Return a YAML file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return path

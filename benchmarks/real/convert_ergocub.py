@@ -145,8 +145,8 @@ def cycles(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[i
 
 
 def refused(t: np.ndarray, set_: np.ndarray, read: np.ndarray) -> np.ndarray:
-    """[n] whether the drive gives another duty than is set: where what is read back (1 is full) differs by more than
-    `UNLIKE` for `SETTLES` s or longer, by which it has followed. Nowhere where nothing is read back."""
+    """Return [n] whether the drive gives another duty than is set: where what is read back (1 is full) differs by
+    more than `UNLIKE` for `SETTLES` s or longer, by which it has followed. Nowhere where nothing is read back."""
     if np.ptp(read) == 0:
         return np.zeros(len(t), bool)
     samples = max(int(round(SETTLES / float(np.median(np.diff(t))))), 1)
@@ -154,8 +154,8 @@ def refused(t: np.ndarray, set_: np.ndarray, read: np.ndarray) -> np.ndarray:
 
 
 def driven(t: np.ndarray, set_: np.ndarray, read: np.ndarray, given: np.ndarray) -> list[tuple[int, int]]:
-    """First and last samples (exclusive) of the stretches in which the motor was on: but for those longer than `OFF` in
-    which a duty was set, and none was given nor read back."""
+    """Return the first and last samples (exclusive) of the stretches in which the motor was on: but for those longer
+    than `OFF` in which a duty was set, and none was given nor read back."""
     off = (np.abs(read) < 1) & (np.abs(given) < 1) & (set_ != 0)
     edges = np.flatnonzero(np.diff(np.r_[0, off.astype(int), 0]))
     cut = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if t[min(b, len(t) - 1)] - t[a] > OFF]
@@ -178,8 +178,8 @@ def _clips(t: np.ndarray, duty: np.ndarray, q: np.ndarray) -> list[tuple[int, in
 
 
 def repeat_noise(data: Path, name: str) -> float:
-    """What strokes at one duty differ by from one to the next, each from where it began [rad, rms over root 2]; NaN
-    where none repeats."""
+    """Return what strokes at one duty differ by from one to the next, each from where it began [rad, rms over root
+    2]; NaN where none repeats."""
     raw = np.load(data / f"{name}.npz")
     t, duty, q = raw["t"], raw["pwm_set"], np.radians(raw["theta_deg"])
     edges = np.r_[0, np.flatnonzero(np.diff(duty) != 0) + 1, len(t)]

@@ -58,9 +58,9 @@ def convert(data: Path, out: Path) -> Panda:
 
 
 def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:
-    """What a plain least squares makes of the first `share` of the trajectory, by joint: Coulomb, viscous friction and
-    offset on the torque less the rigid body (central derivatives by a local polynomial), with 90 % of a block
-    bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m). Shares no code with the tool but how blocks are
+    """Return what a plain least squares makes of the first `share` of the trajectory, by joint: Coulomb, viscous
+    friction and offset on the torque less the rigid body (central derivatives by a local polynomial), with 90 % of a
+    block bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m). Shares no code with the tool but how blocks are
     drawn."""
     raw = np.load(data / FILE)
     model = mujoco.MjModel.from_xml_path(str(data / "panda.xml"))

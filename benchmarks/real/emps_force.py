@@ -33,7 +33,7 @@ def open_loop(
     by_direction: float = 0.0,
     late: float = 0.0,
 ) -> float:
-    """RMSE [m] of the position that the recorded force alone gives, acting `late` s late:
+    """Return RMSE [m] of the position that the recorded force alone gives, acting `late` s late:
     M a = F - Fv v - by_direction |v| - (Fc + peak exp(-(v/v_s)^2)) sign(v) - offset."""
     dt = float(np.median(np.diff(t))) / SUBSTEPS
     if late:

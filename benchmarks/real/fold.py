@@ -9,7 +9,7 @@ from typing import Any
 
 
 def fold(job: tuple[Path, Path, int]) -> dict:
-    """One gain of BAM left out: fitted on the other three, judged on its four recordings."""
+    """Return one gain of BAM left out: fitted on the other three, judged on its four recordings."""
     from benchmarks.real.convert_bam import convert
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
@@ -44,7 +44,7 @@ def fold(job: tuple[Path, Path, int]) -> dict:
 
 
 def joint(job: tuple[Any, Path, str]) -> dict:
-    """One joint of SAGE: fitted on the motions to fit, judged on those held out."""
+    """Return one joint of SAGE: fitted on the motions to fit, judged on those held out."""
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
 
@@ -142,7 +142,7 @@ def _milli(x: float | None) -> float | None:
 
 
 def _log(out: Path, name: str):
-    """Progress of a part into out/NAME.log."""
+    """Return the progress of a part into out/NAME.log."""
     out.mkdir(parents=True, exist_ok=True)
     path, begin = out / f"{name}.log", time.perf_counter()
     path.write_text("", encoding="utf-8")
@@ -155,13 +155,13 @@ def _log(out: Path, name: str):
 
 
 def _keep(out: Path, name: str, result: dict) -> dict:
-    """The result, written to out/NAME.json as well."""
+    """Return the result, written to out/NAME.json as well."""
     (out / f"{name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
     return result
 
 
 def brief(f: dict) -> dict:
-    """A finding without its stretches of time."""
+    """Return a finding without its stretches of time."""
     return {
         k: f.get(k)
         for k in (

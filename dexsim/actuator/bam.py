@@ -100,8 +100,8 @@ class Bam(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read(path: str | Path) -> Bam:
-    """A BAM parameter file. Raises UserError: not JSON, a parameter unknown, missing or impossible, a motor that is not
-    driven by voltage."""
+    """Return a BAM parameter file. Raises UserError: not JSON, a parameter unknown, missing or impossible, a motor
+    that is not driven by voltage."""
     path = Path(path).expanduser()
     text = files.text(path, files.MAX_YAML, "BAM file")
     try:
@@ -125,7 +125,7 @@ def read(path: str | Path) -> Bam:
 
 
 def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> dict[str, Any]:
-    """The content of a servo table: kp duty per rad, supply_voltage V. The rotor's inertia is the model's or
+    """Return the content of a servo table: kp duty per rad, supply_voltage V. The rotor's inertia is the model's or
     hand.yaml's (`armature`). BAM's duty is cut at 1, as here. Raises UserError for a figure that no column takes."""
     columns = {
         "kp": float(kp) * bam.error_gain_ratio,
@@ -149,8 +149,8 @@ def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> di
 
 
 def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl330") -> dict[str, Any]:
-    """The content of a BAM file of one joint, of the first model of m1 to m6 that can say it. Raises UserError where
-    the table has what BAM has not, or lacks what it needs."""
+    """Return the content of a BAM file of one joint, of the first model of m1 to m6 that can say it. Raises
+    UserError where the table has what BAM has not, or lacks what it needs."""
     where = f"{table.source}: joints.{joint}"
     if table.drive != "voltage" or table.supply_voltage is None:
         raise UserError(f"{where}: BAM's motors are driven by voltage; state drive: voltage and supply_voltage")
@@ -184,7 +184,7 @@ def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl33
 
 
 def _model(said: Mapping[str, float]) -> str:
-    """The first model that has all of a table's columns."""
+    """Return the first model that has all of a table's columns."""
     falls = said["stribeck_peak"] > 0
     if not any(said[name] for name in LOADED):
         return "m2" if falls else "m1"

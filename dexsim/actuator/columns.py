@@ -425,7 +425,7 @@ state, a vector for the laws."""
 
 
 def simulated(features: frozenset[str]) -> list[int]:
-    """Indices of the columns that a servo built with these features looks at."""
+    """Return the indices of the columns that a servo built with these features looks at."""
     return [i for i, c in enumerate(COLUMNS) if not c.feature or c.feature in features]
 
 
@@ -436,7 +436,7 @@ def did_you_mean(name: str, valid: Iterable[object]) -> str:
 
 
 def column(name: str) -> Column:
-    """The column called `name`; UserError with the valid names otherwise."""
+    """Return the column called `name`; UserError with the valid names otherwise."""
     if name not in INDEX:
         hint = did_you_mean(name, NAMES)
         raise UserError(f"servo column '{name}' does not exist.{hint} Valid columns: {', '.join(NAMES)}")
@@ -444,7 +444,7 @@ def column(name: str) -> Column:
 
 
 def describe() -> str:
-    """A text table of all columns: name, unit, neutral value, allowed range, meaning."""
+    """Return a text table of all columns: name, unit, neutral value, allowed range, meaning."""
     rows = [("column", "unit", "neutral", "range", "meaning")]
     rows += [(c.name, c.unit, f"{c.neutral:g}", f"{c.low:g} .. {c.high:g}", c.text) for c in COLUMNS]
     widths = [max(len(r[i]) for r in rows) for i in range(4)]

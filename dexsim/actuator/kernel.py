@@ -118,8 +118,8 @@ REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 @cache
 def drives(real: type) -> Any:
-    """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in
-    `servo.Servo`."""
+    """Return the struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units
+    as in `servo.Servo`."""
 
     @wp.struct
     class Drives:
@@ -156,7 +156,7 @@ def drives(real: type) -> Any:
 
 @wp.func
 def target_in_force(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, end: Any, dt: Any):
-    """The target [rad], mean over the step of dt [s] that ends at `end`, less the delay (`laws.arrived`)."""
+    """Return the target [rad], mean over the step of dt [s] that ends at `end`, less the delay (`laws.arrived`)."""
     target = state[w, j, QUEUE + queue]
     for k in range(1, queue):
         part = arrived(end, state[w, j, QUEUE + k], dt)
@@ -170,8 +170,8 @@ def target_in_force(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, en
 
 @wp.func
 def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin: Any, dt: Any):
-    """(speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt] of what is
-    in force (`laws.difference`, `laws.hold`): begin is the step's, less the delay."""
+    """Return (speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt]
+    of what is in force (`laws.difference`, `laws.hold`): begin is the step's, less the delay."""
     speed = begin * type(begin)(0.0)
     acceleration = begin * type(begin)(0.0)
     rate = begin * type(begin)(0.0)
@@ -191,7 +191,7 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
 
 @cache
 def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset()) -> wp.Kernel:
-    """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and
+    """Return the kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and
     `FEATURES`.
 
     Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
@@ -254,8 +254,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def locate(dt: real, x0: int, fresh: bool, d: Drives, w: int, j: int):
-        """The rotor where the last step's v' has left it; writes its slot and the armature of what stays with the
-        joint."""
+        """Return the rotor where the last step's v' has left it; writes its slot and the armature of what stays with
+        the joint."""
         r = Rotor()
         r.v = d.qvel[w, d.dof[j]]
         if wp.static(play):
@@ -277,7 +277,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def sense(dt: real, fresh: bool, r: Rotor, memory: Memory, d: Drives, w: int, j: int):
-        """(what the loop's encoder shows, memory)."""
+        """Return (what the loop's encoder shows, memory)."""
         turned = d.qpos[w, d.loop_q[j]]
         turning = d.qvel[w, d.loop_dof[j]]
         if wp.static(play):
@@ -300,7 +300,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def remaining(dt: real, fresh: bool, last: real, memory: Memory, d: Drives, w: int, j: int):
-        """(what the supply and the temperature leave of the motor, memory); last: its torque of the step before."""
+        """Return (what the supply and the temperature leave of the motor, memory); last: its torque of the step
+        before."""
         m = Motor()
         left, kept = motor(d.params[w, j], d.params[w, j, WARMTH], last, wp.static(voltage), memory, fresh, dt)
         m.tau0 = left[0]
@@ -328,8 +329,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         w: int,
         j: int,
     ):
-        """((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at
-        which its integral waits."""
+        """Return ((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the
+        limits, at which its integral waits."""
         waits, kept = late(d.params[w, j], d.time[w], memory, fresh, dt)
         end = d.time[w] - waits + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
@@ -366,7 +367,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def drive_voltage(u: vec3, v: real, m: Motor):
-        """What a voltage drive gives of a duty."""
+        """Return what a voltage drive gives of a duty."""
         line = m.tau0 / m.no_load
         t = Torque()
         t.now = voltage_torque(u[0], m.tau0, m.supply, line, v)
@@ -386,7 +387,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     def drive_torque(
         dt: real, u: vec3, v: real, x: real, lower: real, upper: real, steep: real, inertia: real, m: Motor
     ):
-        """What a torque drive gives of a torque; x: |v| over the no-load speed; steep: `braking_slope`."""
+        """Return what a torque drive gives of a torque; x: |v| over the no-load speed; steep: `braking_slope`."""
         t = Torque()
         t.now = wp.clamp(u[0], -lower, upper)
         t.end = wp.clamp(u[1], -lower, upper)
@@ -425,7 +426,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         w: int,
         j: int,
     ):
-        """(the motor's torque after its lag, memory); writes what the current shows."""
+        """Return (the motor's torque after its lag, memory); writes what the current shows."""
         t = Torque()
         kept = memory
         if wp.static(voltage):
@@ -469,7 +470,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     def resist(
         dt: real, x0: int, fresh: bool, last: real, r: Rotor, factor: real, memory: Memory, d: Drives, w: int, j: int
     ):
-        """(friction at the motor's speed, memory); last: its torque of the step before."""
+        """Return (friction at the motor's speed, memory); last: its torque of the step before."""
         f = Friction()
         f.viscous = d.params[w, j, VISCOUS] * factor
         if wp.static(shape):
@@ -503,8 +504,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def couple(dt: real, t: Torque, f: Friction, r: Rotor, stiffness: real, d: Drives, w: int, j: int):
-        """(torque on the link T, its slope D in the link's speed, A, B): the rotor's step as a line w' = A + B v',
-        "Play and elasticity". stiffness: of the loop [N.m/rad]."""
+        """Return (torque on the link T, its slope D in the link's speed, A, B): the rotor's step as a line w' = A +
+        B v', "Play and elasticity". stiffness: of the loop [N.m/rad]."""
         q = d.qpos[w, d.dof_q[j]]
         v = d.qvel[w, d.dof[j]]
         gap2 = real(0.5) * d.params[w, j, BACKLASH]
@@ -697,7 +698,7 @@ def reset_kernel(real: type, extended: bool = False) -> wp.Kernel:
 
 @cache
 def given_kernel(real: type) -> wp.Kernel:
-    """What all motors of a world give, from the last step: sum of |torque| [N.m], for a supply that sags."""
+    """Return what all motors of a world give, from the last step: sum of |torque| [N.m], for a supply that sags."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def given(joints: int, torque: wp.array2d(dtype=real), out: wp.array(dtype=real)):

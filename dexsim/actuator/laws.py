@@ -59,15 +59,16 @@ def eccentricity(q: Any, sine: Any, cosine: Any):
 
 @wp.func
 def encoder_line(q: Any, scale: Any, offset: Any):
-    """Position [rad] that an encoder of this scale and offset [rad] shows at q [rad], but for `encoder_error`: scale *
-    q + offset. A scale of 1 and no offset by definition of a right one; ours, as far as it is off."""
+    """Return the position [rad] that an encoder of this scale and offset [rad] shows at q [rad], but for
+    `encoder_error`: scale * q + offset. A scale of 1 and no offset by definition of a right one; ours, as far as it
+    is off."""
     return scale * q + offset
 
 
 @cache
 def encoder_error(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what an encoder shows beyond scale * q + offset, as a sum of laws of the position, for a
-    kernel with these of `columns.FEATURES`.
+    """Return the Warp function of what an encoder shows beyond scale * q + offset, as a sum of laws of the position,
+    for a kernel with these of `columns.FEATURES`.
 
     A further such law is a function of this file and a term of `error` and `slope` here, and in
     `reference.measured_position`; its columns are marked `encoder`. Training, search, recordings and whoever asks what
@@ -76,8 +77,8 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
 
     @wp.func
     def error(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool):
-        """(first, error, slope): first + error [rad] at position q [rad] of what the encoder turns with, and the slope
-        of that in q. Two parts, since each kernel keeps the order of its sum, as of `dry_friction`."""
+        """Return (first, error, slope): first + error [rad] at position q [rad] of what the encoder turns with, and
+        the slope of that in q. Two parts, since each kernel keeps the order of its sum, as of `dry_friction`."""
         first = type(q)(0.0)
         error = type(q)(0.0)
         slope = type(q)(0.0)
@@ -94,8 +95,8 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
 
 @cache
 def encoder_memory(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function that brings what an encoder remembers to a step's begin, before it is read there: once a step,
-    for a kernel with these of `columns.FEATURES`. None of our encoders remembers.
+    """Return the Warp function that brings what an encoder remembers to a step's begin, before it is read there:
+    once a step, for a kernel with these of `columns.FEATURES`. None of our encoders remembers.
 
     A further encoder's error with a memory (teeth with a play, an output that settles) has its law for that here, and
     in `reference.encoder_memory`; what it shows by it, in `encoder_error`."""
@@ -113,7 +114,7 @@ def encoder_memory(features: frozenset[str] = frozenset()) -> Any:
 
 @cache
 def command_delay(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of how long after its time a target acts, as a sum of laws of the time and of what is
+    """Return the Warp function of how long after its time a target acts, as a sum of laws of the time and of what is
     remembered, for a kernel with these of `columns.FEATURES`.
 
     A further such law (a delay that varies, or grows) is a function of this file and a term of `late` here, and in
@@ -138,8 +139,8 @@ def arrived(end: Any, stamp: Any, dt: Any):
 
 @cache
 def dragged_target(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of how far another joint (column `coupling_from`) drags a joint's target, as a sum of laws of
-    where that is, for a kernel with these of `columns.FEATURES`.
+    """Return the Warp function of how far another joint (column `coupling_from`) drags a joint's target, as a sum of
+    laws of where that is, for a kernel with these of `columns.FEATURES`.
 
     A further such law (a tendon that is slack at first, one that gives) is a function of this file and a term of
     `shift` here, and in `reference.dragged_target`; it needs the feature `rare`."""
@@ -168,15 +169,16 @@ def lag_share(time: Any, dt: Any):
 
 @wp.func
 def stage_before(before: Any, after: Any, share: Any):
-    """What went into a first-order lag [N.m, or what it lags] whose output went from `before` to `after` in a step of
-    this `lag_share`: u = before + (after - before) / share, of a lag of second order the first stage, where the output
-    of the second is known (source: `lag_share`, solved for u)."""
+    """Return what went into a first-order lag [N.m, or what it lags] whose output went from `before` to `after` in a
+    step of this `lag_share`: u = before + (after - before) / share, of a lag of second order the first stage, where
+    the output of the second is known (source: `lag_share`, solved for u)."""
     return before + (after - before) / share
 
 
 @cache
 def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> Any:
-    """The Warp function of the speed that a loop's gain kd acts on, for a kernel with these of `columns.FEATURES`;
+    """Return the Warp function of the speed that a loop's gain kd acts on, for a kernel with these of
+    `columns.FEATURES`;
     skips: whether a filter without a lag passes the speed as it is, where it else comes out but for rounding: each
     kernel keeps its own, as of `dry_friction`.
 
@@ -185,8 +187,8 @@ def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> 
 
     @wp.func
     def heard(of: wp.array(dtype=Any), v: Any, memory: Any, fresh: bool, dt: Any):
-        """((now, end, share), memory): speed [rad/s] of what the encoder turns with as kd has it now, and at the end of
-        a step of dt [s] in which v does not change; share of a change of v that passes in the step.
+        """Return ((now, end, share), memory): speed [rad/s] of what the encoder turns with as kd has it now, and at
+        the end of a step of dt [s] in which v does not change; share of a change of v that passes in the step.
 
         A first-order lag (column `speed_lag`)."""
         now = v
@@ -209,8 +211,8 @@ def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> 
 
 @wp.func
 def warmed(per_degree: Any, warmth: Any):
-    """Factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree [1/degC] *
-    warmth [degC].
+    """Return the factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree
+    [1/degC] * warmth [degC].
 
     Copper's resistance has +0.0039 (IEC 60028), the magnets' flux about -0.001 (NdFeB) per degree; grease gets
     thinner."""
@@ -219,7 +221,7 @@ def warmed(per_degree: Any, warmth: Any):
 
 @cache
 def warm_motor(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what a motor can do as it is now, for a kernel with these of `columns.FEATURES`.
+    """Return the Warp function of what a motor can do as it is now, for a kernel with these of `columns.FEATURES`.
 
     A further such law (a motor that heats up as it works, one that weakens) is a function of this file and a term of
     `warm`, or a factor of what is returned, here, and in `reference.warm_motor`: training, search and what a diagnosis
@@ -229,8 +231,9 @@ def warm_motor(features: frozenset[str] = frozenset()) -> Any:
     def motor(
         of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any
     ):
-        """((stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction), memory) of a drive `warmth`
-        [degC] above the temperature that its figures hold at (`warmed`); torque: what it gave in the step before [N.m].
+        """Return ((stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction), memory) of a
+        drive `warmth` [degC] above the temperature that its figures hold at (`warmed`); torque: what it gave in the
+        step before [N.m].
 
         The torque constant k is Nm/A and V.s/rad in one. A voltage drive's stall torque k u / R and no-load speed u / k
         follow from it and from the resistance R; a torque drive asks for a current, and k is lost on the way to the
@@ -256,8 +259,8 @@ def warm_motor(features: frozenset[str] = frozenset()) -> Any:
 
 @cache
 def amplifier(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what the power stage gives of the torque that is asked of it, before the current's lag
-    (column `lag`), for a kernel with these of `columns.FEATURES`. Ours gives all of it.
+    """Return the Warp function of what the power stage gives of the torque that is asked of it, before the current's
+    lag (column `lag`), for a kernel with these of `columns.FEATURES`. Ours gives all of it.
 
     A further such law (a dead band of the current, a torque that can only change so fast, steps of a converter) is a
     function of this file and one more step from what is asked to what is given here, and in `reference.amplifier`:
@@ -265,8 +268,9 @@ def amplifier(features: frozenset[str] = frozenset()) -> Any:
 
     @wp.func
     def given(of: wp.array(dtype=Any), asked: Any, end: Any, memory: Any, fresh: bool, dt: Any):
-        """((now, end, share), memory): torque [N.m] given where `asked` is asked now, and at the end of a step of dt
-        [s], where `end` would be at unchanged speed; share of a change of what is asked that passes in the step."""
+        """Return ((now, end, share), memory): torque [N.m] given where `asked` is asked now, and at the end of a
+        step of dt [s], where `end` would be at unchanged speed; share of a change of what is asked that passes in
+        the step."""
         now = asked
         then = end
         share = type(end)(1.0)
@@ -284,7 +288,7 @@ def sagging(supply: Any, per_torque: Any, others: Any):
 
 @cache
 def supply_left(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what is left of a supply that other motors load, for a kernel with these of
+    """Return the Warp function of what is left of a supply that other motors load, for a kernel with these of
     `columns.FEATURES`.
 
     A further such law (a battery that empties, a converter that limits) is a function of this file and one more step
@@ -317,22 +321,22 @@ def sagged_torque(others: Any, per_own: Any, torque: Any):
 
 @wp.func
 def duty_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
-    """Torque [N.m] of a DC motor at a duty of its supply: tau0 * supply * duty - line * v, line = stall torque over
-    no-load speed [N.m.s/rad]. Kirchhoff's law of the armature, R i = u - k v with torque = k i, without an
+    """Return the torque [N.m] of a DC motor at a duty of its supply: tau0 * supply * duty - line * v, line = stall
+    torque over no-load speed [N.m.s/rad]. Kirchhoff's law of the armature, R i = u - k v with torque = k i, without an
     inductance."""
     return tau0 * supply * duty - line * v
 
 
 @wp.func
 def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
-    """Torque [N.m] of a drive that cannot give more than its supply: tau0 * supply * clip(duty, -1, 1) - line * v, as
-    of `duty_torque` (source: there)."""
+    """Return torque [N.m] of a drive that cannot give more than its supply: tau0 * supply * clip(duty, -1, 1) - line
+    * v, as of `duty_torque` (source: there)."""
     return duty_torque(wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)), tau0, supply, line, v)
 
 
 @wp.func
 def torque_limit(tau0: Any, x: Any, slope: Any):
-    """Largest torque [N.m] of a motor: tau0 * max(0, 1 - slope * x), x = |speed| / no-load speed at the supply's
+    """Return largest torque [N.m] of a motor: tau0 * max(0, 1 - slope * x), x = |speed| / no-load speed at the supply's
     voltage.
 
     tau0: stall torque [N.m]. slope: 1 while the motor drives (the torque-speed line of a DC motor at its full voltage),
@@ -363,10 +367,10 @@ def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
 
 @wp.func
 def transmission(turn: Any, stiff: Any, hardening: Any):
-    """(torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening t^2), t =
-    stiff * turn; its stiffness is 1 + 3 hardening t^2 times as large. A cubic hardening spring, as harmonic drives show
-    (T. Tuttle, W. Seering, A nonlinear model of a harmonic drive gear transmission, IEEE Trans. Robotics and Automation
-    12, 1996)."""
+    """Return (torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening
+    t^2), t = stiff * turn; its stiffness is 1 + 3 hardening t^2 times as large. A cubic hardening spring, as
+    harmonic drives show (T. Tuttle, W. Seering, A nonlinear model of a harmonic drive gear transmission, IEEE Trans.
+    Robotics and Automation 12, 1996)."""
     stretch = stiff * turn
     harder = type(turn)(1.0) + hardening * stretch * stretch
     return wp.vector(stretch * harder, (type(turn)(3.0) * harder - type(turn)(2.0)) * stiff)
@@ -374,7 +378,7 @@ def transmission(turn: Any, stiff: Any, hardening: Any):
 
 @wp.func
 def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: Any):
-    """Damping [N.m.s/rad] of a spring [N.m/rad] between two inertias [kg.m2] at the damping ratio `rebound`:
+    """Return the damping [N.m.s/rad] of a spring [N.m/rad] between two inertias [kg.m2] at the damping ratio `rebound`:
     2 rebound sqrt(stiff * rotor * link / both), both = rotor + link. By definition of the damping ratio of one mass on
     a spring, at the reduced mass of the two."""
     return type(stiff)(2.0) * rebound * wp.sqrt(stiff * rotor * link / both)
@@ -399,9 +403,9 @@ def stribeck_power(ratio: Any, exponent: Any):
 
 @wp.func
 def viscous(high: Any, more: Any, half: Any, v: Any):
-    """Friction per speed [N.m.s/rad] of grease that thins as it is sheared, at speed v [rad/s]: high + more / (1 +
-    |v| / half), high: what is left of it at any speed, more: what is beyond that at rest, half: speed [rad/s] at which
-    half of that is left.
+    """Return friction per speed [N.m.s/rad] of grease that thins as it is sheared, at speed v [rad/s]: high + more /
+    (1 + |v| / half), high: what is left of it at any speed, more: what is beyond that at rest, half: speed [rad/s]
+    at which half of that is left.
 
     Cross's law of a shear-thinning fluid, with its exponent 1 (M. Cross, Rheology of non-Newtonian fluids: a new flow
     equation for pseudoplastic systems, J. Colloid Science 20, 1965). It is nowhere negative: with the speed of a step's
@@ -458,7 +462,8 @@ def opposed_square(motor: Any, outside: Any, per_motor: Any, per_outside: Any):
 
 @cache
 def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf) -> Any:
-    """The Warp function of a drive's dry friction, as a sum of laws, for a kernel with these of `columns.FEATURES`;
+    """Return the Warp function of a drive's dry friction, as a sum of laws, for a kernel with these of
+    `columns.FEATURES`;
     gone: `stribeck_power` from which on nothing of the column `stribeck_peak` is left.
 
     A further such law is a function of this file and a term of `steady` here, and in `reference.dry_friction`:
@@ -478,9 +483,9 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
         fresh: bool,
         dt: Any,
     ):
-        """(level [N.m], memory), the level as four parts of a sum: what neither speed nor load changes; what falls with
-        speed; by the load; by the load and falling with speed. Four, since in finite precision a sum depends on its
-        order, and each kernel keeps its own, so that results made before can be made again bit for bit.
+        """Return (level [N.m], memory), the level as four parts of a sum: what neither speed nor load changes; what
+        falls with speed; by the load; by the load and falling with speed. Four, since in finite precision a sum
+        depends on its order, and each kernel keeps its own, so that results made before can be made again bit for bit.
 
         q, v: position [rad] of the joint and speed [rad/s] of the motor; motor: torque [N.m] of the step before;
         outside: what the joint felt from outside then; carries: whether that, or a column of the feature `load`,
@@ -512,8 +517,8 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
 
 @cache
 def friction_acts(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of how a level of dry friction (`dry_friction`) acts on the joint, as sums of laws of position,
-    speed and what is remembered, for a kernel with these of `columns.FEATURES`.
+    """Return the Warp function of how a level of dry friction (`dry_friction`) acts on the joint, as sums of laws of
+    position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
 
     A further such law (friction that differs by direction at one side of the turn, a seal that gives way farther after
     a rest) is a function of this file and a term here, and in `reference.friction_acts`: training, search and what a
@@ -521,9 +526,9 @@ def friction_acts(features: frozenset[str] = frozenset()) -> Any:
 
     @wp.func
     def acts(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
-        """((uneven, give), memory) at position q [rad] of the joint and speed v [rad/s] of the motor. uneven: the level
-        moving positive is 1 + uneven of the mean of both directions, moving negative 1 - uneven; give: how far the
-        joint gives way before it slides [rad], 0 not at all (`preslide`)."""
+        """Return ((uneven, give), memory) at position q [rad] of the joint and speed v [rad/s] of the motor. uneven:
+        the level moving positive is 1 + uneven of the mean of both directions, moving negative 1 - uneven; give: how
+        far the joint gives way before it slides [rad], 0 not at all (`preslide`)."""
         uneven = type(v)(0.5) * of[ASYMMETRY]
         give = type(v)(0.0)
         if wp.static("presliding" in features):
@@ -544,8 +549,8 @@ def preslide(taken: Any, turned: Any):
 
 @wp.func
 def preslide_slope(taken: Any, turned: Any):
-    """Slope [1] of `preslide` from no turn to this one, (z' - z) / y = (1 - z sign(y)) / (1 + |y|) >= 0: of a line in
-    the turn that is right at both ends (source: there)."""
+    """Return slope [1] of `preslide` from no turn to this one, (z' - z) / y = (1 - z sign(y)) / (1 + |y|) >= 0: of a
+    line in the turn that is right at both ends (source: there)."""
     ahead = taken  # what of it lies in the direction of the turn; from rest either way
     if turned < type(turned)(0.0):
         ahead = -taken
@@ -556,8 +561,8 @@ def preslide_slope(taken: Any, turned: Any):
 
 @wp.func
 def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
-    """Speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) + level z'
-    = 0. Ours, for Dahl's law.
+    """Return speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) +
+    level z' = 0. Ours, for Dahl's law.
 
     a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction;
     level [N.m]; w = presliding / step: the speed that takes up all of the friction in one step."""
@@ -579,9 +584,9 @@ def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
 
 @wp.func
 def ripple_wave(angle: Any, shape: Any):
-    """(value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0 sin(angle),
-    1 a sawtooth that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and jumps up at 0;
-    mixtures between. Ours, for a wave that is no sine: a sawtooth's Fourier series has all harmonics."""
+    """Return (value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0
+    sin(angle), 1 a sawtooth that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and
+    jumps up at 0; mixtures between. Ours, for a wave that is no sine: a sawtooth's Fourier series has all harmonics."""
     value = wp.sin(angle)
     slope = wp.cos(angle)
     if shape != type(angle)(0.0):
@@ -602,16 +607,16 @@ def ripple_wave(angle: Any, shape: Any):
 
 @cache
 def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of all torque of a drive that neither its motor is asked for nor is dry friction, as a sum of
-    laws of position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
+    """Return the Warp function of all torque of a drive that neither its motor is asked for nor is dry friction, as
+    a sum of laws of position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
 
     A further such law is a function of this file and a term here, and in `reference.parasitic_torque`: training, search
     and what a diagnosis hands on take their torque from these two."""
 
     @wp.func
     def parasitic(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
-        """((torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]), memory) at position q [rad] of
-        the joint and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
+        """Return ((torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]), memory) at position q
+        [rad] of the joint and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
         torque = type(q)(0.0)
         by_position = type(q)(0.0)
         by_speed = type(v)(0.0)
@@ -629,9 +634,9 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
 
 @wp.func
 def stand_in(constant: Any, by_position: Any, by_speed: Any, by_square: Any, q: Any, v: Any):
-    """(torque [N.m], its slope [N.m.s/rad] in the speed) that stands in for what is not known of a drive, at position q
-    [rad] and speed v [rad/s] of the joint: constant + by_position q + (by_speed + by_square |v|) v. Ours, for the
-    columns `standin_*`."""
+    """Return (torque [N.m], its slope [N.m.s/rad] in the speed) that stands in for what is not known of a drive, at
+    position q [rad] and speed v [rad/s] of the joint: constant + by_position q + (by_speed + by_square |v|) v. Ours,
+    for the columns `standin_*`."""
     brake = by_speed + by_square * wp.abs(v)
     return wp.vector(constant + by_position * q + brake * v, brake)
 
@@ -653,8 +658,8 @@ def stand_in(constant: Any, by_position: Any, by_speed: Any, by_square: Any, q: 
 
 @cache
 def lost_error(features: frozenset[str] = frozenset()) -> Any:
-    """The Warp function of what of its error a loop does not act on, as a sum of laws of the target, the error and what
-    is remembered, for a kernel with these of `columns.FEATURES`.
+    """Return the Warp function of what of its error a loop does not act on, as a sum of laws of the target, the
+    error and what is remembered, for a kernel with these of `columns.FEATURES`.
 
     A further such law (another dead zone, an error that is limited, a target that is rounded or smoothed, a position
     that the loop has filtered) is a function of this file and a term of `lost` and `slope` here, and in
@@ -662,8 +667,8 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
 
     @wp.func
     def lost_of(of: wp.array(dtype=Any), target: Any, e: Any, memory: Any, fresh: bool, dt: Any):
-        """((lost, slope, acts), memory): lost [rad] of the error e [rad] to a target [rad]; its slope in e at that
-        target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
+        """Return ((lost, slope, acts), memory): lost [rad] of the error e [rad] to a target [rad]; its slope in e at
+        that target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
 
         The deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2
         it counts from the edge on."""
@@ -699,9 +704,9 @@ def pd(
     age: Any,
     share: Any,
 ):
-    """(now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a step of dt
-    [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then
-    [N.m.s/rad].
+    """Return (now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a
+    step of dt [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained
+    until then [N.m.s/rad].
 
     e: error of the measured position [rad]; lost: what of it does not count (`lost_error`). v, v_end: measured speed
     that kd acts on, now and then [rad/s]; rate: measured speed of the position; scale: what the encoder shows over what
@@ -730,7 +735,8 @@ def pd(
 
 @wp.func
 def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
-    """(now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term [N.m]; the
+    """Return (now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term
+    [N.m]; the
     integral goes on over the step: + gain * dt * (e - rate dt), gain = `integral_gain` (source: above)."""
     now = asked[0]
     end = asked[1]
@@ -746,8 +752,8 @@ def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scal
 
 @wp.func
 def feed_forward(by_speed: Any, by_acceleration: Any, speed: Any, acceleration: Any):
-    """Torque [N.m] of the feed-forward: speed_feedforward * r' + acceleration_feedforward * r'', of a target's speed
-    [rad/s] and acceleration [rad/s2] (source: above)."""
+    """Return the torque [N.m] of the feed-forward: speed_feedforward * r' + acceleration_feedforward * r'', of a
+    target's speed [rad/s] and acceleration [rad/s2] (source: above)."""
     return by_speed * speed + by_acceleration * acceleration
 
 
@@ -758,8 +764,9 @@ SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this ar
 
 @wp.func
 def difference(new: Any, old: Any, span: Any, dt: Any):
-    """Backward difference (new - old) / span [rad/s, rad/s2] of two targets [rad], or of two of their speeds, span [s]
-    apart; 0 for a jump in no time. By definition of what a drive can take from its targets; the bound is ours."""
+    """Return backward difference (new - old) / span [rad/s, rad/s2] of two targets [rad], or of two of their speeds,
+    span [s] apart; 0 for a jump in no time. By definition of what a drive can take from its targets; the bound is
+    ours."""
     rate = type(new)(0.0)
     if span > type(dt)(SHORTEST) * dt:
         rate = (new - old) / span
@@ -777,9 +784,9 @@ def hold(stamp: Any, span: Any, until: Any, begin: Any, dt: Any):
 
 @wp.func
 def wind(integral: Any, step: Any, asked: Any, lower: Any, upper: Any):
-    """The integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for, with it, is
-    beyond the limits -lower .. upper and the step would take it further (conditional integration: K. Astrom, T.
-    Hagglund, PID Controllers, 2nd ed. 1995, section 3.5)."""
+    """Return the integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for,
+    with it, is beyond the limits -lower .. upper and the step would take it further (conditional integration: K.
+    Astrom, T. Hagglund, PID Controllers, 2nd ed. 1995, section 3.5)."""
     if (asked > upper and step > type(step)(0.0)) or (asked < -lower and step < type(step)(0.0)):
         return integral
     return integral + step

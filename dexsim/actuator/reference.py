@@ -37,8 +37,9 @@ def over_time(
     *signals: np.ndarray,
     features: Collection[str] = FEATURES,
 ) -> Any:
-    """What a law of this file (`lost_error`, `parasitic_torque`, `shown_position`, ...) answers to signals [S] at the
-    times t [S] s, from rest at the first: one after the other where a column p of it remembers, else at once."""
+    """Return what a law of this file (`lost_error`, `parasitic_torque`, `shown_position`, ...) answers to signals
+    [S] at the times t [S] s, from rest at the first: one after the other where a column p of it remembers, else at
+    once."""
     step = Step()
     begun = dict(step.memory)
     out = law(p, *signals, features, step)
@@ -59,8 +60,8 @@ def measured_position(
     xp: Any = np,
     step: Step | None = None,
 ) -> tuple[Any, Any]:
-    """(position [...] rad that an encoder shows where what it turns with is at q [...] rad, its slope in q): scale,
-    offset and all terms of `laws.encoder_error`.
+    """Return (position [...] rad that an encoder shows where what it turns with is at q [...] rad, its slope in q):
+    scale, offset and all terms of `laws.encoder_error`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; xp: whose arrays these are, `numpy` or
     `torch`: a servo says with this what its encoders report; step: what they remember, None from rest."""
@@ -73,8 +74,8 @@ def measured_position(
 
 
 def encoder_memory(p: Mapping[str, Numbers], q: Numbers, features: Collection[str], step: Step) -> Step:
-    """The step with what an encoder remembers brought to where it is at q [...] rad of what it turns with: all of
-    `laws.encoder_memory`.
+    """Return the step with what an encoder remembers brought to where it is at q [...] rad of what it turns with:
+    all of `laws.encoder_memory`.
 
     p: columns by name; features: those of `columns.FEATURES` that count."""
     return step
@@ -83,7 +84,7 @@ def encoder_memory(p: Mapping[str, Numbers], q: Numbers, features: Collection[st
 def shown_position(
     p: Mapping[str, Numbers], q: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers]:
-    """`measured_position` of an encoder that has come to q [...] rad in this step: as a law for `over_time`."""
+    """Return `measured_position` of an encoder that has come to q [...] rad in this step: as a law for `over_time`."""
     step = encoder_memory(p, q, features, step or Step())
     at: tuple[Numbers, Numbers] = measured_position(p, q, features, np, replace(step, fresh=False))
     return at
@@ -92,7 +93,7 @@ def shown_position(
 def command_delay(
     p: Mapping[str, Numbers], t: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> Numbers:
-    """How long after its time a target acts [...] s, in a step that begins at t [...] s: of all terms of
+    """Return how long after its time a target acts [...] s, in a step that begins at t [...] s: of all terms of
     `laws.command_delay`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
@@ -136,8 +137,8 @@ def lost_error(
     features: Collection[str] = FEATURES,
     step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """(what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what acts: 0
-    no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
+    """Return (what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what
+    acts: 0 no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
     step = step or Step()
@@ -151,8 +152,8 @@ def lost_error(
 def heard_speed(
     p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """(speed [...] rad/s that kd acts on where the encoder's is v [...] rad/s, at the end of a step at unchanged v,
-    share of a change of v that passes): of all filters of `laws.heard_speed`.
+    """Return (speed [...] rad/s that kd acts on where the encoder's is v [...] rad/s, at the end of a step at
+    unchanged v, share of a change of v that passes): of all filters of `laws.heard_speed`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
     if "rare" not in features:
@@ -166,7 +167,7 @@ def heard_speed(
 
 
 def loop_torque(p: Mapping[str, Numbers], e: Numbers, v: Numbers, acts: Numbers) -> np.ndarray:
-    """Torque [...] N.m, or duty, that a loop asks for: kp e - kd v of the error e [...] rad that counts and the
+    """Return torque [...] N.m, or duty, that a loop asks for: kp e - kd v of the error e [...] rad that counts and the
     measured speed v [...] rad/s that kd acts on. acts [...]: 0 nothing, 1 all but the error's, 2 all of it
     (`lost_error`)."""
     damping = p["kd"] * v
@@ -174,7 +175,7 @@ def loop_torque(p: Mapping[str, Numbers], e: Numbers, v: Numbers, acts: Numbers)
 
 
 def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float) -> np.ndarray:
-    """Target [rad] after `delay`, averaged over the step [time, time + dt].
+    """Return the target [rad] after `delay`, averaged over the step [time, time + dt].
 
     stamps [..., queue] (s), targets [..., queue] (rad), oldest first; time, delay [...] (s).
     """
@@ -190,7 +191,8 @@ def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, dela
 def target_rates(
     time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step: arguments as for `target_in_force`.
+    """Return the speed [rad/s] and acceleration [rad/s2] of the target, means over the step: arguments as for
+    `target_in_force`.
 
     Target k has speed (x_k - x_k-1) / span and acceleration (speed_k - speed_k-1) / span, span = t_k - t_k-1, from t_k
     to the next target, for at most 2 span.
@@ -214,7 +216,8 @@ def warm_motor(
     features: Collection[str] = FEATURES,
     step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers, Numbers]:
-    """(stall torque [...] N.m, no-load speed [...] rad/s, efficiency [...], factor [...] on the friction) of a motor as
+    """Return (stall torque [...] N.m, no-load speed [...] rad/s, efficiency [...], factor [...] on the friction) of
+    a motor as
     it is now: of all of `laws.warm_motor`.
 
     p: columns by name; torque [...] N.m that it gave before; features: those of `columns.FEATURES` that count; step:
@@ -241,8 +244,8 @@ def amplifier(
     features: Collection[str] = FEATURES,
     step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """(torque [...] N.m that the power stage gives where `asked` is asked of it, at the end of a step where `end` is
-    asked then, share of a change that passes): of all steps of `laws.amplifier`.
+    """Return (torque [...] N.m that the power stage gives where `asked` is asked of it, at the end of a step where
+    `end` is asked then, share of a change that passes): of all steps of `laws.amplifier`.
 
     p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
     step = step or Step()
@@ -260,7 +263,7 @@ def torque_along(
     limited: bool = True,
     braking_slope: Numbers = 1.0,
 ) -> np.ndarray:
-    """Motor torque [S] N.m along a measured motion: `laws.torque_limits`, or `laws.voltage_torque`.
+    """Return the motor torque [S] N.m along a measured motion: `laws.torque_limits`, or `laws.voltage_torque`.
 
     asked [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
     (inf: no limit); supply: of its nominal voltage, of a voltage drive alone; limited: False leaves what is asked as it
@@ -276,8 +279,8 @@ def torque_along(
 
 
 def lagged(t: np.ndarray, torque: np.ndarray, time: float, stages: int = 1) -> np.ndarray:
-    """Torque [S] N.m after a lag of `time` s, of that in force before each of the times t [S] s: exact for one that
-    changes at these times only; from rest at the first.
+    """Return the torque [S] N.m after a lag of `time` s, of that in force before each of the times t [S] s: exact for
+    one that changes at these times only; from rest at the first.
 
     stages: 1 first order, 2 second order: two in a row with half the time each (`laws.lag_share`)."""
     out = np.asarray(torque, float)
@@ -297,7 +300,8 @@ def parasitic_torque(
     features: Collection[str] = FEATURES,
     step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """(torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its motor is
+    """Return (torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its
+    motor is
     asked for nor is dry friction: of all terms of `laws.parasitic_torque`.
 
     p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
@@ -333,7 +337,8 @@ def dry_friction(
     features: Collection[str] = FEATURES,
     step: Step | None = None,
 ) -> Numbers:
-    """Level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of `laws.dry_friction`.
+    """Return the level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of
+    `laws.dry_friction`.
 
     p: columns by name; q [rad] of the joint, v [rad/s] of the motor; motor, outside: torques on the gear's two sides,
     N.m; features: those of `columns.FEATURES` that count; step: None from rest."""
@@ -372,7 +377,7 @@ def friction_acts(
 
 
 def viscous(p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES) -> Numbers:
-    """Friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`.
+    """Return the friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`.
 
     p: columns by name; v [rad/s] of the motor; features: those of `columns.FEATURES` that count."""
     if "shape" not in features:
@@ -411,7 +416,7 @@ def servo(
     taken: Numbers = 0.0,
     outside: Numbers = 0.0,
 ) -> dict[str, np.ndarray]:
-    """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
+    """Return one evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
     target [rad]; q [rad], v [rad/s] of the driven joint; q_loop, v_loop of the joint that carries the loop's encoder
     (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint [kg.m2];
@@ -605,7 +610,7 @@ def _rotor(
     dt: float,
     gain: Numbers,
 ) -> dict[str, np.ndarray]:
-    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and
+    """Return the rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and
     armature of what passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop
     [N.m/rad]."""
     on_drive = np.where(on_rotor, slope, on_drive)

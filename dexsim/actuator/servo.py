@@ -199,7 +199,7 @@ class Servo:
     # -- parameters ------------------------------------------------------------
 
     def column(self, name: str) -> torch.Tensor:
-        """[N, J] view of one column of `params`; UserError with the valid names for another name."""
+        """Return [N, J] view of one column of `params`; UserError with the valid names for another name."""
         return self.params[:, :, INDEX[column(name).name]]
 
     def check_simulated(self, name: str) -> None:
@@ -252,21 +252,21 @@ class Servo:
     # -- what an observer reads ------------------------------------------------------------
 
     def position(self) -> torch.Tensor:
-        """[N, J] position that the encoders report: scale * position + offset of the reported joints [rad]."""
+        """Return [N, J] position that the encoders report: scale * position + offset of the reported joints [rad]."""
         return self.measured(self._turned()[0])
 
     def velocity(self) -> torch.Tensor:
-        """[N, J] velocity that the encoders report [rad/s]."""
+        """Return [N, J] velocity that the encoders report [rad/s]."""
         q, v = self._turned()
         return measured_position(self._by_name, q, self.features, torch, self._remembered())[1] * v
 
     def measured(self, q: torch.Tensor) -> torch.Tensor:
-        """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
+        """Return what the encoders report [N, J] where they stand at q [N, J] (rad)."""
         shown: torch.Tensor = measured_position(self._by_name, q, self.features, torch, self._remembered())[0]
         return shown
 
     def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
-        """The position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
+        """Return the position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
         q = (reported - self.column("position_offset")) / self.column("position_scale")
         # the error is a small part of the position: each turn wins a digit or more
         for _ in range(6 if self._bent else 0):
@@ -274,7 +274,7 @@ class Servo:
         return q
 
     def _remembered(self) -> Step | None:
-        """What the encoders remember; None where none does."""
+        """Return what the encoders remember; None where none does."""
         if not self._bent or self.first_memory < 0:
             return None
         of = {name: self.state[:, :, self.slots[name]] for name in MEMORY}
@@ -286,8 +286,8 @@ class Servo:
         return self._position_motor is not None and "play" in self.features
 
     def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a
-        play."""
+        """Return ([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors
+        before a play."""
         q, v = self.engine.t.qpos[:, self.reported_q], self.engine.t.qvel[:, self._reported_dof]
         here = self._position_motor
         if here is None or not self.at_rotor:
@@ -299,7 +299,7 @@ class Servo:
     # -- state ------------------------------------------------------------
 
     def get_state(self) -> torch.Tensor:
-        """A copy of state [N, J, S]."""
+        """Return a copy of state [N, J, S]."""
         return self.state.clone()
 
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None) -> None:
@@ -311,7 +311,7 @@ class Servo:
         self.torque.copy_(self.state[:, :, self.slots["motor"]])
 
     def memory(self) -> dict[str, torch.Tensor]:
-        """What a step leaves to the next and what randomization draws, live."""
+        """Return what a step leaves to the next and what randomization draws, live."""
         names = ("params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home")
         return {name: getattr(self, name) for name in names}
 
@@ -336,8 +336,8 @@ def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None
 
 
 def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
-    """Columns that the table gives a value, or a range, other than the neutral one for some joint; unknown ones are
-    neutral."""
+    """Return the columns that the table gives a value, or a range, other than the neutral one for some joint; unknown
+    ones are neutral."""
     nominal, (low, high), unknown = table.nominal(joints), table.bounds(joints), table.unknown(joints)
     return [
         c.name

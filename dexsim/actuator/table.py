@@ -92,7 +92,7 @@ def _number(x: Any) -> float | None:
 
 
 def parse_value(raw: Any, column: Column, where: str) -> Value:
-    """A `servo.yaml` value as a Value inside the column's allowed range; UserError starting with `where`."""
+    """Return a `servo.yaml` value as a Value inside the column's allowed range; UserError starting with `where`."""
     allowed = f"allowed: {column.low:g} .. {column.high:g} {column.unit}"
     if isinstance(raw, str) and raw == "unknown":
         return Value(None, column.low, column.high)
@@ -146,7 +146,7 @@ class ServoTable:
 
     @classmethod
     def load(cls, path: str | Path) -> ServoTable:
-        """The table in a YAML file; UserError if it is missing, not YAML, or states something impossible."""
+        """Return the table in a YAML file; UserError if it is missing, not YAML, or states something impossible."""
         path = Path(path)
         if not path.exists():
             raise UserError(f"servo file '{path}' does not exist; servo_file=PATH must name a servo.yaml.")
@@ -154,7 +154,7 @@ class ServoTable:
 
     @classmethod
     def from_dict(cls, raw: Any, source: str = "servo") -> ServoTable:
-        """The table in a plain mapping of the file's content (of a resolved Hydra config, say)."""
+        """Return the table in a plain mapping of the file's content (of a resolved Hydra config, say)."""
         if not isinstance(raw, dict):
             raise UserError(f"{source}: expected a mapping with the keys {', '.join(KEYS)}; got {type(raw).__name__}.")
         for key in raw:
@@ -189,7 +189,7 @@ class ServoTable:
         )
 
     def to_dict(self) -> dict:
-        """The file's content again: `from_dict(table.to_dict())` is the same table."""
+        """Return the file's content again: `from_dict(table.to_dict())` is the same table."""
         out: dict[str, Any] = {"drive": self.drive, "joints": {}}
         for joint, columns in self.entries.items():
             out["joints"][joint] = {name: _plain(value) for name, value in columns.items()}
@@ -224,7 +224,7 @@ class ServoTable:
                     )
 
     def value(self, joint: str, column: str) -> Value:
-        """What the table says of one joint and column; the neutral value where it says nothing."""
+        """Return what the table says of one joint and column; the neutral value where it says nothing."""
         for key in (joint, ALL):
             if column in self.entries.get(key, {}):
                 return self.entries[key][column]
@@ -250,7 +250,8 @@ class ServoTable:
         self.entries.setdefault(joint, {})[column] = parsed
 
     def nominal(self, joints: Sequence[str]) -> np.ndarray:
-        """[J, C] float64: values in the order of `COLUMNS`; unknown ones neutral, except kp, which must be known."""
+        """Return [J, C] float64: values in the order of `COLUMNS`; unknown ones neutral, except kp, which must be
+        known."""
         out = np.empty((len(joints), len(COLUMNS)))
         for j, joint in enumerate(joints):
             for c, column in enumerate(COLUMNS):
@@ -274,11 +275,11 @@ class ServoTable:
         return np.array([[v.low for v in row] for row in values]), np.array([[v.high for v in row] for row in values])
 
     def unknown(self, joints: Sequence[str]) -> np.ndarray:
-        """[J, C] bool: where the file says `unknown`."""
+        """Return [J, C] bool: where the file says `unknown`."""
         return np.array([[self.value(joint, name).unknown for name in NAMES] for joint in joints])
 
     def current(self, joints: Sequence[str]) -> np.ndarray:
-        """[J] float64: A per N.m of motor torque; nan where unknown or not stated."""
+        """Return [J] float64: A per N.m of motor torque; nan where unknown or not stated."""
         out = np.full(len(joints), np.nan)
         for j, joint in enumerate(joints):
             value = _lookup(self.current_per_torque, joint)
@@ -292,7 +293,7 @@ class ServoTable:
 
 
 def _lookup(value: Any, joint: str) -> Any:
-    """A plain value, or its entry by joint name, or by "*"."""
+    """Return a plain value, or its entry by joint name, or by "*"."""
     if isinstance(value, dict):
         return value.get(joint, value.get(ALL))
     return value

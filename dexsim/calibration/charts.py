@@ -59,7 +59,7 @@ def lines(half: Half, path: Path, title: str) -> Path:
 
 
 def rubber(stretch: np.ndarray, nominal: np.ndarray, fit: Rubber, path: Path) -> Path:
-    """Stress over stretch with the Mooney-Rivlin fit."""
+    """Return the stress over stretch with the Mooney-Rivlin fit."""
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     ax = figure.subplots()
     ax.plot(stretch, 1e-6 * nominal, "o", ms=4, label="measured")
@@ -91,7 +91,7 @@ def press(depth: np.ndarray, force: np.ndarray, fit: Stiffness, path: Path) -> P
 
 
 def pads(found: dict[str, Pad], path: Path) -> Path:
-    """Gain maps of the pads, dead and swapped taxels marked; columns across, rows from the joint to the tip."""
+    """Return gain maps of the pads, dead and swapped taxels marked; columns across, rows from the joint to the tip."""
     figure = Figure(figsize=(3.2 * len(found), 4.2), layout="constrained")
     for ax, (finger, pad) in zip(np.atleast_1d(figure.subplots(1, len(found))), found.items(), strict=True):
         gain = np.ones(len(pad.bias)) if pad.gain is None else pad.gain.copy()

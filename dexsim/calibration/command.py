@@ -38,7 +38,7 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
 
 
 def run(s: dict[str, Any], meta: dict[str, str]) -> int:
-    """Everything that the settings ask for."""
+    """Return the everything that the settings ask for."""
     from dexsim import outputs
     from dexsim.calibration import simulate
     from dexsim.hand import load_hand
@@ -79,7 +79,7 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
 
 
 def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any], hand: Hand) -> list[str]:
-    """All fits and their plots, calibration.yaml; returns what is assumed in it."""
+    """Return all fits and their plots, calibration.yaml; returns what is assumed in it."""
     from dexsim.calibration import charts, current
     from dexsim.calibration.file import Calibration, save
 
@@ -118,7 +118,7 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
 
 
 def _moved(path: Path) -> Path:
-    """Where a staged file is once all is done."""
+    """Return where a staged file is once all is done."""
     return path.parent.parent / path.name
 
 
@@ -183,7 +183,7 @@ def _print_ratio(joints: dict[str, Any]) -> None:
 
 
 def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> dict[str, Any]:
-    """Threshold, dead and swapped taxels, gains of every pad."""
+    """Return the threshold, dead and swapped taxels, gains of every pad."""
     from dexsim.calibration import charts, current, taxels
     from dexsim.calibration.simulate import pads_of
     from dexsim.recording.reader import read
@@ -265,7 +265,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> di
 
 
 def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
-    """Stiffness and rubber constants of a test curve."""
+    """Return the stiffness and rubber constants of a test curve."""
     from dexsim.calibration import charts, rubber
 
     kind, a, b = rubber.read_curve(s["curve"])

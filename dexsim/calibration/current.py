@@ -40,8 +40,8 @@ class Half:
 
 
 def files_of(where: str | Sequence[str], key: str) -> list[Path]:
-    """Recordings named by a folder (its *.mcap, else *.csv and *.npz), a file, or several separated by commas. Raises
-    UserError."""
+    """Return the recordings named by a folder (its *.mcap, else *.csv and *.npz), a file, or several separated by
+    commas. Raises UserError."""
     parts = where.split(",") if isinstance(where, str) else list(where)
     out: list[Path] = []
     for part in parts:
@@ -137,5 +137,5 @@ def combine(real: Half | None, sim: Half | None) -> dict[str, dict[str, Any]]:
 
 
 def _relative(f: LineFit) -> float:
-    """Half the width of the slope's interval over the slope."""
+    """Return half the width of the slope's interval over the slope."""
     return max(f.slope_high - f.slope, f.slope - f.slope_low) / f.slope

@@ -121,12 +121,12 @@ class Calibration:
         return signed / scale
 
     def current(self, torque: np.ndarray) -> np.ndarray:
-        """The SDK's current [J] A at a motor torque [J] N.m: the inverse, for the simulated hand."""
+        """Return the SDK's current [J] A at a motor torque [J] N.m: the inverse, for the simulated hand."""
         return self.current_sign * np.asarray(torque, float) * self.current_per_torque
 
     def normal_force(self, counts: np.ndarray) -> np.ndarray:
-        """Normal forces [P, T] N of taxel readings [P, T, 3] counts (empty: nothing is felt): bias off, exchanged back,
-        gain, threshold."""
+        """Return the normal forces [P, T] N of taxel readings [P, T, 3] counts (empty: nothing is felt): bias off,
+        exchanged back, gain, threshold."""
         if not np.size(counts):
             return np.zeros_like(self.gain)
         z = np.asarray(counts, float)[..., 2] - self.bias
@@ -135,7 +135,7 @@ class Calibration:
 
     @classmethod
     def default(cls, torque_max: np.ndarray | None = None, hand: Hand | None = None) -> Calibration:
-        """Nothing measured: the community's and our assumptions, said in `assumed`."""
+        """Return nothing measured: the community's and our assumptions, said in `assumed`."""
         return cls.from_dict({"schema": 1}, "no calibration", torque_max, hand)
 
     @classmethod
@@ -197,7 +197,7 @@ class Calibration:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The file's content with every value that deployment uses stated."""
+        """Return the file's content with every value that deployment uses stated."""
         out = dict(self.raw) | {"schema": 1, "normalization": self.normalization}
         out["current_sign"] = {j: int(s) for j, s in zip(self.hand.joints, self.current_sign, strict=True)}
         joints = {j: dict((self.raw.get("joints") or {}).get(j) or {}) for j in self.hand.joints}
@@ -228,7 +228,7 @@ def save(path: str | Path, content: dict[str, Any], hand: Hand | None = None) ->
 
 
 def _content(raw: Any, where: str, hand: Hand) -> Content:
-    """What the deployed policy reads of the file, checked; notes for people are not. Raises UserError."""
+    """Return what the deployed policy reads of the file, checked; notes for people are not. Raises UserError."""
     if isinstance(raw, dict):
         keys = {"": (raw, KEYS), "touch": (raw.get("touch"), TOUCH_KEYS), "joints": (raw.get("joints"), hand.joints),
                 "current_sign": (raw.get("current_sign"), hand.joints)}

@@ -63,7 +63,7 @@ class LineFit:
         return not self.why
 
     def table(self) -> dict[str, object]:
-        """Plain numbers, rounded to 6 digits."""
+        """Return the plain numbers, rounded to 6 digits."""
 
         def nice(x: float) -> float:
             return float(f"{x:.6g}")
@@ -79,7 +79,7 @@ class LineFit:
 
 
 def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
-    """The line of one joint's presses; None where there are fewer than 3 with contact. unit: of the effort, for
+    """Return the line of one joint's presses; None where there are fewer than 3 with contact. unit: of the effort, for
     texts."""
     x, y, n = levels.effort, levels.force, len(levels)
     if n < 3 or np.ptp(x) == 0:
@@ -110,7 +110,7 @@ def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
 
 
 def reasons(levels: Levels, f: LineFit, bends: bool, unit: str) -> list[str]:
-    """Why force over effort is no line, in words with figures; [] if it is one."""
+    """Return the why force over effort is no line, in words with figures; [] if it is one."""
     out = []
     x, y = levels.effort, levels.force
     if len(np.unique(levels.level)) < 4:
@@ -153,8 +153,8 @@ def reasons(levels: Levels, f: LineFit, bends: bool, unit: str) -> list[str]:
 
 
 def _ratio_and_slope(*sums: np.ndarray, axis: int = -1) -> np.ndarray:
-    """(ratio, slope) of levels together, stacked, from the sums of each along an axis: n, x, y, x^2, xy; NaN where x
-    does not vary."""
+    """Return (ratio, slope) of levels together, stacked, from the sums of each along an axis: n, x, y, x^2, xy; NaN
+    where x does not vary."""
     n, x, y, xx, xy = (s.sum(axis) for s in sums)
     spread = xx - x**2 / n
     varies = spread > 1e-9 * xx
@@ -170,7 +170,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def _bend(x: np.ndarray, y: np.ndarray) -> tuple[float, bool]:
-    """(largest distance of the best parabola from the best line over the range of y, significant at 1 % by an F
+    """Return (largest distance of the best parabola from the best line over the range of y, significant at 1 % by an F
     test)."""
     if len(x) < 5 or np.ptp(y) == 0:
         return 0.0, False

@@ -17,7 +17,7 @@ CONTACT = 0.3  # N under which nothing is touched
 
 
 def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
-    """(normal force [T, F] N of each fingertip, whether a taxel stood at its largest count [T, F])."""
+    """Return (normal force [T, F] N of each fingertip, whether a taxel stood at its largest count [T, F])."""
     if recording.tactile is None:
         raise UserError(f"{recording.path}: has no /tactile: force cannot be calibrated without the fingertips' force")
     newtons = recording.tactile_newtons()
@@ -29,8 +29,8 @@ def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
 
 
 def levels_of(recording: Recording, hand: Hand) -> dict[str, Levels]:
-    """Steady presses by joint. A joint presses where its command steps from level to level; where no command moves
-    (the fingertip is pressed from outside), every joint of the finger that is touched counts.
+    """Return the steady presses by joint. A joint presses where its command steps from level to level; where no command
+    moves (the fingertip is pressed from outside), every joint of the finger that is touched counts.
 
     Raises UserError for a recording without effort, its sign, or touch.
     """
@@ -101,7 +101,7 @@ def _pressing(recording: Recording, column: int, holds: list[tuple[float, float]
 
 
 def _steady(force: Series, width: float = 0.25) -> list[tuple[int, int]]:
-    """Windows [first, last) in which no fingertip's force changes by more than 4 % of its largest."""
+    """Return the windows [first, last) in which no fingertip's force changes by more than 4 % of its largest."""
     out: list[tuple[int, int]] = []
     t, k = force.t, 0
     if len(t) < 4:

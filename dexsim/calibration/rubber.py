@@ -53,12 +53,13 @@ class Rubber:
 
 
 def stress(stretch: np.ndarray, c10: float, c01: float) -> np.ndarray:
-    """Nominal stress [Pa], positive in tension."""
+    """Return the nominal stress [Pa], positive in tension."""
     return 2 * (stretch - stretch**-2.0) * (c10 + c01 / stretch)
 
 
 def fit_mooney_rivlin(stretch: np.ndarray, nominal: np.ndarray) -> Rubber:
-    """Least squares over points of (stretch, nominal stress [Pa]); points at stretch 1 say nothing and are left out.
+    """Return least squares over points of (stretch, nominal stress [Pa]); points at stretch 1 say nothing and are
+    left out.
 
     Raises UserError for fewer than 4 points or a range too narrow to tell the two constants apart.
     """
@@ -149,8 +150,8 @@ def fit_linear(depth: np.ndarray, force: np.ndarray) -> Stiffness:
 
 
 def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
-    """A CSV with columns depth_m, force_N or stretch, stress_Pa, or "treloar": ("press" | "stress", first, second).
-    Raises UserError."""
+    """Return a CSV with columns depth_m, force_N or stretch, stress_Pa, or "treloar": ("press" | "stress", first,
+    second). Raises UserError."""
     if str(path) == "treloar":
         return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()

@@ -26,7 +26,7 @@ RAMP_S, HOLD_S, RATE = 0.2, 0.4, 100.0
 
 
 def pads_of(hand: Hand) -> TaxelLayout:
-    """A hand's taxels. Raises UserError for one without touch."""
+    """Return a hand's taxels. Raises UserError for one without touch."""
     layout = hand_layout(hand)
     if layout is None:
         raise UserError(f"hand={hand.name}: has no touch pads, and without the fingertips' force none is calibrated")
@@ -42,10 +42,10 @@ def press_recording(
     stiffness: float = STIFFNESS,
     timestep: float = 0.002,
 ) -> Recording:
-    """One joint presses, from the hand's open pose: up a ladder of `levels` torques to the share `most` of its torque
-    limit (less where another joint of the finger could not hold against it), and down again; torque in N.m, touch in N.
-    The finger's other joints lean in by what they carry (arm times force over kp), so that the finger stands still and
-    every lever arm stays what it is."""
+    """Return one joint presses, from the hand's open pose: up a ladder of `levels` torques to the share `most` of
+    its torque limit (less where another joint of the finger could not hold against it), and down again; torque in
+    N.m, touch in N. The finger's other joints lean in by what they carry (arm times force over kp), so that the
+    finger stands still and every lever arm stays what it is."""
     fingers = dict(zip(hand.joints, hand.finger_of_joint, strict=True))
     if fingers.get(joint, -1) < 0:
         raise UserError(
@@ -131,9 +131,9 @@ def make(
 
 
 def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int = 16) -> Recording:
-    """A ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and /external_force
-    [N], the hand at rest. Each of `presses` places a finger is pressed to 2..8 N and let go within `frames` samples,
-    and followed by a rest."""
+    """Return a ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and
+    /external_force [N], the hand at rest. Each of `presses` places a finger is pressed to 2..8 N and let go within
+    `frames` samples, and followed by a rest."""
     import torch
 
     from dexsim.assets.objects import library
@@ -195,8 +195,8 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
 
 
 def delivered(recording: Recording, seed: int = 0) -> Recording:
-    """A press recording as the hardware would have delivered it. The load cell is read with the taxels, which hold
-    their last
+    """Return a press recording as the hardware would have delivered it. The load cell is read with the taxels, which
+    hold their last
     value: else that delay would look like hysteresis."""
     from dexsim.recording.realistic import realistic
 
@@ -254,8 +254,8 @@ def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Se
 
 
 def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, float]]:
-    """Where the ball goes: against the taxel whose normal lies most along the motion there of a joint that closes.
-    Returns its centre [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
+    """Return where the ball goes: against the taxel whose normal lies most along the motion there of a joint that
+    closes. Returns its centre [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
     model = hand.compiled
     data = mujoco.MjData(model)
     data.qpos[[model.joint(name).qposadr[0] for name in hand.joints]] = hand.pose("open")
@@ -299,7 +299,7 @@ def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
 
 
 def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> np.ndarray:
-    """Taxel forces [T, F, K, 3] N of each frame: the physics' contact force, spread by the touch model."""
+    """Return the taxel forces [T, F, K, 3] N of each frame: the physics' contact force, spread by the touch model."""
     import torch
 
     from dexsim.assets.objects import library

@@ -39,7 +39,7 @@ class Pad:
 
 
 def inspect(readings: np.ndarray, load: np.ndarray | None = None, *, rows: int) -> Pad:
-    """One pad's readings [T, K] and, where known, the normal load on it [T] N; rows of its lattice."""
+    """Return one pad's readings [T, K] and, where known, the normal load on it [T] N; rows of its lattice."""
     r = np.asarray(readings, float)
     total = r.sum(1)
     rest = load < 0.02 * load.max() if load is not None and load.max() > 0 else total <= np.percentile(total, 10) + 1e-9
@@ -73,8 +73,8 @@ def inspect(readings: np.ndarray, load: np.ndarray | None = None, *, rows: int) 
 def _dead(
     clean: np.ndarray, threshold: float, near: list[list[int]], rows: int
 ) -> tuple[list[int], list[int]]:
-    """(dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the presses do
-    not tell.
+    """Return (dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the
+    presses do not tell.
 
     One pressed side is not enough: a contact has an edge, and beyond it a healthy taxel feels nothing. A taxel must
     feel something between two pressed ones, on opposite sides of it; and in most of the presses whose strongest taxel
@@ -107,8 +107,8 @@ def _dead(
 
 
 def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray, near: list[list[int]]) -> np.ndarray:
-    """[K]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is
-    what lies between two rests, at most 200 frames."""
+    """Return [K]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A
+    press is what lies between two rests, at most 200 frames."""
     on = clean.max(1) > strong
     press = np.cumsum(np.diff(on, prepend=False) & on) * 1000 + np.arange(len(on)) // 200
     top = clean.argmax(1)
@@ -132,7 +132,7 @@ def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray
 def _beside(
     k: int, step: tuple[int, int], way: int, gone: set[int], columns: int, rows: int, far: int = 3
 ) -> int | None:
-    """The nearest taxel that is not `gone`, at most `far` steps from k; None at the pad's edge."""
+    """Return the nearest taxel that is not `gone`, at most `far` steps from k; None at the pad's edge."""
     c, r = divmod(k, rows)
     for n in range(1, far + 1):
         a, b = c + way * n * step[0], r + way * n * step[1]
@@ -151,7 +151,8 @@ def _swapped(
     sure: float = 2.5,
     beside: float = 5.0,
 ) -> list[tuple[int, int]]:
-    """Pairs that each fit the other's neighbours better than their own by `least` (correlation), and by `sure` standard
+    """Return the pairs that each fit the other's neighbours better than their own by `least` (correlation), and by
+    `sure` standard
     deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies
     much. Taxels side by side feel nearly the same, and a contact's edge between them looks like an exchange: `beside`
     deviations."""
@@ -172,8 +173,8 @@ def _swapped(
 def _fits(
     clean: np.ndarray, near: list[list[int]], skip: set[int], blocks: int = 20, draws: int = 40
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(correlation [taxel, place] of each taxel with the mean of the neighbours of each place; standard deviation [a,
-    b] of what a swap of a and b would better, by bootstrap over blocks of the recording)."""
+    """Return (correlation [taxel, place] of each taxel with the mean of the neighbours of each place; standard
+    deviation [a, b] of what a swap of a and b would better, by bootstrap over blocks of the recording)."""
     around = np.zeros_like(clean)
     for k in range(clean.shape[1]):
         beside = [n for n in near[k] if n not in skip]
@@ -220,8 +221,8 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         return float(np.sqrt(np.mean(np.concatenate(rest) ** 2)) / y.mean())
 
     def neighbours_and_load(rows: np.ndarray) -> np.ndarray:
-        """Neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a surface of
-        degree 3."""
+        """Return the neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a
+        surface of degree 3."""
         local = smooth_gains(x[rows], set(live.tolist()), floor, columns, out.rows)
         basis = _surface(columns, out.rows)[live]
         seen = (x[rows][:, live] * local[live]) @ basis
@@ -263,7 +264,7 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
 
 
 def _surface(columns: int, rows: int, degree: int = 3) -> np.ndarray:
-    """Polynomials over the lattice [K, B], products of Legendre's in column and row up to a total degree."""
+    """Return the polynomials over the lattice [K, B], products of Legendre's in column and row up to a total degree."""
     c, r = np.divmod(np.arange(columns * rows), rows)
     leg = np.polynomial.legendre.legvander
     a, b = leg(2 * c / max(columns - 1, 1) - 1, degree), leg(2 * r / max(rows - 1, 1) - 1, degree)
@@ -273,7 +274,8 @@ def _surface(columns: int, rows: int, degree: int = 3) -> np.ndarray:
 def smooth_gains(
     readings: np.ndarray, live: set[int], floor: float, columns: int, rows: int, prior: float = 0.2
 ) -> np.ndarray:
-    """Gains [K] (times a reading: its force) from readings [T, K] of presses all over, because pressure is smooth.
+    """Return the gains [K] (times a reading: its force) from readings [T, K] of presses all over, because pressure is
+    smooth.
 
     The logarithm of a round press falls off as a parabola, so a taxel's logarithm lies above the mean of the two taxels
     beside it, in column or row, by the same on average wherever it is; what a taxel differs by beyond that is its gain

@@ -56,13 +56,13 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
 
 
 def _silent() -> bool:
-    """Whether another process says it: under torchrun every rank of a machine finds the same wrong setting, the first
-    speaks, and torchrun ends the others. What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
+    """Return whether another process says it: under torchrun every rank of a machine finds the same wrong setting,
+    the first speaks, and torchrun ends the others. What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
     return os.environ.get("WORLD_SIZE", "1") != "1" and os.environ.get("LOCAL_RANK", "0") != "0"
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error of torch, Warp or Python says that memory is full."""
+    """Return whether an error of torch, Warp or Python says that memory is full."""
     text = str(error).lower()
     return isinstance(error, MemoryError) or "out of memory" in text or "failed to allocate" in text
 

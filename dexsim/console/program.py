@@ -12,7 +12,7 @@ DOORS = ("train", "play", "diagnose", "calibrate")
 
 
 def name(job: str) -> str:
-    """The command of a job, called the way this process was: "dexsim play", "python -m dexsim play" or "python
+    """Return the command of a job, called the way this process was: "dexsim play", "python -m dexsim play" or "python
     play.py"."""
     called = Path(sys.argv[0])
     if _by_door() and job in DOORS:
@@ -30,14 +30,14 @@ def typed() -> str:
 
 
 def torchrun(job: str, processes: int) -> str:
-    """The command that starts a job in this many processes of this machine at once."""
+    """Return the command that starts a job in this many processes of this machine at once."""
     return f"torchrun --nproc_per_node={processes} " + (
         f"{job}.py" if _by_door() and job in DOORS else f"-m dexsim {job}"
     )
 
 
 def words(text: str) -> str:
-    """A text that says `dexsim train` or `python train.py`, with the commands of :func:`name` instead."""
+    """Return a text that says `dexsim train` or `python train.py`, with the commands of :func:`name` instead."""
     jobs = "|".join(DOORS)
     return re.sub(rf"python ({jobs})\.py|(?<!-m )\bdexsim ({jobs})\b", lambda match: name(match[1] or match[2]), text)
 

@@ -52,7 +52,7 @@ class Stop:
         print("\nstopping and saving (Ctrl-C again: stop at once, without saving)", flush=True)
 
     def asked(self) -> bool:
-        """Whether someone asked to stop."""
+        """Return whether someone asked to stop."""
         return self._asked
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table of aligned columns; numbers to the right, text to the left, the last column unpadded."""
+    """Return a table of aligned columns; numbers to the right, text to the left, the last column unpadded."""
     cells = [[cell(v) for v in row] for row in rows]
     number = [all(isinstance(row[i], (int, float)) for row in rows) and bool(rows) for i in range(len(header))]
     widths = [
@@ -24,7 +24,7 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> s
 
 
 def cell(value: Any) -> str:
-    """One value for reading: four significant digits, ranges as "low .. high"."""
+    """Return one value for reading: four significant digits, ranges as "low .. high"."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, float):
@@ -46,7 +46,7 @@ def duration(seconds: float) -> str:
 
 
 def count(value: float) -> str:
-    """A large count in three digits: 950, 12.3k, 4.56M, 1.2G."""
+    """Return a large count in three digits: 950, 12.3k, 4.56M, 1.2G."""
     for scale, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= scale:
             return f"{value / scale:.3g}{letter}"

@@ -53,7 +53,7 @@ def save(path: str | Path, payload: dict[str, Any]) -> Path:
 
 
 def encode(payload: dict[str, Any]) -> bytes:
-    """A checkpoint's bytes; ``config`` (a dict) becomes JSON text, format and version are added."""
+    """Return a checkpoint's bytes; ``config`` (a dict) becomes JSON text, format and version are added."""
     payload = {"format": FORMAT, "version": VERSION, **payload, "config": json.dumps(payload["config"])}
     buffer = io.BytesIO()  # torch reports a failed write as a RuntimeError without its cause, so write it ourselves
     torch.save(payload, buffer)
@@ -175,7 +175,7 @@ def _check_whole(path: Path) -> None:
 
 
 def _nearby(path: Path) -> str:
-    """Checkpoints that are there, newest first, for an error message."""
+    """Return the checkpoints that are there, newest first, for an error message."""
     try:
         found = sorted(path.parent.glob("*.pt"), key=lambda p: -p.stat().st_mtime)
     except OSError:
@@ -189,7 +189,8 @@ def _writer(data: dict[str, Any]) -> str:
 
 
 def policy_only(payload: dict[str, Any]) -> dict[str, Any]:
-    """The small export: what a replay needs and no more (actor with its normalization, config, layout, versions)."""
+    """Return the small export: what a replay needs and no more (actor with its normalization, config, layout,
+    versions)."""
     return {k: v for k, v in payload.items() if k in KEYS} | {"kind": "policy"}
 
 
@@ -208,7 +209,7 @@ def check_layout(data: dict[str, Any], layout: dict[str, Any], path: str | Path)
 
 
 def layout_of(env: Any) -> dict[str, Any]:
-    """Joint and observation layout of an environment, for the checkpoint (plain lists and text)."""
+    """Return the joint and observation layout of an environment, for the checkpoint (plain lists and text)."""
     tables = env.describe()
     groups = {g: [[str(row[0]), int(row[1])] for row in rows] for g, rows in tables["observations"].items()}
     return {"joints": [str(n) for n in env.action_names],
@@ -217,7 +218,8 @@ def layout_of(env: Any) -> dict[str, Any]:
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any]:
-    """Commit of the dexsim in use and whether its tracked files differ from it; "unknown" outside a git checkout."""
+    """Return the commit of the dexsim in use and whether its tracked files differ from it; "unknown" outside a git
+    checkout."""
     folder = folder or Path(__file__).resolve().parent
 
     def git(*args: str) -> str | None:
@@ -234,8 +236,8 @@ def git_state(folder: Path | None = None) -> dict[str, Any]:
 
 
 def provenance(data: dict[str, Any]) -> str:
-    """A checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where tracked files
-    differed from it; "written in afterwards" where that is not known."""
+    """Return a checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where
+    tracked files differed from it; "written in afterwards" where that is not known."""
     git = data["git"]
     commit = git["commit"]
     if commit != "unknown":

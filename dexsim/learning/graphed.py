@@ -23,7 +23,7 @@ LOWEST, HIGHEST, FACTOR = 1e-5, 1e-2, 1.5
 
 
 def unsupported(alg: Any) -> str | None:
-    """Why this algorithm's update cannot be recorded, or None if it can."""
+    """Return the why this algorithm's update cannot be recorded, or None if it can."""
     if type(alg) is not PPO:
         return "the algorithm is not rsl-rl's PPO"
     if alg.is_multi_gpu:
@@ -159,7 +159,7 @@ class GraphedUpdate:
         return self._stream
 
     def _refers_to(self) -> tuple[int, ...]:
-        """Addresses of all that a record reads and that others could replace."""
+        """Return the addresses of all that a record reads and that others could replace."""
         st, tensors = self.alg.storage, []
         for model in (self.alg.actor, self.alg.critic):
             tensors += list(model.parameters())

@@ -83,6 +83,6 @@ class GymVectorEnv(VectorEnv):
         return {name: self._out(obs[name]) for name in obs.keys() if name != self._group}
 
     def _out(self, value: torch.Tensor) -> Any:
-        """A copy (the environment changes its buffers in place): torch tensor or NumPy array."""
+        """Return a copy (the environment changes its buffers in place): torch tensor or NumPy array."""
         value = value.detach().clone()
         return value if self._torch else value.cpu().numpy()

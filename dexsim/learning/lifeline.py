@@ -122,7 +122,7 @@ class Lifeline:
 
 
 def _listen(host: str) -> socket.socket:
-    """A server on the interface that the others know rank 0 by."""
+    """Return a server on the interface that the others know rank 0 by."""
     try:
         return socket.create_server((host, 0))
     except OSError:  # a name that means something else here
@@ -140,7 +140,7 @@ def _exit(status: int) -> None:
 
 
 def _receive(peer: socket.socket, size: int) -> bytes:
-    """Exactly ``size`` bytes, fewer where the connection ends."""
+    """Return exactly ``size`` bytes, fewer where the connection ends."""
     data = b""
     while len(data) < size:
         try:
@@ -154,7 +154,7 @@ def _receive(peer: socket.socket, size: int) -> bytes:
 
 
 def _message(peer: socket.socket) -> tuple[bytes, str]:
-    """(kind, text) of one message; kind b"" where the connection ended."""
+    """Return (kind, text) of one message; kind b"" where the connection ended."""
     head = _receive(peer, 5)
     if len(head) < 5:
         return b"", ""

@@ -47,8 +47,8 @@ def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: s
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted name, value) of every single value below a nest of dicts and lists; a logger's own mapping is looked into
-    too."""
+    """Yield (dotted name, value) of every single value below a nest of dicts and lists; a logger's own mapping is
+    looked into too."""
     items = node.items() if isinstance(node, dict) else enumerate(node)
     for name, value in items:
         key = f"{prefix}{name}"

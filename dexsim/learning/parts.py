@@ -110,7 +110,7 @@ def check(data: dict[str, Any], path: object) -> None:
 
 
 def tensors(node: Any, prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
-    """(dotted name, tensor) of all below a nest of dicts and lists."""
+    """Yield (dotted name, tensor) of all below a nest of dicts and lists."""
     items = node.items() if isinstance(node, dict) else enumerate(node)
     for key, value in items:
         name = f"{prefix}{key}"

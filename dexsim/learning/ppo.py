@@ -25,7 +25,7 @@ Policy = Callable[[TensorDict], torch.Tensor]  # observations -> actions [N, A]
 def agent_config(
     cfg: dict[str, Any], device: str, typed: names.Typed = frozenset(), where: str = "agent settings"
 ) -> dict[str, Any]:
-    """The nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep.
+    """Return the nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep.
 
     typed: settings that the user typed, which alone may name code of another package. where: whose settings these are.
     Raises UserError for others that do (see :mod:`dexsim.learning.names`).
@@ -74,7 +74,7 @@ def scale_first_actions(actor: torch.nn.Module, factor: object) -> None:
 
 
 def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> MLPModel:
-    """The trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
+    """Return the trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:
         data: what :func:`dexsim.learning.checkpoint.load` returned.
@@ -102,8 +102,8 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
 
 
 def plain_policy(name: str, env: Any, seed: int) -> Policy:
-    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform in [-1, 1], what every task's actions
-    are clipped to) or ``scripted`` (the task's own, from ``env.scripted_policy()``)."""
+    """Return a policy without learning: ``zero`` (all actions 0), ``random`` (uniform in [-1, 1], what every task's
+    actions are clipped to) or ``scripted`` (the task's own, from ``env.scripted_policy()``)."""
     shape = (env.num_envs, env.num_actions)
     if name == "zero":
         return lambda obs: torch.zeros(shape, device=env.device)

@@ -53,8 +53,8 @@ class Ranks:
         self._lifeline: Lifeline | None = None
 
     def device(self, asked: str | None, cuda_devices: int) -> str | None:
-        """The device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do not
-        suffice.
+        """Return the device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do
+        not suffice.
 
         Args:
             asked: the setting ``device``. cuda_devices: how many this machine has.
@@ -74,7 +74,7 @@ class Ranks:
         return f"cuda:{self.local}"
 
     def seed(self, seed: int, iteration: int = 0) -> int:
-        """The seed of this rank's worlds and exploration; ``seed`` itself for rank 0 at the start.
+        """Return the seed of this rank's worlds and exploration; ``seed`` itself for rank 0 at the start.
 
         iteration: of a resumed run: ranks but 0, whose random state no checkpoint holds, begin a stream of their own.
         """
@@ -127,7 +127,7 @@ class Ranks:
             self._lifeline.hint = text
 
     def tell(self, value: Any) -> Any:
-        """The leader's value, everywhere (pickled; small things)."""
+        """Return the leader's value, everywhere (pickled; small things)."""
         if not self.several:
             return value
         box = [value]
@@ -139,7 +139,7 @@ class Ranks:
         self.any(False)
 
     def any(self, flag: bool) -> bool:
-        """Whether the flag is set on any rank; decided in host memory, so that no GPU is waited for."""
+        """Return whether the flag is set on any rank; decided in host memory, so that no GPU is waited for."""
         if not self.several:
             return flag
         votes = torch.tensor([int(flag)])
@@ -147,7 +147,7 @@ class Ranks:
         return bool(votes.item())
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
-        """``values`` summed over ranks, in place, on their device."""
+        """Return ``values`` summed over ranks, in place, on their device."""
         if self.several:
             dist.all_reduce(values)
         return values

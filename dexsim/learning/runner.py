@@ -87,7 +87,7 @@ class Runner(OnPolicyRunner):
         )
 
     def _whether_worlds(self, asked: bool | None) -> bool:
-        """Whether checkpoints hold the worlds' states: as asked, else where they are small."""
+        """Return whether checkpoints hold the worlds' states: as asked, else where they are small."""
         able = hasattr(self.env, "keep_worlds")
         if asked and self.ranks.size > 1:
             raise UserError("save_worlds=true: works with one process, not under torchrun; leave it out")
@@ -166,8 +166,8 @@ class Runner(OnPolicyRunner):
         return True
 
     def _moment(self) -> dict[str, Any]:
-        """All that a rollout changes, copied: what was saved in the middle of one that was broken off would not be the
-        run that did not stop."""
+        """Return all that a rollout changes, copied: what was saved in the middle of one that was broken off would
+        not be the run that did not stop."""
         return {
             "env": self.env.state_dict(),
             "worlds": self._worlds(),
@@ -184,7 +184,7 @@ class Runner(OnPolicyRunner):
             buffer.copy_(value)
 
     def _buffers(self) -> list[torch.Tensor]:
-        """What the networks keep beside weights: the observations' running normalization."""
+        """Return what the networks keep beside weights: the observations' running normalization."""
         return [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers()]
 
     def _worlds(self) -> dict[str, torch.Tensor]:
@@ -213,7 +213,7 @@ class Runner(OnPolicyRunner):
         return obs
 
     def _update(self) -> dict[str, float]:
-        """One PPO update. Raises UserError when it left something not finite, before that is saved."""
+        """Return one PPO update. Raises UserError when it left something not finite, before that is saved."""
         try:
             losses = self._updater.update()
         except RuntimeError:
@@ -231,7 +231,7 @@ class Runner(OnPolicyRunner):
         return losses
 
     def _finite(self) -> bool:
-        """Whether the weights and the observations' running normalization are finite."""
+        """Return whether the weights and the observations' running normalization are finite."""
         weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
         weights += [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers() if b.is_floating_point()]
         return bool(torch.stack([w.isfinite().all() for w in weights]).all())
@@ -250,7 +250,8 @@ class Runner(OnPolicyRunner):
         )
 
     def _config(self) -> dict[str, Any]:
-        """The config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked again."""
+        """Return the config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked
+        again."""
         agent = self.full_cfg["agent"]
         return (
             self.full_cfg | {"agent": agent | {"logger": "tensorboard"}}
@@ -259,7 +260,7 @@ class Runner(OnPolicyRunner):
         )
 
     def payload(self) -> dict[str, Any]:
-        """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
+        """Return the everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         learned = self.alg.save()
         return {
             "kind": "train",
@@ -337,6 +338,6 @@ class Runner(OnPolicyRunner):
         self.resumed = "the worlds go on where they were" if self._resumed_worlds else anew
 
     def policy(self) -> Any:
-        """The actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
+        """Return the actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
         self.alg.eval_mode()
         return self.alg.get_policy()

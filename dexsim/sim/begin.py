@@ -12,7 +12,7 @@ import warp as wp
 
 @cache
 def _kernel(real: type) -> tuple[wp.Kernel, Any]:
-    """The kernel, and the struct that it takes: what belongs to the state of N worlds."""
+    """Return the kernel, and the struct that it takes: what belongs to the state of N worlds."""
 
     @wp.struct
     class States:

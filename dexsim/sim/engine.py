@@ -33,7 +33,7 @@ class ContactPair:
 
 
 def geoms_of(model: mujoco.MjModel, kind: str, name: str) -> np.ndarray:
-    """Ids of the geoms that (kind, name) selects; raises UserError when the name is unknown."""
+    """Return the ids of the geoms that (kind, name) selects; raises UserError when the name is unknown."""
     if kind == "geom":
         gid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         if gid >= 0:
@@ -53,7 +53,7 @@ def geoms_of(model: mujoco.MjModel, kind: str, name: str) -> np.ndarray:
 
 
 def _pairs(flags: int) -> str:
-    """What the peak of contacts does not show."""
+    """Return what the peak of contacts does not show."""
     return ", pairs that come near, which count against sim.nconmax too" if flags & NEAR_BIT else ""
 
 
@@ -107,7 +107,7 @@ class Engine:
         return np.array([self.mjm.jnt_dofadr[self.joint(j)] for j in joints], dtype=np.int32)
 
     def pair(self, name: str) -> int:
-        """Column of a contact pair in pair_normal and pair_force."""
+        """Return the column of a contact pair in pair_normal and pair_force."""
         for k, p in enumerate(self.pairs):
             if p.name == name:
                 return k
@@ -155,8 +155,8 @@ class Engine:
         self.set_state(mask, qpos, torch.zeros_like(self.t.qvel))
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """What one step leaves to the next, live: state, warm start, applied forces, model fields by world. Whole
-        numbers with their lowest and highest."""
+        """Return what one step leaves to the next, live: state, warm start, applied forces, model fields by world.
+        Whole numbers with their lowest and highest."""
         t = self.t
         out = {
             "time": t.time,

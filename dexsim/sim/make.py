@@ -25,7 +25,7 @@ MUJOCO_ITERATIONS = 50
 
 
 def engine_of(engine: str, device: str) -> str:
-    """The engine that `sim.engine` names on a device: "warp" or "mujoco"."""
+    """Return the engine that `sim.engine` names on a device: "warp" or "mujoco"."""
     if engine not in ("auto", "warp", "mujoco"):
         raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
     if engine == "auto":
@@ -34,7 +34,7 @@ def engine_of(engine: str, device: str) -> str:
 
 
 def newton_iterations(sim: Mapping[str, Any], engine: str) -> int:
-    """Newton iterations at most of "warp" or "mujoco", from the settings `sim`.
+    """Return Newton iterations at most of "warp" or "mujoco", from the settings `sim`.
 
     C MuJoCo gets `iterations_mujoco`, or `iterations` where that is more: its iterations are cheap, it stops by itself
     when it has converged (after 2 on average in a grasp), and cut off at 8 it throws an object out of a firm grasp now

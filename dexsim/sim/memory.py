@@ -8,7 +8,7 @@ from functools import cache
 
 @cache
 def _libc() -> ctypes.CDLL | None:
-    """GNU's C library, which alone keeps freed memory so; None elsewhere."""
+    """Return GNU's C library, which alone keeps freed memory so; None elsewhere."""
     try:
         found = ctypes.CDLL(None)
         found.malloc_trim.argtypes, found.malloc_trim.restype = [ctypes.c_size_t], ctypes.c_int

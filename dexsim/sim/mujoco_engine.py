@@ -196,7 +196,7 @@ class MujocoEngine(Engine):
         self._own_inertia = self._without_armature()
 
     def _without_armature(self) -> np.ndarray:
-        """Inertia [N, S] of the S dofs of `_simple`, kg.m2 or kg, less their armature."""
+        """Return the inertia [N, S] of the S dofs of `_simple`, kg.m2 or kg, less their armature."""
         i = self._simple
         return self._inertia[:, i] - self._fields["dof_armature"][:, i] if len(i) else np.zeros((self.n, 0))
 

@@ -31,7 +31,7 @@ class Tree:
 
 
 def tree(model: mujoco.MjModel, expanded: dict[str, np.ndarray]) -> Tree:
-    """The tree of `model`; `expanded` holds the fields that differ by world, [N, ...]."""
+    """Return the tree of `model`; `expanded` holds the fields that differ by world, [N, ...]."""
     t = Tree()
     for name, field in (
         ("parent", "body_parentid"), ("first_joint", "body_jntadr"), ("joints", "body_jntnum"), ("kind", "jnt_type"),
@@ -51,7 +51,7 @@ def tree(model: mujoco.MjModel, expanded: dict[str, np.ndarray]) -> Tree:
 
 @wp.func
 def times(a: wp.vec4d, b: wp.vec4d):
-    """Product of two quaternions (w x y z)."""
+    """Return the product of two quaternions (w x y z)."""
     return wp.vec4d(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -205,7 +205,7 @@ def check_worlds(
 
 
 def friction_rows(model: mujoco.MjModel) -> np.ndarray:
-    """[nv, 2] of the constraint that MuJoCo makes of a dof's dry friction: its impedance d, and B [1/s] of its
+    """Return [nv, 2] of the constraint that MuJoCo makes of a dof's dry friction: its impedance d, and B [1/s] of its
     reference acceleration -B v (MuJoCo's documentation, "Computation", "Parameters" of the constraint solver, at no
     distance)."""
     out = np.zeros((model.nv, 2))

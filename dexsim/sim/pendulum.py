@@ -8,7 +8,7 @@ import mujoco
 def pendulum_spec(
     mass: float = 0.1, length: float = 0.1, armature: float = 1e-4, timestep: float = 0.005
 ) -> mujoco.MjSpec:
-    """A point-like mass [kg] at `length` [m] on a hinge `joint` about y, hanging at q = 0; gravity along -z.
+    """Return a point-like mass [kg] at `length` [m] on a hinge `joint` about y, hanging at q = 0; gravity along -z.
 
     About the hinge the inertia is mass * length^2 + 2/5 mass r^2 (r = 5 mm) + armature [kg.m^2]; positive q swings the
     mass toward -x, and the gravity torque is -mass g length sin(q).

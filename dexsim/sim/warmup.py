@@ -32,7 +32,7 @@ def compile_side_by_side(program: Callable[[], None], device: str) -> int:
 
 
 def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
-    """(module, threads a block) of each kernel that `program` launches, in order, none twice."""
+    """Return (module, threads a block) of each kernel that `program` launches, in order, none twice."""
     found: dict[tuple[int, int], tuple[Any, int]] = {}
     with _instead_of_launching(
         lambda module, block_dim: found.setdefault((id(module), block_dim), (module, block_dim))

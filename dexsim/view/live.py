@@ -299,8 +299,8 @@ class LiveView:
         self._facts.content = panels.facts(self._about(w))
 
     def _commanded(self, world: int) -> np.ndarray | None:
-        """Commanded force of each finger (N), NaN for those that press against the others, which are not told one; None
-        without commands."""
+        """Return commanded force of each finger (N), NaN for those that press against the others, which are not told
+        one; None without commands."""
         command, full = getattr(self.env, "command", None), getattr(self.env, "f_max", None)
         if command is None or full is None or command.dim() != 1:
             return None
@@ -376,7 +376,7 @@ class LiveView:
         self._show_world()
 
     def _obey(self) -> bool:
-        """Do what the page asked for; True where the state was changed or another world is looked at."""
+        """Return the do what the page asked for; True where the state was changed or another world is looked at."""
         env, w = self.env, self.wishes
         changed = w.world != self._world
         if changed:
@@ -411,7 +411,7 @@ class LiveView:
 
 
 def _lighter(rgba: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """A black hand shows no form in a browser's plain light: dark colours are lifted."""
+    """Return a black hand shows no form in a browser's plain light: dark colours are lifted."""
     r, g, b = (c + 0.16 * (1 - c) ** 2 for c in rgba[:3])
     return r, g, b
 

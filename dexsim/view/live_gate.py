@@ -44,7 +44,7 @@ class Gate:
         self._lock = threading.Lock()
 
     def reason(self, path: str, headers: Any) -> tuple[int, str] | None:
-        """Why a request is refused (HTTP status, text), or None. headers: multi-valued, by name, any case."""
+        """Return why a request is refused (HTTP status, text), or None. headers: multi-valued, by name, any case."""
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or not (host := _name(hosts[0])):
             return 400, "one Host header is needed"
@@ -59,7 +59,7 @@ class Gate:
         return None
 
     def cookie(self, path: str) -> str | None:
-        """The Set-Cookie that keeps the token of an address, None where it has none."""
+        """Return the Set-Cookie that keeps the token of an address, None where it has none."""
         if not self.token or not _same(_query_token(path), self.token):
             return None
         return f"dexsim={self.token}; Path=/; HttpOnly; SameSite=Strict"
@@ -190,23 +190,23 @@ def only_known(server: Any, checks: dict[str, Callable[[Any], bool]]) -> None:
 
 
 def number(low: float, high: float) -> Callable[[Any], bool]:
-    """Whether a value is a finite number in [low, high]."""
+    """Return whether a value is a finite number in [low, high]."""
     return lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) and low <= v <= high
 
 
 def one_of(choices: Any) -> Callable[[Any], bool]:
-    """Whether a value is one of these texts."""
+    """Return whether a value is one of these texts."""
     known = frozenset(choices)
     return lambda v: isinstance(v, str) and v in known
 
 
 def truth(v: Any) -> bool:
-    """Whether a value is true or false."""
+    """Return whether a value is true or false."""
     return isinstance(v, bool)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to serve at is reached from this machine alone."""
+    """Return whether an address to serve at is reached from this machine alone."""
     if host == "localhost":
         return True
     try:
@@ -220,7 +220,7 @@ def _upgrades(headers: Any) -> bool:
 
 
 def _name(host: str) -> str:
-    """The name in a Host header, '' where it is none."""
+    """Return the name in a Host header, '' where it is none."""
     try:
         return (urlsplit(f"//{host}").hostname or "").rstrip(".")
     except ValueError:
@@ -228,7 +228,7 @@ def _name(host: str) -> str:
 
 
 def _place(origin: str) -> str:
-    """Host and port of a page's origin, '' where it is none."""
+    """Return the host and port of a page's origin, '' where it is none."""
     try:
         parts = urlsplit(origin)
     except ValueError:

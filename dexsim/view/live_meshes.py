@@ -21,8 +21,8 @@ class BodyMesh:
 
 
 def body_meshes(model: mujoco.MjModel) -> dict[int, list[BodyMesh]]:
-    """Meshes of each body, geoms of one colour merged; geoms of groups 0 to 2 as MuJoCo's own viewer shows them, parked
-    ones and planes left out."""
+    """Return the meshes of each body, geoms of one colour merged; geoms of groups 0 to 2 as MuJoCo's own viewer shows
+    them, parked ones and planes left out."""
     parts: dict[tuple[int, tuple], list[tuple[np.ndarray, np.ndarray]]] = {}
     for g in range(model.ngeom):
         rgba = model.mat_rgba[model.geom_matid[g]] if model.geom_matid[g] >= 0 else model.geom_rgba[g]
@@ -45,7 +45,7 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, list[BodyMesh]]:
 
 
 def _shape(model: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices and faces of one geom in its own frame; None for kinds that are not drawn."""
+    """Return the vertices and faces of one geom in its own frame; None for kinds that are not drawn."""
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
     t = mujoco.mjtGeom
     if kind == t.mjGEOM_MESH:
@@ -85,7 +85,7 @@ def _arc(radius: float, half: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turned(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of revolution about z of a profile [P]."""
+    """Return the surface of revolution about z of a profile [P]."""
     angle = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)
     vertices = np.stack(
         [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle), np.repeat(height[:, None], SIDES, 1)], -1

@@ -16,8 +16,8 @@ BAR, COMMAND, PLUS, MINUS = "#1f5fa8", "#e08a00", "#2e8b57", "#c0392b"
 
 
 def colours(values: np.ndarray, full: float) -> np.ndarray:
-    """RGB [..., 3] uint8 of forces (N): pale where nothing presses, through red to black-red at `full`; the square
-    root, so that a light touch shows."""
+    """Return RGB [..., 3] uint8 of forces (N): pale where nothing presses, through red to black-red at `full`; the
+    square root, so that a light touch shows."""
     x = np.sqrt(np.clip(values / max(full, 1e-9), 0.0, 1.0))[..., None]
     stops = np.array([[214, 222, 232], [255, 214, 102], [240, 80, 40], [90, 0, 20]], float)
     position = x * (len(stops) - 1)
@@ -66,17 +66,23 @@ class TaxelMap:
             self._inside.append(distance.min(-1) < 0.9 * np.median(spacing) + scale)
 
     def image(self, force: np.ndarray, full: float) -> np.ndarray:
-        """RGB image [H, W, 3] uint8 of forces [F, T] (N); `full` has the darkest colour."""
+        """Return an RGB image [H, W, 3] uint8 of forces [F, T] (N); `full` has the darkest colour."""
+        gap = np.broadcast_to(BACKGROUND, (PAD_HEIGHT, GAP, 3))
+        tiles = [part for tile in self.pictures(force, full) for part in (tile, gap)]
+        return np.ascontiguousarray(np.concatenate(tiles[:-1], 1))
+
+    def pictures(self, force: np.ndarray, full: float, background: np.ndarray = BACKGROUND) -> list[np.ndarray]:
+        """Return the same as one picture [H, W, 3] uint8 of each pad."""
         tiles = []
         for f in range(self.pads):
             tile = colours(force[f][self._nearest[f]], full)
-            tile[~self._inside[f]] = BACKGROUND
-            tiles += [tile, np.broadcast_to(BACKGROUND, (PAD_HEIGHT, GAP, 3))]
-        return np.ascontiguousarray(np.concatenate(tiles[:-1], 1))
+            tile[~self._inside[f]] = background
+            tiles.append(tile)
+        return tiles
 
 
 def force_bars(names: Sequence[str], force: np.ndarray, command: np.ndarray | None, full: float) -> str:
-    """One bar a finger: measured force (N), with a line at the commanded one. command [F] (NaN: none for this
+    """Return one bar a finger: measured force (N), with a line at the commanded one. command [F] (NaN: none for this
     finger)."""
     rows = []
     for k, name in enumerate(names):
@@ -103,8 +109,8 @@ def force_bars(names: Sequence[str], force: np.ndarray, command: np.ndarray | No
 
 
 def reward_bars(terms: Mapping[str, float], totals: Mapping[str, float], full: float) -> str:
-    """One bar a term: the reward of this step to the right (green) or left (red) of the middle; behind it the episode's
-    sum."""
+    """Return one bar a term: the reward of this step to the right (green) or left (red) of the middle; behind it the
+    episode's sum."""
     rows = []
     for name, value in terms.items():
         width = 50 * min(abs(value) / full, 1.0)

@@ -27,7 +27,7 @@ TITLES = {"reward": "reward of an episode", "length": "length of an episode (ste
 
 
 def read_progress(path: Path) -> dict[str, list[float]]:
-    """Columns of a run's ``progress.csv``; an empty cell is NaN. Raises UserError where there is none."""
+    """Return the columns of a run's ``progress.csv``; an empty cell is NaN. Raises UserError where there is none."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; train.py writes it into the run folder")
     with open(path, newline="", encoding="utf-8") as file:
@@ -37,7 +37,8 @@ def read_progress(path: Path) -> dict[str, list[float]]:
 
 
 def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path:
-    """Learning curves against environment steps: reward, episode length, then every logged term; saved to ``path``.
+    """Return the learning curves against environment steps: reward, episode length, then every logged term; saved to
+    ``path``.
 
     Thin line: each iteration; thick line: mean over a twentieth of the run.
     """
@@ -73,7 +74,7 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
 
 
 def _order(name: str) -> tuple[int, str]:
-    """Task terms first, then losses and the rest."""
+    """Return the task terms first, then losses and the rest."""
     return (1 if name.startswith(("Loss/", "Policy/", "Perf/")) else 0, name)
 
 
@@ -87,7 +88,7 @@ def smooth(values: Sequence[float], width: int) -> list[float]:
 
 
 def draw(functions: Sequence[Any], folder: Path) -> list[Path]:
-    """Each plot, a function of one axes or a pair (file name, function), saved as ``<name>.png``."""
+    """Return each plot, a function of one axes or a pair (file name, function), saved as ``<name>.png``."""
     paths = []
     for item in functions:
         name, function = item if isinstance(item, tuple) else (item.__name__, item)

@@ -10,6 +10,7 @@ import math
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypedDict
 
 import numpy as np
@@ -93,6 +94,11 @@ class Tile:
     def __init__(self, folder: Path, index: int, clip: dict[str, Any], settings: dict[str, Any]) -> None:
         import mujoco
 
+        from dexsim.view.decor import FULL_TAXEL, Decor
+        from dexsim.view.live_panels import TaxelMap
+        from dexsim.view.overlay import room
+
+        self._full_taxel = FULL_TAXEL
         self._mujoco, self._clip, self._settings = mujoco, clip, settings
         arrays = np.load(folder / f"{index}.npz")
         self.qpos = arrays["qpos"]
@@ -107,9 +113,18 @@ class Tile:
         model.vis.headlight.diffuse[:] = 0.55
         model.vis.headlight.specular[:] = 0.15
         model.vis.map.znear = 0.02
+        self._titled = bool(clip["label"] or clip["text"])
+        above, below = room(height, self._titled, self._force is not None)
+        self._height, height = height, height - above - below
+        self._taxels: Any = None
+        if "taxels" in arrays:
+            parts: Any = {name: arrays[f"taxel_{name}"] for name in ("point", "normal", "ty", "count")}
+            layout: Any = SimpleNamespace(pads=len(parts["count"]), **parts)
+            self._taxels, self._map = arrays["taxels"], TaxelMap(layout)
+        self._decor = Decor(model, arrays, clip["bodies"], clip["colours"]) if clip["decor"] else None
         self._sky = any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._model, self._data = model, mujoco.MjData(model)
-        self._renderer = mujoco.Renderer(model, height, width)
+        self._renderer = mujoco.Renderer(model, height, width, max_geom=20_000)
         self._camera = mujoco.MjvCamera()
         view = CAMERA | settings["camera"]
         self._camera.lookat[:] = view["lookat"]
@@ -118,33 +133,36 @@ class Tile:
         self._behind = backdrop(height, width)
 
     def frame(self, k: int) -> np.ndarray:
-        """Frame ``k`` [H, W, 3] uint8; past the end, the last one."""
-        from dexsim.view.overlay import annotate
+        """Return the frame ``k`` [H, W, 3] uint8; past the end, the last one."""
+        from dexsim.view.overlay import DARK, annotate
 
         k = min(k, len(self.qpos) - 1)
-        self._data.qpos[:] = self.qpos[k]
+        self._data.qpos[:] = self.qpos[k] if self._decor is None else self._decor.turn(k, self.qpos[k])
         self._mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
+        if self._decor is not None:
+            self._decor.draw(self._renderer.scene, self._data, k)
         image = self._renderer.render()
         if not self._sky:
             image = np.where(image.any(axis=2, keepdims=True), image, self._behind)
+        pads = None if self._taxels is None else self._map.pictures(self._taxels[k], self._full_taxel, np.array(DARK, np.uint8))
         lines = self._clip["text"]
         text = "   ".join(t for t in (self._clip["label"], lines[min(k, len(lines) - 1)] if lines else "") if t)
         return annotate(
             image, text, None if self._force is None else self._force[min(k, len(self._force) - 1)],
             None if self._command is None else self._command[min(k, len(self._command) - 1)],
-            self._settings["names"], self._settings["full"])
+            self._settings["names"], self._settings["full"], self._height, pads)
 
 
 def backdrop(height: int, width: int) -> np.ndarray:
-    """A quiet grey-blue gradient [H, W, 3] uint8 where nothing was drawn."""
+    """Return a quiet grey-blue gradient [H, W, 3] uint8 where nothing was drawn."""
     mix = np.linspace(0.0, 1.0, height)[:, None, None]
     colour = (1 - mix) * np.array([206, 214, 224]) + mix * np.array([120, 132, 148])
     return np.broadcast_to(colour, (height, width, 3)).astype(np.uint8)
 
 
 def grid(tiles: list[np.ndarray]) -> np.ndarray:
-    """Tiles [H, W, 3] in rows: 1, 1x2, 2x2, 2x3, 3x3 ...; empty places stay dark."""
+    """Return the tiles [H, W, 3] in rows: 1, 1x2, 2x2, 2x3, 3x3 ...; empty places stay dark."""
     across = math.ceil(math.sqrt(len(tiles)))
     down = math.ceil(len(tiles) / across)
     blank = np.full_like(tiles[0], 24)

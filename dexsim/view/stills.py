@@ -37,7 +37,7 @@ class Shot:
     groups: Sequence[int] = field(default_factory=lambda: (0, 1, 2))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels [P, 2] (right, down from the upper left corner) of points [P, 3] m of the world."""
+        """Return the pixels [P, 2] (right, down from the upper left corner) of points [P, 3] m of the world."""
         az, el = np.radians(self.azimuth), np.radians(self.elevation)
         ahead = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
         right = np.array([np.sin(az), -np.cos(az), 0.0])
@@ -51,7 +51,7 @@ class Shot:
 
 
 def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
-    """The pictures [H, W, 3] uint8. Raises `dexsim.view.video.NoRenderer` where no OpenGL backend works."""
+    """Return the pictures [H, W, 3] uint8. Raises `dexsim.view.video.NoRenderer` where no OpenGL backend works."""
     import mujoco
 
     from dexsim.view import video
@@ -81,7 +81,7 @@ def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
 
 
 def main(folder: Path) -> int:
-    """The rendering process."""
+    """Return the rendering process."""
     import mujoco
 
     from dexsim.view.render import NO_GL, backdrop, why

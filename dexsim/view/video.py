@@ -29,7 +29,10 @@ class Clip:
     """One world's film.
 
     model: mujoco.MjModel; qpos [T, nq]; label: a line of text; force [T, F] measured force of each finger (N) and
-    command [T] or [T, F] (N), drawn as bars, or None; text: a line for each frame, or none.
+    command [T] or [T, F] (N), drawn as bars, or None; text: a line for each frame, or none. What is drawn in the scene
+    beside the model: push [T, 3] N on the object, an arrow; taxels [T, F, K] N of a layout
+    (`dexsim.tactile.layout.TaxelLayout`), lit; gravity [T, 3] m/s^2, by which the hand is turned; colours: six for a
+    box's faces; decor: a table and a forearm.
     """
 
     model: Any
@@ -38,6 +41,12 @@ class Clip:
     force: np.ndarray | None = None
     command: np.ndarray | None = None
     text: Sequence[str] = field(default_factory=tuple)
+    push: np.ndarray | None = None
+    taxels: np.ndarray | None = None
+    layout: Any = None
+    gravity: np.ndarray | None = None
+    colours: bool = False
+    decor: bool = False
 
 
 class NoRenderer(UserError):
@@ -45,15 +54,17 @@ class NoRenderer(UserError):
 
 
 def clips_of(frames: dict[str, Any]) -> list[Clip]:
-    """Clips from the ``frames`` of ``env.evaluate``: lists ``model``, ``qpos`` and, where there are any, ``overlay``
-    (dicts with ``force``, ``command``, ``text``) and ``label``, one entry for each shown world."""
+    """Return the clips from the ``frames`` of ``env.evaluate``: lists ``model``, ``qpos`` and, where there are any,
+    ``overlay`` (dicts with ``force``, ``command``, ``text``, ``push``, ``taxels``, ``layout``, ``gravity``) and
+    ``label``, one entry for each shown world; ``colours`` for all."""
     clips = []
     for k, (model, qpos) in enumerate(zip(frames["model"], frames["qpos"])):
         overlay = (frames.get("overlay") or [{}] * (k + 1))[k]
         labels = frames.get("label")
         clips.append(Clip(model, np.asarray(qpos, np.float64), labels[k] if labels else "",
                           _array(overlay.get("force")), _array(overlay.get("command")),
-                          tuple(overlay.get("text") or ())))
+                          tuple(overlay.get("text") or ()), _array(overlay.get("push")), _array(overlay.get("taxels")),
+                          overlay.get("layout"), _array(overlay.get("gravity")), bool(frames.get("colours")), True))
     return clips
 
 
@@ -104,14 +115,27 @@ def _hand_over(folder: Path, clips: Sequence[Clip], settings: dict[str, Any]) ->
 
     for k, clip in enumerate(clips):
         mujoco.mj_saveModel(clip.model, str(folder / f"{k}.mjb"), None)
-        arrays = {n: getattr(clip, n) for n in ("qpos", "force", "command") if getattr(clip, n) is not None}
+        names = ("qpos", "force", "command", "push", "taxels", "gravity")
+        arrays = {n: getattr(clip, n) for n in names if getattr(clip, n) is not None}
+        if clip.taxels is not None:
+            for name in ("point", "normal", "ty", "count"):
+                arrays[f"taxel_{name}"] = getattr(clip.layout, name)
         np.savez(folder / f"{k}.npz", **arrays)
-    settings["clips"] = [{"label": clip.label, "text": list(clip.text)} for clip in clips]
+    settings["clips"] = [
+        {
+            "label": clip.label,
+            "text": list(clip.text),
+            "bodies": [] if clip.taxels is None else list(clip.layout.bodies),
+            "colours": clip.colours,
+            "decor": clip.decor,
+        }
+        for clip in clips
+    ]
     (folder / "settings.json").write_text(json.dumps(settings), "utf-8")
 
 
 def _run(folder: Path, path: Path, backend: str, progress: Callable[[int, int], None]) -> tuple[int, str]:
-    """One try with one backend: exit status and the last line it said."""
+    """Return one try with one backend: exit status and the last line it said."""
     env = os.environ | system.renderer_environment(backend)
     command = [sys.executable, "-m", "dexsim.view.render", str(folder), str(path)]
     last = ""

@@ -21,7 +21,7 @@ INLINE = re.compile(r"\$`([^`\n]+)`\$")
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """A page's Markdown before it is rendered. Raises KeyError for a generated table that does not exist."""
+    """Return a page's Markdown before it is rendered. Raises KeyError for a generated table that does not exist."""
     markdown = GENERATED.sub(lambda m: reference.PAGES[m[1]](), markdown)
     markdown = BLOCK.sub(
         lambda m: "".join(f"<p>{convert(line, display='block')}</p>\n" for line in m[1].split("\\\\\n")), markdown

@@ -32,25 +32,25 @@ class Setting:
 
 
 def config_folder() -> Path:
-    """Where the config files lie."""
+    """Return where the config files lie."""
     return ROOT / "dexsim" / "configs"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; bars in cells are escaped."""
+    """Return a Markdown table; bars in cells are escaped."""
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     lines += ["| " + " | ".join(_cell(str(cell)) for cell in row) + " |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
 def _cell(text: str) -> str:
-    """Bars would end the cell; outside code, <word> would be taken for HTML."""
+    """Return the bars would end the cell; outside code, <word> would be taken for HTML."""
     text = text.replace("|", "\\|")
     return text if text.startswith("`") else text.replace("<", "&lt;")
 
 
 def leaves(path: Path) -> list[Setting]:
-    """Every setting of a config file in its order; Hydra's `defaults` list is left out.
+    """Return every setting of a config file in its order; Hydra's `defaults` list is left out.
 
     A mapping written on one line is one setting. Comments are those on the line on which a key stands.
     """
@@ -86,7 +86,7 @@ def leaves(path: Path) -> list[Setting]:
 
 
 def heading_comment(path: Path) -> str:
-    """The comment lines at the top of a config file as one text."""
+    """Return the comment lines at the top of a config file as one text."""
     top: list[str] = []
     for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
@@ -96,7 +96,7 @@ def heading_comment(path: Path) -> str:
 
 
 def settings() -> str:
-    """All groups, their options, and every setting of every config file but the drawn numbers of realities."""
+    """Return all groups, their options, and every setting of every config file but the drawn numbers of realities."""
     folder, out = config_folder(), []
     names = [
         *ORDER,
@@ -135,7 +135,7 @@ def _rows(path: Path, prefix: str = "") -> str:
 
 
 def columns() -> str:
-    """The servo table's columns."""
+    """Return the servo table's columns."""
     from dexsim.actuator.columns import COLUMNS
 
     return table(
@@ -145,7 +145,7 @@ def columns() -> str:
 
 
 def effects() -> str:
-    """The catalogue of the diagnosis: effects of joints, then of touch and contact."""
+    """Return the catalogue of the diagnosis: effects of joints, then of touch and contact."""
     from dexsim.gap.effects import catalogue
 
     head = ("effect", "what it means", "where it shows", "what shows it best", "may be confused with")
@@ -162,7 +162,7 @@ def effects() -> str:
 
 
 def rules() -> str:
-    """The figures that the diagnosis decides by."""
+    """Return the figures that the diagnosis decides by."""
     from dexsim.gap.rules import RULES, described
 
     head = ("figure", "value", "what it means", "where its value came from")
@@ -175,14 +175,14 @@ def rules() -> str:
 
 
 def audit() -> str:
-    """Kinds of findings of the recording's audit."""
+    """Return the kinds of findings of the recording's audit."""
     from dexsim.recording.audit import KINDS
 
     return table(("kind", "meaning"), [(f"`{k}`", v) for k, v in KINDS.items()])
 
 
 def metadata() -> str:
-    """Topics and metadata keys of a recording."""
+    """Return the topics and metadata keys of a recording."""
     from dexsim.recording.schema import DEFAULTS, KEYS, TOPICS, UNIT_KEYS
 
     topics = table(("topic", "ROS 2 type"), [(f"`{k}`", f"`{v}`") for k, v in TOPICS.items()])
@@ -195,7 +195,7 @@ def metadata() -> str:
 
 
 def commands() -> str:
-    """What `dexsim COMMAND --help` prints, for every command."""
+    """Return what `dexsim COMMAND --help` prints, for every command."""
     from dexsim.cli.main import COMMANDS, dispatch
 
     out = []

@@ -40,7 +40,7 @@ class TooLong(BaseException):
 
 
 def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tuple[str, str, Path]:
-    """(fine, refused, traceback, over 20 s, over 2 GB, message, silent; what, the file) of a case."""
+    """Return (fine, refused, traceback, over 20 s, over 2 GB, message, silent; what, the file) of a case."""
     mutate.clean(folder)
     path = mutate.case(kind, seed, files, folder)
 

@@ -124,7 +124,7 @@ TREES = {
 
 
 def recording(seconds: float = 1.5, tactile: bool = True, config: str | None = None) -> Recording:
-    """Two joints at 100 Hz, touch and an object now and then."""
+    """Return two joints at 100 Hz, touch and an object now and then."""
     t = np.arange(0, seconds, 0.01)
     q = np.stack([0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t)], 1)
     meta = schema.DEFAULTS | {
@@ -190,7 +190,7 @@ def build(folder: Path) -> dict[str, list[Path]]:
 
 
 def objects(folder: Path) -> list[Path]:
-    """A box as meshes and as an imported object."""
+    """Return a box as meshes and as an imported object."""
     box, made = trimesh.creation.box((0.04, 0.05, 0.06)), []
     for end in ("obj", "stl", "ply"):
         made.append(folder / f"mesh.{end}")
@@ -232,7 +232,7 @@ def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
 
 
 def checkpoint_payload() -> dict:
-    """A whole training's checkpoint, its networks and worlds tiny."""
+    """Return a whole training's checkpoint, its networks and worlds tiny."""
     import torch
 
     from dexsim.cli import start

@@ -78,7 +78,7 @@ WORDS = (
 
 
 def bytes_(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
-    """A few edits of a file's bytes."""
+    """Return a few edits of a file's bytes."""
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 8))):
         n = len(out)
@@ -111,7 +111,7 @@ def bytes_(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
 
 
 def tree(value: Any, rng: np.random.Generator) -> Any:
-    """One to three changes of plain data: values replaced, keys lost, renamed, exchanged."""
+    """Return one to three changes of plain data: values replaced, keys lost, renamed, exchanged."""
     root = [copy.deepcopy(value)]
     for _ in range(int(rng.integers(1, 4))):
         node, key = root, 0
@@ -140,7 +140,7 @@ def tree(value: Any, rng: np.random.Generator) -> Any:
 
 
 def text_of(kind: str, rng: np.random.Generator) -> bytes:
-    """A damaged YAML file of a kind."""
+    """Return a damaged YAML file of a kind."""
     text = yaml.dump(
         tree(corpus.TREES[kind], rng),
         Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
@@ -247,7 +247,7 @@ def _checkpoint(rng: np.random.Generator, source: Path, folder: Path) -> Path:
 
 
 def _manifest(rng: np.random.Generator, source: Path, folder: Path) -> Path:
-    """The manifest of a bundle whose other files are sound."""
+    """Return the manifest of a bundle whose other files are sound."""
     case = folder / "case"
     case.mkdir()
     for name in ("policy.onnx", "golden.npz", "config.yaml"):
@@ -261,7 +261,7 @@ def _manifest(rng: np.random.Generator, source: Path, folder: Path) -> Path:
 
 
 def _overrides(rng: np.random.Generator, source: Path, folder: Path) -> Path:
-    """Lines of a command: values and names exchanged, dropped, prefixed."""
+    """Return the lines of a command: values and names exchanged, dropped, prefixed."""
     lines = source.read_text().splitlines()
     for _ in range(int(rng.integers(1, 4))):
         k = int(rng.integers(0, len(lines)))

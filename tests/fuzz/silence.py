@@ -38,12 +38,12 @@ ABOUT_NUMBERS = ("position_unit", "time_unit")
 
 
 def signal(t: np.ndarray) -> np.ndarray:
-    """Targets [T, 2] rad of the sound recordings at t [s]; their positions are 0.03 s behind."""
+    """Return the targets [T, 2] rad of the sound recordings at t [s]; their positions are 0.03 s behind."""
     return np.stack([0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t)], 1)
 
 
 def of_recording(path: Path, r: Recording, runs: list[Run], words: set[tuple[str, str]]) -> str:
-    """What is wrong and was not said; "" where nothing is. words: (topic, kind) of all that was said."""
+    """Return what is wrong and was not said; "" where nothing is. words: (topic, kind) of all that was said."""
     if path.suffix == ".csv" or any(r.meta.get(k) for k in ABOUT_NUMBERS):
         return ""
     shift = 1e-9 * (r.start_ns - START_NS) if path.suffix == ".mcap" else 0.0
@@ -69,14 +69,14 @@ def of_recording(path: Path, r: Recording, runs: list[Run], words: set[tuple[str
 
 
 def _shifted(t: np.ndarray, x: np.ndarray, behind: float, columns: list[int]) -> bool:
-    """Whether values [T, J] are those of another time, all by as much."""
+    """Return whether values [T, J] are those of another time, all by as much."""
     return any(
         (np.abs(x - signal(t - s - behind)[:, columns])[t - s > SETTLED] < TOLERANCE).all() for s in SHIFTS
     )
 
 
 def of_settings(said: Any, taken: Any, path: str = "") -> str:
-    """The first value of a file's tree that is not, or is another, in what was taken; "" where all are there."""
+    """Return the first value of a file's tree that is not, or is another, in what was taken; "" where all are there."""
     if isinstance(said, Mapping) and isinstance(taken, (list, tuple)):  # a range
         said = [said.get("low"), said.get("high")]
     if isinstance(said, Mapping) and set(said) == {"value"} and not isinstance(taken, Mapping):

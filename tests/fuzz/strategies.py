@@ -28,7 +28,7 @@ seeds = st.integers(0, 2**40)
 
 @st.composite
 def trees(draw, kind: str):
-    """A sound tree of a kind with one place exchanged for anything."""
+    """Return a sound tree of a kind with one place exchanged for anything."""
     root = [copy.deepcopy(corpus.TREES[kind])]
     node, key = root, 0
     for _ in range(draw(st.integers(0, 6))):

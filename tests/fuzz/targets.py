@@ -55,7 +55,8 @@ def recording(path: Path) -> str:
 
 
 def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
-    """(what was read, the runs that a diagnosis would use, what it would say); None where it uses none, and says so."""
+    """Return (what was read, the runs that a diagnosis would use, what it would say); None where it uses none, and
+    says so."""
     r = read(path)
     spec = mujoco.MjSpec.from_string(MODEL)
     m = Mechanism(spec, corpus.JOINTS, ServoTable.from_dict(corpus.SERVO), "rig")
@@ -77,7 +78,7 @@ def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
 
 
 def _always() -> Told:
-    """What is said of a sound recording, too."""
+    """Return what is said of a sound recording, too."""
     if not _sound:
         with tempfile.TemporaryDirectory() as folder:
             write(Path(folder) / "sound.mcap", corpus.recording())
@@ -151,7 +152,7 @@ def hand(path: Path) -> str:
 
 
 def object_(path: Path) -> str:
-    """A mesh to grasp, or a folder of import-object."""
+    """Return a mesh to grasp, or a folder of import-object."""
     if path.suffix == ".npz":
         folder = path.parent / "case_object"
         folder.mkdir()
@@ -161,7 +162,7 @@ def object_(path: Path) -> str:
 
 
 def checkpoint(path: Path) -> str:
-    """Loaded, and its settings completed, as play does before it builds anything."""
+    """Return the loaded, and its settings completed, as play does before it builds anything."""
     start.for_play([f"checkpoint={path}", "device=cpu"], CONFIGS)
     return ""
 
@@ -172,7 +173,7 @@ def manifest(path: Path) -> str:
 
 
 def overrides(path: Path) -> str:
-    """The settings of a training, as far as they are checked before anything heavy begins."""
+    """Return the settings of a training, as far as they are checked before anything heavy begins."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     if any(line.lstrip("+~").startswith(("servo_file", "resume", "tactile_file", "model_file")) for line in lines):
         return ""
@@ -182,7 +183,7 @@ def overrides(path: Path) -> str:
 
 
 def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
-    """The first typed setting that is another in the settings that a training would begin with."""
+    """Return the first typed setting that is another in the settings that a training would begin with."""
     parser, asked = OverridesParser.create(), {}
     for line in lines:
         if line.startswith(("~", "+", "--")) or "=" not in line:

@@ -47,7 +47,7 @@ EVERY, PATIENCE = 10.0, 30.0
 
 
 def hours_of(worlds: int, iterations: int) -> float:
-    """Simulated hours of a training, all its worlds together."""
+    """Return the simulated hours of a training, all its worlds together."""
     return PERIOD * STEPS * worlds * iterations / 3600
 
 
@@ -69,15 +69,15 @@ def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
 
 
 def amounts(s: dict[str, str], name: str) -> tuple[float, str]:
-    """(what a part of this name has to do, its unit)."""
+    """Return (what a part of this name has to do, its unit)."""
     part, shares = name.rstrip("0123456789"), dict(x.split(":") for x in s["processes"].split(","))
     n = int(shares.get(part, 1)) if part != "training" else 1
     return float(s[part].rstrip("h")) / n, UNITS[part]
 
 
 def done(s: dict[str, str], out: Path, name: str) -> tuple[float, float] | None:
-    """(how much of its work a part has done, in its unit, MiB that it keeps between two pieces of it, NaN where it has
-    none); None before its first turn."""
+    """Return (how much of its work a part has done, in its unit, MiB that it keeps between two pieces of it, NaN
+    where it has none); None before its first turn."""
     try:
         if name != "training":
             worked, kept, *_ = [*map(float, (out / name / "done").read_text().split()), math.nan]
@@ -93,7 +93,7 @@ def done(s: dict[str, str], out: Path, name: str) -> tuple[float, float] | None:
 
 
 def state(s: dict[str, str], out: Path, name: str, child: subprocess.Popen, watch: Watch, cut: bool) -> dict[str, Any]:
-    """A part as it is now."""
+    """Return a part as it is now."""
     amount, unit = amounts(s, name)
     found = judge(watch.rows)
     said = (out / f"{name}.log").read_text(errors="replace").strip().splitlines() or [""]

@@ -69,7 +69,7 @@ class Lagging:
 
 
 def deploy(hours: float, folder: Path) -> str:
-    """The loop with the included grasp policy for so many hours of its own time."""
+    """Return the loop with the included grasp policy for so many hours of its own time."""
     import torch
 
     from dexsim import export
@@ -95,7 +95,7 @@ def deploy(hours: float, folder: Path) -> str:
 
 
 def envs(count: float, folder: Path) -> str:
-    """Environments made, stepped and closed, of both tasks, of one to seven worlds."""
+    """Return the environments made, stepped and closed, of both tasks, of one to seven worlds."""
     import torch
 
     from dexsim.cli import start
@@ -156,7 +156,7 @@ def diagnoses(count: float, folder: Path) -> str:
 
 
 def plays(count: float, folder: Path) -> str:
-    """`dexsim play` with the included grasp policy, its plots and a recording each time; prints memory."""
+    """Return `dexsim play` with the included grasp policy, its plots and a recording each time; prints memory."""
     from dexsim.cli.main import main
 
     heaps = []

@@ -29,7 +29,7 @@ HANDLES = 2
 
 
 def look(pid: int) -> tuple[float, float, int, int] | None:
-    """(anonymous, resident memory in MiB, open files, threads) of a process; None when it is gone."""
+    """Return (anonymous, resident memory in MiB, open files, threads) of a process; None when it is gone."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
         status = dict(line.split(":", 1) for line in lines)
@@ -40,7 +40,7 @@ def look(pid: int) -> tuple[float, float, int, int] | None:
 
 
 def gpu_mib() -> float:
-    """Memory in use on the first GPU that programs may use, MiB; NaN without one."""
+    """Return the memory in use on the first GPU that programs may use, MiB; NaN without one."""
     first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] or "0"
     ask = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", f"--id={first}"]
     try:
@@ -117,7 +117,7 @@ def judge(rows: list[tuple[float, ...]]) -> dict[str, dict[str, float]]:
 
 
 def grows(found: dict[str, dict[str, float]]) -> list[str]:
-    """Columns that grew by more than is allowed, beyond doubt."""
+    """Return the columns that grew by more than is allowed, beyond doubt."""
     out = []
     for name, f in found.items():
         allowed = max(GROWTH_MIB, GROWTH_SHARE * f["mean"]) if name.endswith("_mib") else HANDLES

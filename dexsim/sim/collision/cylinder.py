@@ -56,7 +56,7 @@ def off(half: wp.vec3, x: wp.vec3) -> wp.vec3:
 
 @wp.func
 def furthest(half: wp.vec3, u: wp.vec3) -> wp.vec3:
-    """The point of the cylinder that is furthest along u [m]; of a whole cap its centre."""
+    """Return the point of the cylinder that is furthest along u [m]; of a whole cap its centre."""
     flat = wp.sqrt(u[0] * u[0] + u[1] * u[1])
     k = float(0.0)
     if flat > 0.0:
@@ -66,7 +66,7 @@ def furthest(half: wp.vec3, u: wp.vec3) -> wp.vec3:
 
 @wp.func
 def stands_off(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3) -> float:
-    """How far [m] the body is beyond the cylinder along the unit direction u: see gjk.separation."""
+    """Return how far [m] the body is beyond the cylinder along the unit direction u: see gjk.separation."""
     return wp.dot(u, R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * u))) + p - furthest(half, u))
 
 
@@ -97,7 +97,7 @@ def on_corner(half: wp.vec3, a: wp.vec3, i: int) -> Nearest:
 
 @wp.func
 def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
-    """What of the segment a, b is nearest to the cylinder."""
+    """Return what of the segment a, b is nearest to the cylinder."""
     e = b - a
     low = float(0.0)
     high = float(1.0)
@@ -154,7 +154,7 @@ def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
 
 @wp.func
 def beside(y: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """The corner nearest to y: from there a height above the face suffers least from what its normal is off."""
+    """Return the corner nearest to y: from there a height above the face suffers least from what its normal is off."""
     p = a
     if wp.length_sq(b - y) < wp.length_sq(p - y):
         p = b
@@ -165,7 +165,7 @@ def beside(y: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
 
 @wp.func
 def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> Nearest:
-    """The triangle's nearest point if that is within, else `none`: then an edge has it, or one as near."""
+    """Return the triangle's nearest point if that is within, else `none`: then an edge has it, or one as near."""
     n = wp.cross(b - a, c - a)
     area = wp.length(n)
     if area <= 1.0e-14:
@@ -213,7 +213,7 @@ def number(s: Nearest, k: int) -> int:
 
 @wp.func
 def with_corner(half: wp.vec3, s: Nearest, w: wp.vec3, i: int) -> Nearest:
-    """What of the feature and one more corner is nearest to the cylinder; the corner has a part in it."""
+    """Return what of the feature and one more corner is nearest to the cylinder; the corner has a part in it."""
     best = none()
     face = none()
     for k in range(s.n):  # not known in advance: a loop that is not unrolled compiles in a third of the time
@@ -231,7 +231,7 @@ def with_corner(half: wp.vec3, s: Nearest, w: wp.vec3, i: int) -> Nearest:
 
 @wp.func
 def begin(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i) -> Nearest:
-    """The nearest of the corners numbered in `first` (-1: none), where the body is now."""
+    """Return the nearest of the corners numbered in `first` (-1: none), where the body is now."""
     i = first[0]
     if i < 0 or i >= corners(b):
         i = support(b, vertex, -(wp.transpose(R) * p))
@@ -250,7 +250,7 @@ def begin(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
 def from_cylinder(
     half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
 ) -> Nearest:
-    """What of the body b is nearest to the cylinder; g is zero if they overlap, or that cannot be told.
+    """Return what of the body b is nearest to the cylinder; g is zero if they overlap, or that cannot be told.
 
     R, p: the body's frame in the cylinder's. first: numbers of corners to begin with. cutoff [m]: bodies that are shown
     to be further apart need no exact answer; then |g| is at least the cutoff.
@@ -284,7 +284,7 @@ def from_cylinder(
 
 @wp.func
 def beside_side(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, s: Nearest) -> Nearest:
-    """Where the nearest is an edge beside the round side: its point by the edge's own direction.
+    """Return where the nearest is an edge beside the round side: its point by the edge's own direction.
 
     Of two positions' difference a short edge is off by 1e-4 rad seen along the axis, and where edge and axis are at a
     small angle the place goes with that (see gjk.crossing).
@@ -320,7 +320,7 @@ class Way:
 
 @wp.func
 def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
-    """Along u for a feature with the point a, where the rim is furthest along it."""
+    """Return the along u for a feature with the point a, where the rim is furthest along it."""
     w = Way()
     w.found = 1
     w.u = u
@@ -330,7 +330,7 @@ def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
 
 @wp.func
 def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
-    """The way out for a corner through the side or through a cap, whichever is nearer to `about`, if it is below
+    """Return the way out for a corner through the side or through a cap, whichever is nearer to `about`, if it is below
     that."""
     u = wp.vec3(0.0, 0.0, wp.where(about[2] > 0.0, 1.0, -1.0))
     rho = wp.sqrt(a[0] * a[0] + a[1] * a[1])
@@ -345,8 +345,8 @@ def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
 
 @wp.func
 def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
-    """The shortest way out for the edge a, b among directions across it that are near `about`: over a rim, or past the
-    side."""
+    """Return the shortest way out for the edge a, b among directions across it that are near `about`: over a rim, or
+    past the side."""
     length = wp.length(b - a)
     e = (b - a) / length
     c = wp.normalize(about - wp.dot(about, e) * e)
@@ -381,7 +381,7 @@ def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
 
 @wp.func
 def past_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, about: wp.vec3) -> Way:
-    """The way out along the normal of a triangle."""
+    """Return the way out along the normal of a triangle."""
     w = Way()
     n = wp.cross(b - a, c - a)
     if wp.dot(n, n) > 0.0:
@@ -392,8 +392,8 @@ def past_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, about: wp.vec3)
 
 @wp.func
 def past(half: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, about: wp.vec3, i: wp.vec3i) -> Way:
-    """The way out past the feature of corners c, near the direction `about`. Where their numbers i are the same it has
-    fewer."""
+    """Return the way out past the feature of corners c, near the direction `about`. Where their numbers i are the
+    same it has fewer."""
     if i[0] == i[1] and i[0] == i[2]:
         return past_corner(half, c0, about)
     if i[0] == i[1]:
@@ -405,8 +405,8 @@ def past(half: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, about: wp.vec3, i
 
 @wp.func
 def lowest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> wp.vec3i:
-    """The numbers of the three corners that are least along d (in the body's frame); the last again where there are but
-    two."""
+    """Return the numbers of the three corners that are least along d (in the body's frame); the last again where
+    there are but two."""
     i = wp.vec3i(0, 0, 0)
     h = wp.vec3(FAR, FAR, FAR)
     for k in range(corners(b)):
@@ -427,8 +427,8 @@ def lowest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> wp.vec3i:
 
 @wp.func
 def widest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, first: wp.vec3i) -> wp.vec3i:
-    """Three corners far apart of the face that is lowest along d (in the body's frame), which tell its normal best;
-    `first`, the three lowest, if no more are as low."""
+    """Return three corners far apart of the face that is lowest along d (in the body's frame), which tell its normal
+    best; `first`, the three lowest, if no more are as low."""
     c0 = corner(b, vertex, first[0])
     level = wp.dot(d, c0) + FLAT
     out = first
@@ -455,8 +455,8 @@ def widest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, first: wp.vec3i
 
 @wp.func
 def side(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, y: wp.vec3, near: wp.vec3i) -> wp.vec2i:
-    """The ends of the edge beyond which y lies, of the face that is lowest along the unit direction d; (-1, -1) if y is
-    within. All in the body's frame; near: three of the face's corners."""
+    """Return the ends of the edge beyond which y lies, of the face that is lowest along the unit direction d; (-1,
+    -1) if y is within. All in the body's frame; near: three of the face's corners."""
     level = wp.dot(d, corner(b, vertex, near[0])) + FLAT
     out = wp.vec2i(-1, -1)
     furthest_off = float(0.0)
@@ -484,7 +484,7 @@ def side(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, y: wp.vec3, near:
 def rounder(
     half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, about: wp.vec3, on: wp.vec3i
 ) -> Way:
-    """The way out of the round cylinder near that of the prism, whose facets are chords.
+    """Return the way out of the round cylinder near that of the prism, whose facets are chords.
 
     about: the prism's. on: the body's corners that it led past. Tried are the features that these and the body's three
     lowest corners make, fewest corners first: the shortest along which no other corner is lower.

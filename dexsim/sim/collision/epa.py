@@ -55,8 +55,8 @@ class Facet:
 
 @wp.func
 def plane(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
-    """Unit normal of the triangle (counter-clockwise seen from outside) and the origin's depth below it; FAR if it has
-    no area."""
+    """Return the unit normal of the triangle (counter-clockwise seen from outside) and the origin's depth below it; FAR
+    if it has no area."""
     n = wp.cross(b - a, c - a)
     area = wp.length(n)
     if area <= 1.0e-14:
@@ -73,7 +73,7 @@ def plane(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
 
 @wp.func
 def weights(n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """Barycentric coordinates of the origin's projection on the triangle of normal n."""
+    """Return the barycentric coordinates of the origin's projection on the triangle of normal n."""
     la = wp.dot(n, wp.cross(b, c))
     lb = wp.dot(n, wp.cross(c, a))
     lc = wp.dot(n, wp.cross(a, b))
@@ -82,7 +82,7 @@ def weights(n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
 
 @wp.func
 def three(f: int) -> wp.vec3i:
-    """The points of a face."""
+    """Return the points of a face."""
     return wp.vec3i(f & 0xFF, (f >> 8) & 0xFF, (f >> 16) & 0xFF)
 
 
@@ -90,7 +90,7 @@ def three(f: int) -> wp.vec3i:
 def grown(
     a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i, above: float
 ) -> Facet:
-    """The nearest facet of A - B, by one search. above [m]: from a corner at this height a face is not seen."""
+    """Return the nearest facet of A - B, by one search. above [m]: from a corner at this height a face is not seen."""
     pos = wp.zeros(shape=(POINTS,), dtype=wp.vec3)
     name = wp.zeros(shape=(POINTS,), dtype=int)
     face = wp.zeros(shape=(FACES,), dtype=int)  # three points of 8 bits, or -1
@@ -219,8 +219,8 @@ def grown(
 
 @wp.func
 def penetration(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
-    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose
-    it, or have it on a face.
+    """Return the nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that
+    enclose it, or have it on a face.
 
     Parallel faces and edges of the two cores make facets of many corners, and rounding may call some triangles of one
     facet seen and others not, until one is inside out. That shows: it is nearer than any was before, or A - B goes on

@@ -70,7 +70,7 @@ def point(p: wp.vec3, i: int) -> Simplex:
 
 @wp.func
 def segment(a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Simplex:
-    """What of the segment a, b is nearest to the origin."""
+    """Return what of the segment a, b is nearest to the origin."""
     e = b - a
     ee = wp.dot(e, e)
     t = -wp.dot(a, e)
@@ -101,8 +101,8 @@ def nearer(s: Simplex, t: Simplex) -> Simplex:
 
 @wp.func
 def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> Simplex:
-    """What of the triangle a, b, c is nearest to the origin: a point within, or of an edge. Rounding may choose the
-    wrong one, in a sliver, but never a point outside of the triangle."""
+    """Return what of the triangle a, b, c is nearest to the origin: a point within, or of an edge. Rounding may
+    choose the wrong one, in a sliver, but never a point outside of the triangle."""
     ab = b - a
     ac = c - a
     n = wp.cross(ab, ac)
@@ -134,14 +134,14 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> S
 
 @wp.func
 def beyond(a: wp.vec3, b: wp.vec3, c: wp.vec3, other: wp.vec3) -> bool:
-    """Whether the origin is on the other side of the plane a, b, c than `other`, or that cannot be told."""
+    """Return whether the origin is on the other side of the plane a, b, c than `other`, or that cannot be told."""
     n = wp.cross(b - a, c - a)
     return wp.dot(n, a) * wp.dot(n, other - a) >= 0.0
 
 
 @wp.func
 def with_corner(s: Simplex, w: wp.vec3, i: int) -> Simplex:
-    """What of the simplex and one more corner is nearest to the origin; `inside` if they enclose it."""
+    """Return what of the simplex and one more corner is nearest to the origin; `inside` if they enclose it."""
     if s.n == 0:
         return point(w, i)
     if s.n == 1:
@@ -165,13 +165,13 @@ def with_corner(s: Simplex, w: wp.vec3, i: int) -> Simplex:
 
 @wp.func
 def difference(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, i: int) -> wp.vec3:
-    """Corner of A minus corner of B, in B's frame [m]."""
+    """Return the corner of A minus corner of B, in B's frame [m]."""
     return R * corner(a, vertex, i & 0xFFFF) + p - corner(b, vertex, i >> 16)
 
 
 @wp.func
 def begin(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i) -> Simplex:
-    """The simplex named by `first` (-1: none), where the bodies are now."""
+    """Return the simplex named by `first` (-1: none), where the bodies are now."""
     if first[0] < 0:
         i = support(a, vertex, -(wp.transpose(R) * p)) | (support(b, vertex, p) << 16)
         return point(difference(a, b, vertex, R, p, i), i)
@@ -186,7 +186,7 @@ def begin(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.v
 
 @wp.func
 def away(p: wp.vec3) -> wp.vec3:
-    """A way out (from A to B) where nothing better is known: along the line of centres."""
+    """Return a way out (from A to B) where nothing better is known: along the line of centres."""
     if wp.dot(p, p) > 0.0:
         return -wp.normalize(p)
     return wp.vec3(0.0, 0.0, 1.0)
@@ -196,7 +196,8 @@ def away(p: wp.vec3) -> wp.vec3:
 def outermost(
     a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3
 ) -> int:
-    """The corner of A - B furthest from the plane through `beside` across u, on the side where that is further."""
+    """Return the corner of A - B furthest from the plane through `beside` across u, on the side where that is
+    further."""
     up = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
     down = support(a, vertex, -(wp.transpose(R) * u)) | (support(b, vertex, u) << 16)
     height = wp.dot(u, difference(a, b, vertex, R, p, up) - beside)
@@ -206,7 +207,7 @@ def outermost(
 
 @wp.func
 def enclose(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
-    """A simplex that goes through the origin, with corners added until it has four."""
+    """Return a simplex that goes through the origin, with corners added until it has four."""
     s = simplex
     if s.n == 1:
         s.i1 = outermost(a, b, vertex, R, p, away(p), s.p0)
@@ -231,7 +232,7 @@ def enclose(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp
 def distance(
     a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
 ) -> Simplex:
-    """The simplex of the nearest points of A and B (`v` from B to A, in B's frame).
+    """Return the simplex of the nearest points of A and B (`v` from B to A, in B's frame).
 
     R, p: A's frame in B's. first: names of the corners to begin with. cutoff [m]: bodies that are shown to be further
     apart need no exact answer; then |v| is at least the cutoff.
@@ -274,7 +275,7 @@ def distance(
 
 @wp.func
 def nearest_of_b(b: Core, vertex: wp.array(dtype=wp.vec3), i: wp.vec3i, l: wp.vec3) -> wp.vec3:
-    """The weighted mean of B's corners named by i (-1: none), in B's frame [m]."""
+    """Return the weighted mean of B's corners named by i (-1: none), in B's frame [m]."""
     q = l[0] * corner(b, vertex, i[0] >> 16)
     if i[1] >= 0:
         q += l[1] * corner(b, vertex, i[1] >> 16)
@@ -295,7 +296,7 @@ class Crossing:
 
 @wp.func
 def crossing(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, s: Simplex) -> Crossing:
-    """Where the simplex is of two corners of each body: the nearest points of these two edges.
+    """Return where the simplex is of two corners of each body: the nearest points of these two edges.
 
     Their directions come from each body's own corners. The simplex has differences of positions, in which a short edge
     is off by 1e-4 rad, and where two edges cross at a small angle the place goes with that.
@@ -340,8 +341,8 @@ def crossing(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: 
 
 @wp.func
 def separation(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3) -> float:
-    """How far apart [m] the cores are along the unit direction u from A to B. No direction's exceeds their distance, or
-    minus their depth if they overlap; that of the best one is it."""
+    """Return how far apart [m] the cores are along the unit direction u from A to B. No direction's exceeds their
+    distance, or minus their depth if they overlap; that of the best one is it."""
     i = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
     return -wp.dot(u, difference(a, b, vertex, R, p, i))
 
@@ -359,7 +360,7 @@ class Touch:
 
 @wp.func
 def touching(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, about: wp.vec3) -> Touch:
-    """The contact of cores that are hardly apart or hardly overlap, near the way out `about` (a unit vector).
+    """Return the contact of cores that are hardly apart or hardly overlap, near the way out `about` (a unit vector).
 
     The difference of their positions has no direction, and a plane that they lie on both sides of need not go through
     where they touch. So A is moved out along the way by a little. What of convex bodies is nearest is the same then if

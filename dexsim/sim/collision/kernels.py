@@ -174,7 +174,7 @@ def core_of(
 
 @wp.func
 def known(name: int, a: Core, b: Core) -> bool:
-    """Whether both corners exist: another mesh may be there than in the step before."""
+    """Return whether both corners exist: another mesh may be there than in the step before."""
     return name < 0 or ((name & 0xFFFF) < corners(a) and (name >> 16) < corners(b))
 
 

@@ -28,7 +28,7 @@ _MOST_CORNERS = 1 << 15  # corners are named by 16 bits
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
-    """Why `sim.collision=hand` cannot serve this model, or None if it can."""
+    """Return the why `sim.collision=hand` cannot serve this model, or None if it can."""
     if mjw.__version__ != VERSION:
         return f"it is written for MuJoCo-Warp {VERSION}, and {mjw.__version__} is installed"
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD:
@@ -132,7 +132,7 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
 
 
 def _filled(kind: Any, source: object, prefix: str = "") -> Any:
-    """A kernel's struct, with the arrays of the same names of `source`."""
+    """Return a kernel's struct, with the arrays of the same names of `source`."""
     struct = kind()
     for name in kind.vars:
         if hasattr(source, prefix + name):

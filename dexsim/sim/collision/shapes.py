@@ -39,7 +39,7 @@ class Prism:
 
 @wp.func
 def radius_of(kind: int, size: wp.vec3) -> float:
-    """Distance of the geom's surface from its core [m]."""
+    """Return the distance of the geom's surface from its core [m]."""
     if kind == SPHERE or kind == CAPSULE:
         return size[0]
     return 0.0
@@ -58,7 +58,7 @@ def corners(core: Core) -> int:
 
 @wp.func
 def corner(core: Core, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:
-    """Corner i in the geom's frame [m]."""
+    """Return the corner i in the geom's frame [m]."""
     if core.kind == HULL:
         return vertex[core.first + i]
     if core.kind == BOX:
@@ -75,7 +75,7 @@ def corner(core: Core, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:
 
 @wp.func
 def support(core: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:
-    """The corner that is furthest along d (in the geom's frame)."""
+    """Return the corner that is furthest along d (in the geom's frame)."""
     if core.kind == HULL:
         # All of them, in order: the corners of one hull are few and neighbouring threads read the same ones, while a
         # climb along edges is a chain of loads that wait for each other.
@@ -96,7 +96,7 @@ def support(core: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:
 
 @wp.func  # type: ignore[no-redef]
 def corner(core: Prism, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:  # noqa: F811  (an overload)
-    """Corner i in the geom's frame [m]: at the upper end if odd."""
+    """Return the corner i in the geom's frame [m]: at the upper end if odd."""
     angle = (2.0 * wp.pi / float(SIDES)) * float(i >> 1)
     h = core.half
     return wp.vec3(h[0] * wp.cos(angle), h[0] * wp.sin(angle), wp.where((i & 1) != 0, h[1], -h[1]))
@@ -104,14 +104,14 @@ def corner(core: Prism, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:  # 
 
 @wp.func  # type: ignore[no-redef]
 def support(core: Prism, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:  # noqa: F811  (an overload)
-    """The corner that is furthest along d (in the geom's frame)."""
+    """Return the corner that is furthest along d (in the geom's frame)."""
     turn = int(wp.round(wp.atan2(d[1], d[0]) * (float(SIDES) / (2.0 * wp.pi))))
     return ((turn & (SIDES - 1)) << 1) + wp.where(d[2] > 0.0, 1, 0)
 
 
 def hull_corners(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners of each mesh's convex hull: (first [nmesh], count [nmesh], corners [n, 3] in m). A mesh without a hull,
-    which no geom that collides has, gets none."""
+    """Return corners of each mesh's convex hull: (first [nmesh], count [nmesh], corners [n, 3] in m). A mesh without
+    a hull, which no geom that collides has, gets none."""
     first, count, found = (
         np.zeros(model.nmesh, np.int32),
         np.zeros(model.nmesh, np.int32),

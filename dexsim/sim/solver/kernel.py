@@ -58,7 +58,7 @@ class Solution:
 
 @cache
 def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False) -> wp.Kernel:
-    """The kernel for models of `nv` dofs (at most 32); [N * 32] threads, in blocks of whole warps.
+    """Return the kernel for models of `nv` dofs (at most 32); [N * 32] threads, in blocks of whole warps.
 
     It solves the worlds that have more than `above` and at most `rows` rows beside those of dry friction. registers:
     CUDA, at most so many a thread (0: as the compiler likes).

@@ -21,7 +21,7 @@ _SHARED = 48 * 1024  # bytes a CUDA block has without asking for more
 
 
 def unsupported(model: mujoco.MjModel, device: str, njmax: int) -> str | None:
-    """Why `sim.solver=hand` cannot serve this model on this device, or None if it can."""
+    """Return the why `sim.solver=hand` cannot serve this model on this device, or None if it can."""
     opt, bit = model.opt, mujoco.mjtDisableBit
     if mjw.__version__ != VERSION:
         return f"it is written for MuJoCo-Warp {VERSION}, and {mjw.__version__} is installed"
@@ -111,7 +111,7 @@ class NewtonSolver:
 
 
 def _problem(m: mjw.Model, d: mjw.Data) -> Problem:
-    """The arrays that MuJoCo-Warp's step fills before it solves."""
+    """Return the arrays that MuJoCo-Warp's step fills before it solves."""
     out = Problem()
     for name in ("tolerance", "ls_tolerance", "impratio_invsqrt"):
         setattr(out, name, getattr(m.opt, name))
@@ -126,7 +126,7 @@ def _problem(m: mjw.Model, d: mjw.Data) -> Problem:
 
 
 def _solution(d: mjw.Data) -> Solution:
-    """The arrays that it reads afterwards."""
+    """Return the arrays that it reads afterwards."""
     out = Solution()
     out.qacc, out.qfrc_constraint, out.niter, out.overflow = d.qacc, d.qfrc_constraint, d.solver_niter, d.overflow
     out.Ma, out.force, out.state = d.efc.Ma, d.efc.force, d.efc.state

@@ -28,20 +28,20 @@ ROW_INTS = 3
 
 
 def row_stride(nv: int) -> int:
-    """Floats between rows of the dense Jacobian: an odd multiple of 4, so that 8 lanes that read 4 floats each of 8
-    rows meet no bank twice."""
+    """Return the floats between rows of the dense Jacobian: an odd multiple of 4, so that 8 lanes that read 4 floats
+    each of 8 rows meet no bank twice."""
     quads = -(-nv // 4)
     return 4 * (quads + 1 - quads % 2)
 
 
 def shared_bytes(nv: int, rows: int, worlds: int) -> int:
-    """Shared memory of a block of `worlds` worlds of at most `rows` rows each."""
+    """Return the shared memory of a block of `worlds` worlds of at most `rows` rows each."""
     words = rows * (row_stride(nv) + ROW_FLOATS + ROW_INTS) + LANES + nv * (nv | 1)
     return 16 * worlds * -(-words // 4)
 
 
 def text(nv: int, rows: int) -> str:
-    """The function's body for `nv` dofs and at most `rows` rows (a multiple of 4) beside those of the dofs' dry
+    """Return the function's body for `nv` dofs and at most `rows` rows (a multiple of 4) beside those of the dofs' dry
     friction."""
     state, overflow = types.ConstraintState, types.OverflowType
     values = {
