@@ -145,7 +145,9 @@ class Tile:
         image = self._renderer.render()
         if not self._sky:
             image = np.where(image.any(axis=2, keepdims=True), image, self._behind)
-        pads = None if self._taxels is None else self._map.pictures(self._taxels[k], self._full_taxel, np.array(DARK, np.uint8))
+        pads = None
+        if self._taxels is not None:
+            pads = self._map.pictures(self._taxels[k], self._full_taxel, np.array(DARK, np.uint8))
         lines = self._clip["text"]
         text = "   ".join(t for t in (self._clip["label"], lines[min(k, len(lines) - 1)] if lines else "") if t)
         return annotate(
