@@ -393,11 +393,11 @@ MUTATIONS = (
         "tests/test_gap_fits.py::test_windows_may_begin_each_from_its_own_place_and_end_early",
     ),
     Mutation(
-        "a long recording is replayed whole",
+        "a name that only harms is written",
         "dexsim/gap/judge/full_model.py",
-        "    most = MOST\n",
-        "    most = math.inf\n",
-        "tests/test_gap_confirm.py::test_no_more_is_replayed_than_is_worth_its_time",
+        "    named = min(alike, max(belief, JUDGE.within * noise))",
+        "    named = math.inf",
+        "tests/test_gap_confirm.py::test_of_a_joint_what_follows_best_is_written",
     ),
     Mutation(
         "a joint without a loop is said to ring",

@@ -101,26 +101,16 @@ def test_the_plain_model_follows_what_it_can_state(fitted):
     assert "plain least squares" in baseline.text(data, "mrad") and baseline.text({}, "mrad") == ""
 
 
-def test_what_follows_worse_than_the_plain_model_is_not_handed_on(fitted):
-    case, true, plain = fitted
-    trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
-    given = lambda squares: baseline.refused(  # noqa: E731
-        [plain],
-        {"joint": {"after": float(np.sqrt(squares.mean())), "sigma": 3e-4}},
-        [(case, trial, squares)],
-        [0],
-        3e-4,
-    )
-    assert given(1.05 * plain.squares) == {}  # as good, to the noise
-    worse = plain.squares + (2e-3) ** 2
-    assert "plain least squares" in given(worse)["joint"]
-    lucky = plain.squares.copy()
-    lucky[:20] += 1e-2  # one moment is no evidence
-    assert given(lucky) == {}
-    servo = ServoTable.from_dict(BELIEVED)
-    assert baseline.hand_on([plain], servo, ["joint"]) == ["joint"]
-    assert servo.value("joint", "delay").value == pytest.approx(plain.value["delay"], abs=1e-8)
-    assert servo.value("joint", "kp").value == pytest.approx(plain.value["kp"], abs=1e-8)
+def test_the_plain_model_is_written_as_it_was_fitted(fitted):
+    _, _, plain = fitted
+    servo, spec = ServoTable.from_dict(BELIEVED), mujoco.MjSpec.from_string(PENDULUM)
+    before = float(np.ravel(spec.joint("joint").armature)[0])
+    said = baseline.write(plain, servo, spec)
+    for name in ("kp", "kd", "delay", "lag"):
+        assert servo.value("joint", name).value == pytest.approx(plain.value[name], abs=1e-8)
+    assert servo.value("joint", "standin_constant").value == pytest.approx(plain.value["offset"], abs=1e-8)
+    assert float(np.ravel(spec.joint("joint").armature)[0]) == pytest.approx(before + plain.value["inertia"])
+    assert "armature of joint" in said[0]
 
 
 @pytest.mark.parametrize(
@@ -145,8 +135,7 @@ def test_breakaway_and_friction_by_load_may_forbid_a_fall_too(columns, held):
     params = [Param(n, (n,), "set", 0.0, 9.0, 0.0) for n in {**columns, **fixed}]
     x = np.array([*columns.values(), *fixed.values()])
     trial = SimpleNamespace(fit=SimpleNamespace(params=params, x=x))
-    refused = baseline.refused([], {"joint": {"after": 1.0, "sigma": 1e-3}}, [(case, trial, np.ones(3))], [0], 1e-3)
-    assert ("would hold the joint" in refused.get("joint", "")) is held
+    assert ("would hold the joint" in baseline.forbidden(case, trial, [0])) is held
 
 
 def test_the_plain_model_is_handed_on_with_the_braking_that_it_was_judged_with(fitted):
@@ -154,7 +143,7 @@ def test_the_plain_model_is_handed_on_with_the_braking_that_it_was_judged_with(f
     case, _, plain = fitted
     servo = ServoTable.from_dict(BELIEVED)
     assert servo.value("joint", "braking_slope").value == 1.0 != case.scales.nominal["braking_slope"]
-    baseline.hand_on([plain], servo, ["joint"])
+    baseline.write(plain, servo, mujoco.MjSpec.from_string(PENDULUM))
     assert servo.value("joint", "braking_slope").value == case.scales.nominal["braking_slope"] == 0.0
     stated = replace(case, stated=frozenset({"braking_slope"}))
     assert baseline.judged(stated, ([], np.zeros(0)), [1]).beside == {}
@@ -168,11 +157,5 @@ def test_the_plain_model_fits_no_friction_that_a_fall_forbids():
     )
     friction = next(p for p in baseline.plain_model(case, [0]) if p.key == "coulomb_friction")
     assert friction.high <= room_for_friction(case, [0])[-1]
-    refused = baseline.refused(
-        [],
-        {"joint": {"after": 1.0, "sigma": 1e-3}},
-        [(case, SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS]))), np.ones(3))],
-        [0],
-        1e-3,
-    )
-    assert "would hold the joint" in refused["joint"]
+    trial = SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS])))
+    assert "would hold the joint" in baseline.forbidden(case, trial, [0])

@@ -243,7 +243,7 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
     there is none to take it from."""
     from types import SimpleNamespace
 
-    from dexsim.gap.judge.handed_on import servo_changes
+    from dexsim.gap.judge.handed_on import missing_of, servo_changes
     from dexsim.gap.plant.columns import Param
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
@@ -252,7 +252,8 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
         joint=JOINT, ranges={}, constants=SimpleNamespace(armature=1e-4), scales=SimpleNamespace(nominal={})
     )
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=(age,), x=np.array([0.001])))
-    assert servo_changes(table, case, trial, np.array([[0.0, 0.002]]), xhand.JOINTS) == []
+    servo_changes(table, case, trial, np.array([[0.0, 0.002]]), xhand.JOINTS)
+    assert missing_of(case, trial) == ()
     assert table.value(JOINT, "kd").value == (None if after is None else pytest.approx(after))
 
 

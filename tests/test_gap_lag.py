@@ -10,7 +10,7 @@ from test_gap import model, plant_run
 from dexsim.actuator.reference import lagged
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.judge.handed_on import servo_changes
+from dexsim.gap.judge.handed_on import missing_of, servo_changes
 from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import JointConstants, build
 from dexsim.gap.plant.columns import INDEX, NEUTRAL, SERIES, SERIES_INDEX
@@ -123,6 +123,7 @@ def test_training_gets_the_first_order_with_the_same_mean_delay_and_is_told(swin
         table = ServoTable.from_dict({"joints": {"joint": SERVO}})
         params = search._params((Member(EFFECTS["lag"], variant),))[:1]
         trial = Trial((Member(EFFECTS["lag"], variant),), search.fitter.fit(params, np.array([0.02]), iterations=0))
-        left = servo_changes(table, search.case, trial, np.array([[0.01, 0.03]]), ["joint"])
+        servo_changes(table, search.case, trial, np.array([[0.01, 0.03]]), ["joint"])
+        left = missing_of(search.case, trial)
         assert table.value("joint", "lag").value == pytest.approx(0.02)
         assert [x.startswith("second order of lag@joint") for x in left] == [True] * second

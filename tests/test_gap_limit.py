@@ -148,53 +148,36 @@ def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
     assert drives.w.limit.left_out == ([f"no stand-in is fitted to {left} (the limit of 100 s)"] if left else [])
 
 
-def test_the_replay_is_as_long_as_its_time(clock):
-    """An engine takes 2 s to begin and 4 s for each second of one hypothesis; three hypotheses, in two engines and one
-    more in coarser steps."""
-
-    def run(seconds):
-        clock[0] += 2.0 + 4.0 * seconds
-
-    begun = clock[0]
-    most = full_model._affordable(run, 60.0, 2, 3.1)
-    pilots = clock[0] - begun
-    assert pilots + 3 * 2.0 + 3.1 * 4.0 * most == pytest.approx(60.0)
-    with pytest.raises(full_model.NoTime):
-        full_model._affordable(run, 20.0, 2, 3.1)
-
-
-def test_what_is_replayed_ends_with_it():
-    keys = ("rows", "table", "gravity", "q", "v", "target", "stamps", "targets")
-    worlds = [full_model.World(duration=x, **dict.fromkeys(keys)) for x in (0.5, 3.0)]
-    assert [w.duration for w in full_model._until(worlds, 1.5)] == [0.5, 1.5]
-
-
 @pytest.mark.parametrize("spent, seconds", [(0.5, 200.0), (1 - PLANNING + 0.01, 2000.0), (0.5, 100.0)])
 def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeypatch):
     """A plan is one call that nothing ends: it is begun where a minute is left."""
     asked = []
-
-    def confirm(*_, room, **__):
-        asked.append(room)
-        return
-
-    monkeypatch.setattr(full_model, "confirm", confirm)
+    given = {"j": [full_model.Candidate("believed", 1.0, None)]}
+    monkeypatch.setattr(diagnosis.conclude, "candidates", lambda *_: (given, {}))
+    monkeypatch.setattr(full_model, "write_best", lambda *_: asked.append(_[-1]))
+    monkeypatch.setattr(diagnosis.logged_torque, "told", lambda *_: {})
     monkeypatch.setattr(diagnosis, "plan_next", lambda *_: asked.append("plan"))
     drives = object.__new__(Drives)
     settings = SimpleNamespace(replay="mujoco", device="cpu", next_recording=True)
     limit = TimeLimit(seconds)
     w = drives.w = SimpleNamespace(
-        limit=limit, runs=[], settings=settings, m=None, readable=[], clock=SimpleNamespace(lap=lambda _: None)
+        limit=limit,
+        runs=[],
+        settings=settings,
+        m=SimpleNamespace(joints=("j",)),
+        by_name={},
+        notes=[],
+        clock=SimpleNamespace(lap=lambda _: None),
     )
     drives.parts = SimpleNamespace(test=[1], span_test=None)
-    drives.searched, drives.noise = [], SimpleNamespace(floor=1.0)
-    drives._hypotheses = lambda d: []
+    drives.searched, drives.noise = [], SimpleNamespace(joints={"j": 1.0})
+    drives.by_torque, drives.stages, drives.answers, drives.plains = [], [], [], []
     clock[0] = seconds * spent
-    drives.confirm(SimpleNamespace(notes=[]))
+    drives.write()
     diagnosis._next(SimpleNamespace(), w, [])
     replayed, planned = spent < 1 - PLANNING, limit.rest() > diagnosis.PLAN
     assert planned == (seconds == 200.0)
-    assert asked == [pytest.approx(diagnosis.REPLAYING * limit.rest())] * replayed + ["plan"] * planned
+    assert asked == ["mujoco" if replayed else "none"] + ["plan"] * planned
     said = ["not replayed in the engine that trains"] * (not replayed)
     said += ["no next recording is planned"] * (not planned)
     assert [x.split(" (")[0] for x in limit.left_out] == said

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import test_gap
 from test_gap import mechanism_of, plant_run
+from test_gap_confirm import best_of
 
 from dexsim.gap import demo
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.judge import full_model
-from dexsim.gap.judge.full_model import Hypothesis
-from dexsim.gap.judge.handed_on import model_changes, servo_changes
+from dexsim.gap.judge.handed_on import model_changes, servo_changes, values_of
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read import conditions
@@ -83,7 +82,7 @@ def test_the_side_on_which_the_friction_acts_is_handed_on_and_the_engine_does_th
     share = play.fit.value("motor_share")
     assert not any("friction" in x for x in model_changes(m.spec.copy(), case, none, {}))
     spec, table = m.spec.copy(), runs[0].servo
-    said = model_changes(spec, case, play, full_model.values_of(play))
+    said = model_changes(spec, case, play, values_of(play))
     model = spec.compile()
     assert model.dof_frictionloss[0] == pytest.approx((1 - share) * FRICTION) and "went to its motor" in said[-1]
     assert model.dof_damping[0] == pytest.approx((1 - share) * DAMPING)
@@ -91,14 +90,6 @@ def test_the_side_on_which_the_friction_acts_is_handed_on_and_the_engine_does_th
     servo_changes(table, case, play, intervals(play.fit, search.blocks), ["joint"])
     own = believed * play.fit.value("coulomb_friction")
     assert table.value("joint", "coulomb_friction").value == pytest.approx(own + share * FRICTION, abs=1e-6)
-    c = full_model.confirm(
-        m,
-        runs,
-        [case],
-        [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": play})],
-        [1],
-        None,
-        4e-4,
-    )
-    engine, plant = c.errors["found"]
-    assert c.errors["believed"][0] > 3 * engine and engine < max(1.7 * plant, 0.8e-3), c.errors
+    c = best_of(m, runs, case, {"refitted": none, "found": play})
+    engine, plant = c.errors["joint"]["found"], c.candidates["joint"][1].plant
+    assert c.errors["joint"]["refitted"] > 3 * engine and engine < max(1.7 * plant, 0.8e-3), c.errors

@@ -22,7 +22,7 @@ from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.drive import temperature_follows
-from dexsim.gap.judge import conclude, confidence, full_model, handed_on, held_out, joint_answer
+from dexsim.gap.judge import conclude, confidence, handed_on, held_out, joint_answer
 from dexsim.gap.judge.joint_answer import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import coupled
@@ -573,18 +573,6 @@ def test_intervals_grow_with_what_is_left():
     assert (
         factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)
     )
-
-
-def test_the_engine_that_trains_confirms():
-    assert full_model.agree(1.28, 1.0, 0.5, 1.0) and not full_model.agree(1.32, 1.0, 0.5, 1.0)
-    assert full_model.agree(1.40, 1.0, 0.5, 10.0) and not full_model.agree(1.43, 1.0, 0.5, 10.0)
-
-
-def test_the_engine_that_trains_confirms_in_the_main():
-    said = lambda left: full_model.Confirmation(  # noqa: E731
-        "C MuJoCo", 5e-4, {"believed": (1.0, 1.0), "found": (left, 0.1)}, {}, [], [], False, 0.1
-    ).text()
-    assert "Not confirmed" not in said(0.72) and "Not confirmed" in said(0.74)  # 0.3 of 1.0 - 0.1, the floor
 
 
 def test_a_stand_in_must_take_a_least_share_off():

@@ -161,13 +161,17 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     servo = ServoTable.from_dict(
         {"drive": "torque", "joints": {"*": {"kp": 80.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}}}
     )
-    d = SimpleNamespace(servo=servo, notes=[], data={"findings": [], "nuisance": {"coulomb_friction@shoulder": 9.0}})
+    nuisance = {"coulomb_friction@shoulder": 9.0}
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
     searched = [SearchedJoint(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
-    logged_torque.hand_on(given[:1], d, searched, [], None, [SimpleNamespace(joint="shoulder", sound=False)])
+    (own,) = logged_torque.told(
+        given[:1], searched, [], None, [SimpleNamespace(joint="shoulder", sound=False)]
+    ).values()
+    assert own.over(lambda table, spec: ["written"])(servo, None) == ["written"]
+    assert "as the recorded torque tells it" in own.note(nuisance)
     told = servo.value("shoulder", "coulomb_friction")
     assert told.value == pytest.approx(COULOMB[0], rel=0.05) and told.low < told.value < told.high
-    assert d.data["nuisance"]["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
+    assert nuisance["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
     assert servo.value("shoulder", "viscous_friction").value == pytest.approx(VISCOUS[0], rel=0.1)
     assert servo.value("elbow", "coulomb_friction").unknown
     notes: list[str] = []

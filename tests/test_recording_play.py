@@ -190,6 +190,7 @@ def test_replay_of_a_bench_recording(tmp_path, capsys):
             f"servo={servo}",
             f"out={tmp_path / 'out'}",
             "video=false",
+            "timestep=0.002",  # the one that it was recorded with
             "meta.robot=bench",
         ],
         CONFIGS,
@@ -219,7 +220,7 @@ def test_an_unknown_current_constant_is_fitted_and_said():
     run = mech.drive(truth, commands, ("joint",), 3.0, np.zeros(1))
     r = realistic(mech.recorded(run, truth, commands, ("joint",)), 1, 1.7)
     m = pendulum({k: v for k, v in SERVO.items() if k != "current_per_torque"})
-    c = compare(r, mech.replay(r, m), m)
+    c = compare(r, mech.replay(r, m, 0.002), m)
     assert c.fitted.all() and c.effort_scale[0] == pytest.approx(1.7, rel=0.02)
 
 
@@ -227,6 +228,8 @@ def test_an_unknown_current_constant_is_fitted_and_said():
     (["replay=x.mcap", "episodes=3"], "does not go with replay=FILE"),
     (["replay=x.mcap", "servo=idael"], "must be a servo.yaml file, or one of ideal"),
     (["replay=x.mcap", "timestep=1"], "from 0.0001 to 0.02"),
+    (["replay=x.mcap", "hold=still"], "hold=still: must be recorded or limp"),
+    (["replay=x.mcap", "start=-1"], "start=-1: must be a number from 0"),
     (["replay=x.mcap", "video=maybe"], "must be true or false"),
     (["replay=x.mcap", "hand_mirror=1"], "hand_mirror=1: must be true or false"),
     (["replay=x.mcap", "hand=xhnd"], "hand=xhnd: must be one of xhand"),

@@ -10,8 +10,11 @@
     loop_encoder: joint            # joint or motor
     position_encoder: joint        # joint or motor
     supply_voltage: 24.0           # V
+    fitted: {index_bend_joint: {}} # joints that `diagnose` fitted: see below
 
 A value is a number, a range [low, high], a number with its range, or `unknown`; an absent column is ideal (neutral).
+`fitted`: what the file says of such a joint goes before what a recording says of its own drive; of columns in which the
+recordings differed, the factor on what each says. A replay holds the other joints at their recorded motion.
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ KEYS = (
     "loop_encoder",
     "position_encoder",
     "supply_voltage",
+    "fitted",
 )
 ALL = "*"
 
@@ -62,6 +66,7 @@ class Content(msgspec.Struct):
     loop_encoder: Side | dict[str, Side] | None = None
     position_encoder: Side | dict[str, Side] | None = None
     supply_voltage: typed.Positive | None = None
+    fitted: dict[str, dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -140,6 +145,7 @@ class ServoTable:
     loop_encoder: str | dict = "joint"
     position_encoder: str | dict = "joint"
     supply_voltage: float | None = None  # V
+    fitted: dict[str, dict[str, float]] | None = None  # joints that were fitted to recordings; None: nothing was
     source: str = "servo"  # named in errors
 
     # -- reading and writing ------------------------------------------------------------
@@ -162,7 +168,7 @@ class ServoTable:
                 hint = did_you_mean(key, KEYS)
                 raise UserError(f"{source}: key '{key}' does not exist.{hint} Valid keys: {', '.join(KEYS)}")
         top = typed.convert(
-            {k: v if k in ("drive", "joints") else _numbers(v) for k, v in raw.items()}, Content, source
+            {k: v if k in ("drive", "joints", "fitted") else _numbers(v) for k, v in raw.items()}, Content, source
         )
         joints = top.joints or {}
         entries: dict[str, dict[str, Value]] = {}
@@ -185,6 +191,7 @@ class ServoTable:
             top.loop_encoder or "joint",
             top.position_encoder or "joint",
             top.supply_voltage,
+            top.fitted,
             source,
         )
 
@@ -215,8 +222,8 @@ class ServoTable:
     def check_joints(self, known: Iterable[str]) -> None:
         """UserError if the table names a joint that is not among `known`."""
         known = list(known)
-        for mapping in (self.entries, self.current_per_torque, self.loop_encoder, self.position_encoder):
-            for joint in mapping if isinstance(mapping, dict) else ():
+        for given in (self.entries, self.current_per_torque, self.loop_encoder, self.position_encoder, self.fitted):
+            for joint in given if isinstance(given, dict) else ():
                 if joint != ALL and joint not in known:
                     hint = did_you_mean(joint, known)
                     raise UserError(

@@ -41,6 +41,9 @@ REPLAY = """with replay=FILE.mcap, beside out= and video=:
   object_size=                its extents, m: three of a box, diameter and length of a capsule, the longest of others
   object_mass=                kg
   object_friction=            sliding, of hand and object
+  hold=recorded               joints without a servo, or that its file was not fitted to, follow their recording;
+                              limp: nothing holds those without a servo
+  start= end=                 part of the recording, s; all of it by default
   timestep=                   a physics step, s
   remap.OURS=THEIRS           a topic or a joint of the file; meta.KEY=VALUE what the file does not say
 """

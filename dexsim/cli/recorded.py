@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dexsim import outputs, yaml_text
 from dexsim.console.tables import table
@@ -18,6 +21,9 @@ KEYS = (
     "out",
     "video",
     "timestep",
+    "hold",
+    "start",
+    "end",
     "hand",
     "hand_mirror",
     "object",
@@ -31,7 +37,7 @@ USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE, units.QUAN
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
     """The settings of a replay: {"replay": path, "model", "servo": path or None, "hand": a
-    Hand or None, "out", "video", "timestep", "object":
+    Hand or None, "out", "video", "timestep", "hold", "start", "end", "object":
     a `led_object.Stated` or None, "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments
     from dexsim.recording.mechanism import stated_hand
@@ -52,12 +58,19 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
             raise UserError(f"{key}={own[key]}: must be true or false")
     if own.get("model") and ("hand" in own or "hand_mirror" in own):
         raise UserError(f"model={own['model']}: is not simulated beside hand=; say one of them")
-    try:
-        timestep = float(own["timestep"]) if "timestep" in own else None
-    except ValueError:
-        timestep = -1.0
-    if timestep is not None and not 1e-4 <= timestep <= 0.02:
-        raise UserError(f"timestep={own['timestep']}: must be a number from 0.0001 to 0.02 s")
+    if own.get("hold", "recorded") not in ("recorded", "limp"):
+        raise UserError(f"hold={own['hold']}: must be recorded or limp")
+
+    def seconds(key: str, low: float, high: float) -> float | None:
+        try:
+            x = float(own[key]) if key in own else None
+        except ValueError:
+            x = -1.0
+        if x is not None and not low <= x <= high:
+            raise UserError(f"{key}={own[key]}: must be a number from {low:g} to {high:g} s")
+        return x
+
+    timestep, start, end = seconds("timestep", 1e-4, 0.02), seconds("start", 0.0, 1e6), seconds("end", 0.0, 1e6)
     servo = own.get("servo_file") or own.get("servo")
     if servo is not None and not servo.endswith((".yaml", ".yml")):
         path = config_dir / "servo" / f"{servo}.yaml"
@@ -73,6 +86,9 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
         "out": own.get("out") or None,
         "video": own.get("video", "true") == "true",
         "timestep": timestep,
+        "hold": own.get("hold", "recorded"),
+        "start": start or 0.0,
+        "end": end,
         "object": _object(own),
         "remap": remap,
         "meta": meta,
@@ -126,7 +142,7 @@ def run(play: dict[str, Any]) -> int:
         print(audit.table(recording.findings))
     m = mechanism.for_recording(recording, model, play["servo"], hand)
     config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else {}
-    timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
+    timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", mechanism.STEP))
     placed = led_object.add_object(m, recording, play["object"])
     led = placed == "led"
     if play["object"] is not None and not led:
@@ -148,19 +164,30 @@ def run(play: dict[str, Any]) -> int:
         flush=True,
     )
     pairs = led_object.pairs(m.hand) if led and m.hand is not None else ()
-    result = mechanism.replay(recording, m, timestep, pairs, led_object.JOINT if placed != "none" else None)
+    start, hold = play["start"], play["hold"]
+    follow = led_object.JOINT if placed != "none" else None
+    result = mechanism.replay(recording, m, timestep, pairs, follow, hold, start, play["end"])
     c = compare.compare(recording, result, m, forces=led)
     position, effort = c.position_rmse(), c.effort_rmse()
+    held = mechanism.held_joints(m, c.joints) if hold == "recorded" else []
     rows = [
-        (j, f"{1e3 * p:.2f}", f"{e:.4f}" if e == e else "-") for j, p, e in zip(c.joints, position, effort, strict=True)
+        (j, "as recorded" if j in held else f"{1e3 * p:.2f}", f"{e:.4f}" if e == e and j not in held else "-")
+        for j, p, e in zip(c.joints, position, effort, strict=True)
     ]
+    free = [k for k, j in enumerate(c.joints) if j not in held]
+    together = math.sqrt(float(np.nanmean((c.position - c.position_simulated)[:, free] ** 2))) if free else math.nan
+    if len(free) > 1:
+        rows.append((f"all {len(free)} that run free", f"{1e3 * together:.2f}", ""))
     print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")
     about = {
         "replay": str(path),
         "model": model or m.robot,
         "timestep_s": timestep,
         "object": placed,
+        "start_s": float(result.t[0]),
+        "follow_their_recording": held,
         "position_rmse_rad": _plain(c.joints, position),
+        "position_rmse_all_rad": together if together == together else None,
         "torque_rmse_Nm": _plain(c.joints, effort),
         "current_per_torque": _plain(c.joints, c.effort_scale),
         "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
@@ -168,7 +195,8 @@ def run(play: dict[str, Any]) -> int:
     }
     with outputs.staged(out) as stage:
         (stage / "metrics.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-        write(stage / "simulated.mcap", mechanism.recorded(result, m, recording.commands, recording.joints))
+        sent = recording.commands.between(start, np.inf if play["end"] is None else play["end"])
+        write(stage / "simulated.mcap", mechanism.recorded(result, m, sent, recording.joints))
         drawn = compare.plots(c, stage, path.name)
     print(f"metrics  {out / 'metrics.json'}\nmcap     {out / 'simulated.mcap'}")
     for plot in drawn:
@@ -188,13 +216,12 @@ def _plain(joints: tuple[str, ...], values: Any) -> dict[str, float | None]:
 def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
     """The recorded posture beside the simulated one; whether it could be made."""
     import mujoco
-    import numpy as np
 
     from dexsim.console.ticker import Ticker
     from dexsim.view.video import Clip, NoRenderer, render
 
     model = m.spec.compile()
-    frames = np.arange(len(result.qpos)) * result.frame_s
+    frames = result.t[0] + np.arange(len(result.qpos)) * result.frame_s
     clips = []
     address = [model.jnt_qposadr[model.joint(j).id] for j in recording.joints]
     state = recording.states.position

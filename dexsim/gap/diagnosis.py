@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -35,7 +36,7 @@ from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fi
 from dexsim.gap.plant.columns import DRAGGERS
 from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
-from dexsim.gap.report.next_recording import plan_next, rival_of
+from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
@@ -68,8 +69,8 @@ def diagnose(
     if d.data["verdict"] in ("unknown", "partly_explained"):
         drives.stand_in(d)
         w.clock.lap("stand-in")
-    drives.confirm(d)
-    w.clock.lap("replay in the engine that trains")
+    drives.replay(d)
+    w.clock.lap("replay of what is written")
     _next(d, w, drives.searched)
     d.notes[:0] = w.limit.left_out
     d.shares = w.clock.shares
@@ -540,11 +541,44 @@ class Drives(Steps):
             a.judge(self.w.m)
         self.plains = [b for b in compute.each(len(self.searched), lambda k: self._plain(self.searched[k].search)) if b]
         self.w.clock.lap("plain model")
+        self.write()
+
+    def write(self) -> None:
+        """What is written of each joint: the candidate that follows what was held out best, in the engine that
+        trains."""
+        w, s, p, cases = self.w, self.w.settings, self.parts, [x.case for x in self.searched]
+        told = logged_torque.told(self.by_torque, self.searched, p.test, p.span_test, self.stages)
+        self.told = list(told.values())
+        given, self.refused = conclude.candidates(self.answers, self.plains, told, w.m.joints)
+        what = w.m, w.runs, w.by_name, cases, given, self.noise.joints, p.test, p.span_test
+        best = partial(full_model.write_best, *what)
+        engine = s.replay
+        if engine != "none" and w.limit.spent(1 - PLANNING):
+            w.limit.leave_out("not replayed in the engine that trains")
+            engine = "none"
+        try:
+            self.written = best(s.device, engine)
+        except UserError as error:
+            w.notes.append(f"not replayed in the engine that trains: {error}")
+            self.written = best(engine="none")
+        w.clock.lap("choice in the engine that trains")
 
     def report(self, d: Diagnosis) -> None:
         """The joints into a diagnosis: findings, verdict, what is handed on."""
         w, p = self.w, self.parts
-        into_diagnosis(d, w.settings, self.answers, self.kept, self.noise, p.how, w.channel, self.plains)
+        into_diagnosis(
+            d,
+            w.settings,
+            self.answers,
+            self.kept,
+            self.noise,
+            p.how,
+            w.channel,
+            self.plains,
+            self.written,
+            self.refused,
+        )
+        w.notes += [x.note(d.data["nuisance"]) for x in self.told]
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:
             w.notes.append(
@@ -553,7 +587,6 @@ class Drives(Steps):
             )
         d.stages = [x.text for x in self.stages] + self.behind
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
-        logged_torque.hand_on(self.by_torque, d, self.searched, p.test, p.span_test, self.stages)
         conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out
 
@@ -580,66 +613,22 @@ class Drives(Steps):
         if late:
             limit.leave_out(f"no stand-in is fitted to {', '.join(late)}")
 
-    def confirm(self, d: Diagnosis) -> None:
-        """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the
-        sentence says so."""
-        w, s, p = self.w, self.w.settings, self.parts
-        if s.replay == "none":
+    def replay(self, d: Diagnosis) -> None:
+        """The files as they are, over all that was held out, by the function of `play replay=`: the number of the
+        report."""
+        w, p = self.w, self.parts
+        if not self.written.by_replay or d.servo is None:
             return
-        room = REPLAYING * w.limit.rest()  # comparisons with the search's own plant, and what comes next, need time too
-        if w.limit.spent(1 - PLANNING):
-            w.limit.leave_out("not replayed in the engine that trains")
-            return
-        cases, finer = (
-            [x.case for x in self.searched],
-            [replace(x.case, plant=x.search.whole) for x in self.searched],
-        )
-        try:
-            found = full_model.confirm(
-                w.m,
-                w.runs,
-                cases,
-                self._hypotheses(d),
-                p.test,
-                p.span_test,
-                self.noise.floor,
-                s.device,
-                s.replay,
-                finer=finer,
-                room=room,
-            )
-        except full_model.NoTime:
-            w.limit.leave_out("not replayed in the engine that trains")
-            return
-        except UserError as error:
-            d.notes.append(f"not replayed in the engine that trains: {error}")
-            return
+        spec = w.m.spec if d.model_spec is None else d.model_spec
+        cases = [x.case for x in self.searched]
+        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test)
         if found is None:
             return
-        d.confirmation = found
-        d.data["held_out"]["confirmed"] = found.entry()
+        self.written.replayed = found
+        d.data["held_out"]["replayed"] = found.entry()
         if d.data["held_out"]["error"].startswith("position"):
-            d.sentence += " " + found.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
-
-    def _hypotheses(self, d: Diagnosis) -> list[full_model.Hypothesis]:
-        """What is replayed: as believed, as found, and with the first rival in the place of what it rivals."""
-        named = [f for f in d.data["findings"] if f["where"]["joints"] and modelled(f)]
-        claimed = {j for f in named for j in f["where"]["joints"]}
-        by = {x.case.joint: x for x in self.searched}
-        none = {j: x.search.polish(x.outcome.none) for j, x in by.items()}
-        final = none | {j: by[j].search.polish(by[j].outcome.best) for j in claimed}
-        out = [full_model.Hypothesis("believed", none)] + ([full_model.Hypothesis("found", final)] if claimed else [])
-        for f in named:
-            rivals = [a["effect"] for a in f["alternatives"]]
-            joint = f["where"]["joints"][0]
-            x = by[joint]
-            other = rival_of(x.search, x.outcome, f["effect"], rivals[0]) if rivals else None
-            if other is not None:
-                return [
-                    *out,
-                    full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: x.search.polish(other)}),
-                ]
-        return out
+            d.sentence += " " + self.written.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
+        d.notes += self.written.differences(d.joints)
 
 
 def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str]:

@@ -150,7 +150,7 @@ class Diagnosis:
     # (joint, recording): mean |error| before, after
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     untrained: list[str] = field(default_factory=list)
-    confirmation: full_model.Confirmation | None = None
+    written: full_model.Written | None = None  # of each joint; None where none is judged
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
     # joints that ring by themselves, as what was found of them does in what was held out
     ringing: frozenset[str] = frozenset()
@@ -214,6 +214,11 @@ class Inquiry:
     def readable(self) -> list[Recording]:
         """The recordings that could be read."""
         return [r for r in self.recordings if r is not None]
+
+    @property
+    def by_name(self) -> dict[str, Recording]:
+        """The recordings that could be read, by their runs' name."""
+        return {r.path.name: r for r in self.readable}
 
     @property
     def held_names(self) -> set[str]:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every fig
 
 from dexsim import files  # noqa: E402
 from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
-from dexsim.recording.schema import Recording  # noqa: E402
+from dexsim.recording.schema import Recording, Series  # noqa: E402
 
 RECORDED, SIMULATED, COMMANDED = "#1f5fa8", "#d1641b", "#9a9a9a"
 
@@ -60,9 +60,12 @@ class Comparison:
 
 
 def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) -> Comparison:
-    """Lay the run beside the recording. forces: run.pair_normal holds one fingertip a column."""
+    """Lay the run beside the recording; what was recorded outside its time is left out. forces: run.pair_normal holds
+    one fingertip a column."""
     columns = [m.joints.index(j) for j in recording.joints]
     state, J = recording.states.position, len(recording.joints)
+    inside = (state.t >= run.t[0] - 1e-9) & (state.t <= run.t[-1] + 1e-9) if len(state) else slice(None)
+    state = Series(state.t[inside], state.value[inside]) if len(state) else state
     t = state.t if len(state) else run.t
 
     def at(values: np.ndarray) -> np.ndarray:
@@ -74,7 +77,7 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
     signed = recording.signed_effort()
     effort, scale, fitted = None, np.ones(J), np.zeros(J, bool)
     if signed is not None and recording.effort_is != "none":
-        effort = signed.value
+        effort = signed.value[inside]
         if recording.effort_is == "current_A":
             scale = m.table.current(recording.joints)
             fitted = np.isnan(scale)
@@ -94,7 +97,8 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
         out.finger_force = (touch.t, touch.value[..., 2].sum(2))
         out.force_unit = "N" if known else "count"
     if forces:
-        out.finger_force_simulated = (np.arange(len(run.pair_normal)) * run.frame_s + run.frame_s, run.pair_normal)
+        frames = run.t[0] + run.frame_s * np.arange(1, len(run.pair_normal) + 1)
+        out.finger_force_simulated = (frames, run.pair_normal)
     return out
 
 

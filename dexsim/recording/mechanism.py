@@ -6,8 +6,8 @@ Any MuJoCo model serves: the xHand alone in the air, a one-joint test bench, ano
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,20 +16,32 @@ import mujoco
 import numpy as np
 import torch
 import yaml
+from scipy.interpolate import CubicHermiteSpline
 
 from dexsim import model_file, yaml_text
+from dexsim.actuator.columns import COLUMNS
 from dexsim.actuator.servo import FIELDS, Servo
-from dexsim.actuator.table import ServoTable
+from dexsim.actuator.table import ALL, ServoTable
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, DEFAULTS, STATES, Recording, Series, States
+from dexsim.recording.smooth import local_polynomial
 from dexsim.sim import ContactPair, make_engine
 
 if TYPE_CHECKING:
     from dexsim.tactile.sensors import Sensors
 
 XHAND = "xhand"  # the hand where no model is given
+STEP = 5e-4  # s of the physics, in a replay and where a diagnosis replays what it wrote; the error is of first order
+HEAVY = 1e6  # kg.m2 (kg): the rotor of a joint that is led along a path, so that nothing but its path moves it
+BEFORE = 0.6  # s: commands sent so long before a replay begins are sent, for they may still act
+QUICK = 4  # degree of the polynomials that smooth what is fast
+SOON = 0.05  # s: a recording whose first reading is later begins with that
+RESTS = 0.2  # of a joint's largest speed: slower, it is at rest where a replay begins
+MARGIN = 12  # readings before the start that tell the speed there
+REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
+WARM = frozenset(c.name for c in COLUMNS if c.name.startswith("thermal"))  # columns that act with the temperature
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
 
@@ -116,11 +128,13 @@ def mechanism(
         assert model is not None  # else the folder is the xHand's
         path = Path(model).expanduser()
         spec = model_file.read(path, f"model={model}")
+        _undriven(spec)
         _physical(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:
             raise UserError(f"model={model}: say which servo drives it with servo=FILE (a servo.yaml)")
         table = _table(servo)
+        _uncoupled(spec, table)
     if gravity is not None:
         spec.option.gravity = [float(g) for g in gravity]
     hinges = [
@@ -133,6 +147,21 @@ def mechanism(
     if not chosen:
         raise UserError(f"model={model}: has no named hinge or slide joint to drive")
     return Mechanism(spec, chosen, table, robot, hand, None if hand else part_of)
+
+
+def _undriven(spec: mujoco.MjSpec) -> None:
+    """Takes a model's own actuators away, and what refers to them: the servo drives its joints, and an actuator at
+    control 0 would hold them, or pull at their tendons, beside it."""
+    for group in (spec.actuators, spec.sensors, spec.keys):
+        for item in list(group):
+            spec.delete(item)
+
+
+def _uncoupled(spec: mujoco.MjSpec, table: ServoTable) -> None:
+    """Takes away equalities between two joints that both have a drive of their own in the servo's file."""
+    for e in list(spec.equalities):
+        if e.type == mujoco.mjtEq.mjEQ_JOINT and e.name1 in table.entries and e.name2 in table.entries:
+            spec.delete(e)
 
 
 def stated_hand(name: str | None, mirror: bool = False) -> Hand | None:
@@ -198,9 +227,18 @@ def for_recording(
     servo: str | Path | dict | None = None,
     hand: Hand | None = None,
 ) -> Mechanism:
-    """The mechanism that a recording was made with: its gravity, its `servo` over the believed table, its joints driven
-    (the model's others stay where they are, driven to their initial position)."""
-    out = mechanism(model, servo, None, recording.gravity, hand)
+    """The mechanism that a recording was made with (`of_recording`), from a model and a servo file."""
+    return of_recording(mechanism(model, servo, None, recording.gravity, hand), recording)
+
+
+def of_recording(m: Mechanism, recording: Recording) -> Mechanism:
+    """The mechanism as a recording was made with it: its gravity, its `servo` over the believed table, its joints
+    driven (the model's others stay where they are, driven to their initial position). What was fitted to recordings
+    (`fitted` of the table) goes before what a recording says of its drive, but for columns in which those differed:
+    of them its factor is on the recording's own."""
+    spec = m.spec.copy()
+    spec.option.gravity = [float(g) for g in recording.gravity]
+    out = Mechanism(spec, m.joints, m.table, m.robot, m.hand, m.part_of)
     missing = [j for j in recording.joints if j not in out.joints]
     if missing:
         raise UserError(
@@ -209,8 +247,25 @@ def for_recording(
         )
     if recording.meta.get("servo"):
         over = yaml_text.parse(recording.meta["servo"], f"servo of {recording.path}")
-        out.table = ServoTable.from_dict(merged(out.table.to_dict(), over), source=f"servo of {recording.path}")
+        own, fitted = m.table.to_dict(), m.table.fitted or {}
+        asked = {j: dict(columns or {}) for j, columns in (over.get("joints") or {}).items()}
+        for joint, factors in fitted.items():
+            stated = asked.get(ALL, {}) | asked.get(joint, {})
+            asked[joint] = {c: x for c, x in stated.items() if c in factors or c not in own["joints"].get(joint, {})}
+        over["joints"] = asked
+        out.table = ServoTable.from_dict(merged(own, over), source=f"servo of {recording.path}")
+        for joint, column, factor in [(j, c, f) for j, x in fitted.items() for c, f in x.items()]:
+            if column in asked[joint]:
+                out.table.set(joint, column, factor * (out.table.value(joint, column).value or 0.0))
     return out
+
+
+def held_joints(m: Mechanism, joints: Sequence[str]) -> list[str]:
+    """Those of recorded `joints` that no servo drives, or that were not among those that the servo's file was fitted
+    to: a free run of the others is only judged where these move as they did."""
+    table = m.table
+    driven = lambda j: j in table.entries or ALL in table.entries  # noqa: E731
+    return [j for j in joints if not driven(j) or (table.fitted is not None and j not in table.fitted)]
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -227,9 +282,9 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """What the simulation did, one row a physics step. t [T] s; position, velocity, torque, target [T, J] (as the
-    encoders and the current report; target: the last one sent); qpos [F, nq] and pair_normal [F, P] (N, of each
-    contact pair) every `frame_s`."""
+    """What the simulation did, one row a physics step. t [T] s, in a replay the recording's; position, velocity,
+    torque, target [T, J] (as the encoders and the current report; target: the last one sent); qpos [F, nq] and
+    pair_normal [F, P] (N, of each contact pair) every `frame_s`."""
 
     t: np.ndarray
     position: np.ndarray
@@ -253,23 +308,31 @@ def drive(
     frame_s: float = 0.02,
     pairs: Sequence[ContactPair] = (),
     follow: tuple[str, Series] | None = None,
+    velocity: np.ndarray | None = None,
+    target: np.ndarray | None = None,
+    columns_of: Mapping[str, Series] | None = None,
+    led: Led | None = None,
 ) -> Run:
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
     commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]:
-    start and first target of the mechanism's joints (NaN or None: the model's own). enabled: like commands, 0 frees
-    a joint. pairs: contact pairs to measure. follow: (name of a free joint, poses [T, 7]): a body that is led along
-    a recorded path. Deterministic. Engine: C MuJoCo.
+    start of the mechanism's joints (NaN or None: the model's own); velocity [J]: their speed then (None: at rest);
+    target [J]: in force then (NaN or None: the start). enabled: like commands, 0 frees a joint. pairs: contact pairs to
+    measure. follow: (name of a free joint, poses [T, 7]): a body that is led along a recorded path. columns_of: servo
+    columns that change, by name [T, J]. led: joints that follow a path. Deterministic. Engine: C MuJoCo.
     """
     spec = m.spec.copy()
+    for joint in led.joints if led is not None else ():
+        spec.joint(joint).armature = HEAVY
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     engine = make_engine(spec, 1, "cpu", "mujoco", fields=FIELDS, pairs=pairs, threads=1)
     steps = max(1, round(duration / timestep))
     stamps = np.asarray(commands.t, float)
     spacing = float(np.percentile(np.diff(stamps), 5)) if len(stamps) > 2 else None
-    servo = Servo(engine, m.joints, m.table, control_period=max(spacing, 1e-3) if spacing else None)
-    qpos = torch.as_tensor(engine.mjm.qpos0)[None].clone()
+    varied = tuple(columns_of or ())
+    servo = Servo(engine, m.joints, m.table, control_period=max(spacing, 1e-3) if spacing else None, varied=varied)
+    qpos, qvel = torch.as_tensor(engine.mjm.qpos0)[None].clone(), torch.zeros_like(engine.t.qvel)
     address = engine.qpos_index(m.joints)
     dofs = engine.dof_index(m.joints)
     scale, offset = (servo.column(f"position_{name}")[0].double().numpy().copy() for name in ("scale", "offset"))
@@ -278,21 +341,31 @@ def drive(
         known = servo.unmeasured(torch.as_tensor(np.nan_to_num(initial))[None])[0].numpy()
         start = np.where(np.isfinite(initial), known, start)
     qpos[0, address] = torch.as_tensor(start)
+    if velocity is not None:
+        qvel[0, dofs] = torch.as_tensor(velocity / scale)
     lead = None
     if follow is not None:
         joint = engine.joint(follow[0])
         q, v = int(engine.mjm.jnt_qposadr[joint]), int(engine.mjm.jnt_dofadr[joint])
         lead, lead_speed = _path(follow[1], steps, timestep)
         qpos[0, q : q + 7] = torch.as_tensor(lead[0])
-    engine.set_state(torch.ones(1, dtype=torch.bool), qpos, torch.zeros_like(engine.t.qvel))
+    engine.set_state(torch.ones(1, dtype=torch.bool), qpos, qvel)
     now = np.where(np.isfinite(initial), initial, start) if initial is not None else start.copy()
+    now = np.where(np.isfinite(target), target, now) if target is not None else now
     servo.reset(None, torch.as_tensor(now)[None])
     place = np.array([m.joints.index(c) for c in columns])
     J = len(m.joints)
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
     q_view, v_view, torque_view = engine.t.qpos[0].numpy(), engine.t.qvel[0].numpy(), servo.torque[0].numpy()
+    applied = engine.t.qfrc_applied[0].numpy()
+    if led is not None:
+        mine = [m.joints.index(j) for j in led.joints]
+        held_q, held_v, pull = led.at(np.arange(steps) * timestep, offset[mine], scale[mine])
+        led_q, led_v = address[mine], dofs[mine]
+    changed = [(servo.column(name)[0].numpy(), x) for name, x in (columns_of or {}).items()]
     on = None if enabled is None else (enabled.t, np.nan_to_num(enabled.value, nan=1.0) > 0.5)
     state = {"k": 0, "command": 0, "enabled": 0}
+    every = max(1, round(frame_s / timestep))
 
     def before_each() -> None:
         k, t = state["k"], state["k"] * timestep
@@ -308,6 +381,11 @@ def drive(
             said = torch.as_tensor(on[1][state["enabled"]])
             servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = said.to(servo.state.dtype)
             state["enabled"] += 1
+        if changed and k % every == 0:
+            for column, x in changed:
+                column[:] = x.value[max(np.searchsorted(x.t, t, side="right") - 1, 0)]
+        if led is not None:
+            q_view[led_q], v_view[led_v] = held_q[k], held_v[k]
         if lead is not None:
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
             engine.t.qvel[0, v : v + 6] = torch.as_tensor(lead_speed[k])
@@ -319,10 +397,11 @@ def drive(
             out["velocity"][k] = scale * v_view[dofs]
         out["target"][k] = now
         servo.before_each()
+        if led is not None:
+            applied[led_v] = HEAVY * pull[k]
         out["torque"][k] = torque_view
         state["k"] = k + 1
 
-    every = max(1, round(frame_s / timestep))
     frames, forces = [], []
     for first in range(0, steps, every):
         frames.append(engine.t.qpos[0].numpy().copy())
@@ -373,27 +452,134 @@ def recorded(
 def replay(
     recording: Recording,
     m: Mechanism,
-    timestep: float = 0.002,
+    timestep: float = STEP,
     pairs: Sequence[ContactPair] = (),
     follow: str | None = None,
+    hold: str = "recorded",
+    start: float = 0.0,
+    end: float | None = None,
 ) -> Run:
-    """Drive the mechanism with a recording's commands from the recorded first position (free run, no correction).
+    """Drive the mechanism with a recording's commands from its first position and speed at `start` s or later on, to
+    `end` s (None: of the recording), as a free run without correction; supply and temperatures as they were recorded.
+    The run's times are the recording's.
 
-    pairs: contact pairs to measure. follow: name of the free joint that is led along the recorded object's path.
+    pairs: contact pairs to measure. follow: name of the free joint that is led along the recorded object's path. hold:
+    joints that no servo drives, or that its file was not fitted to (`held_joints`), follow their recording where it is
+    `recorded`; `limp`: nothing moves those without a servo.
     """
-    if not len(recording.commands):
+    commands, state = recording.targets(), recording.states.position
+    if not len(commands):
         raise UserError(f"recording {recording.path} has no commands: nothing to replay; {COMMANDS_FIX}")
-    initial = np.full(len(m.joints), np.nan)
-    state = recording.states.position
-    for j, joint in enumerate(recording.joints):
-        seen = np.flatnonzero(np.isfinite(state.value[:, j])) if len(state) else np.zeros(0, int)
-        if len(seen):
-            initial[m.joints.index(joint)] = state.value[seen[0], j]
-    end = max(recording.duration, float(recording.commands.t[-1])) + timestep
-    led = None if follow is None or recording.object_pose is None else (follow, recording.object_pose)
-    return drive(
-        m, recording.targets(), recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led
+    last = max(recording.duration, float(commands.t[-1]))
+    if not 0 <= start < (last if end is None else min(end, last)):
+        raise UserError(
+            f"start={start:g} end={last if end is None else end:g}: must lie in the recording, 0 to {last:g} s"
+        )
+    start = max(start, float(state.t[0])) if len(state) and state.t[0] > SOON else start
+    place, target = [m.joints.index(j) for j in recording.joints], np.full(len(m.joints), np.nan)
+    initial, velocity, paths = begun(recording, m, start)
+    held = [j for j in (held_joints(m, recording.joints) if hold == "recorded" else []) if j in paths]
+    first = max(int(np.searchsorted(commands.t, start - BEFORE)) - 1, 0)
+    if commands.t[first] < start:
+        target[place] = commands.value[first]
+    given = Series(np.asarray(commands.t[first:], float) - start, commands.value[first:])
+    enabled = recording.enabled
+    if enabled is not None:
+        now = max(int(np.searchsorted(enabled.t, start, side="right")) - 1, 0)
+        enabled = Series(np.asarray(enabled.t[now:], float) - start, enabled.value[now:])
+    pose = recording.object_pose
+    path = None if follow is None or pose is None else (follow, replace(pose, t=np.asarray(pose.t) - start))
+    run = drive(
+        m,
+        given,
+        recording.joints,
+        (last if end is None else end) - start + timestep,
+        initial,
+        timestep,
+        enabled,
+        pairs=pairs,
+        follow=path,
+        velocity=velocity,
+        target=target,
+        columns_of=_recorded_columns(recording, m, place, start),
+        led=Led({j: paths[j] for j in held}) if held else None,
     )
+    return replace(run, t=run.t + start)
+
+
+def begun(
+    recording: Recording, m: Mechanism, start: float
+) -> tuple[np.ndarray, np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
+    """(position [J] of the mechanism's joints at the first reading from `start` s on, NaN where there is none, their
+    speed [J] then, of the recorded joints the path from there: times from `start`, position, speed, acceleration
+    [n])."""
+    initial, velocity, paths = np.full(len(m.joints), np.nan), np.zeros(len(m.joints)), {}
+    for j, joint in enumerate(recording.joints):
+        t, x = _seen(recording.states.position, j)
+        on = t >= start - 1e-9
+        if not on.any():
+            continue
+        t, x = t[max(int(np.argmax(on)) - MARGIN, 0) :], x[max(int(np.argmax(on)) - MARGIN, 0) :]
+        first, k = int(np.argmax(t >= start - 1e-9)), m.joints.index(joint)
+        speed = local_polynomial(t, x[:, None])[1][:, 0]
+        initial[k] = x[first]
+        velocity[k] = speed[first] if abs(speed[first]) > RESTS * np.abs(speed).max() else 0.0
+        paths[joint] = t - start, *(y[:, 0] for y in followed(t, x[:, None]))
+    return initial, velocity, paths
+
+
+def followed(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Position, speed and acceleration [S, J] of a recorded motion x [S, J] at t [S] s, fast motion not cut."""
+    return local_polynomial(t, x, degree=QUICK)
+
+
+def _seen(series: Series, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values of one column where it was recorded."""
+    if not len(series):
+        return np.zeros(0), np.zeros(0)
+    x = np.asarray(series.value, float).reshape(len(series), -1)[:, j]
+    ok = np.isfinite(x) & np.r_[True, np.diff(series.t) > 1e-6]
+    return np.asarray(series.t, float)[ok], x[ok]
+
+
+def _recorded_columns(recording: Recording, m: Mechanism, place: list[int], start: float) -> dict[str, Series]:
+    """Servo columns that a recording tells of: the supply, as a share of the table's, and temperatures above the
+    reference, where a column of the table depends on them."""
+    out, table = {}, m.table
+    supply, heat = recording.supply_voltage, recording.temperature
+    if supply is not None and table.supply_voltage and len(t_x := _seen(supply, 0)[0]):
+        share = np.mean(_seen(supply, 0)[1]) / table.supply_voltage * m.column("supply")
+        out["supply"] = Series(t_x[:1], share[None])
+    if heat is not None and len(heat) and any(c in WARM for columns in table.entries.values() for c in columns):
+        value = np.zeros((len(heat), len(m.joints)))
+        value[:, place] = np.nan_to_num(heat.value - REFERENCE)
+        out["warmth"] = Series(np.asarray(heat.t, float) - start, value)
+    return out
+
+
+@dataclass
+class Led:
+    """Joints that follow a path, whatever the dynamics: by name times [n] s and position, speed, acceleration [n] as
+    their encoders report them."""
+
+    paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+
+    @property
+    def joints(self) -> list[str]:
+        """Their names."""
+        return list(self.paths)
+
+    def at(self, t: np.ndarray, offset: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Position, speed and acceleration [T, J] of the joints at times t [T] s; offset, scale [J]: of their
+        encoders. Position and speed belong together: a cubic between readings; beyond them a joint rests."""
+        out = []
+        for times, q, v, a in self.paths.values():
+            at = np.clip(t, times[0], times[-1])
+            curve = CubicHermiteSpline(times, q, v)
+            on = (t >= times[0]) & (t <= times[-1])
+            out.append((curve(at), np.where(on, curve(at, 1), 0.0), np.where(on, np.interp(at, times, a), 0.0)))
+        q, v, a = (np.stack(x, 1) for x in zip(*out, strict=True))
+        return (q - offset) / scale, v / scale, a / scale
 
 
 def _path(poses: Series, steps: int, timestep: float) -> tuple[np.ndarray, np.ndarray]:

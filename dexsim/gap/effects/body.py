@@ -50,15 +50,20 @@ class Inertia(Effect):
         )
 
     def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
-        joint = spec.joint(case.joint)
-        armature = float(np.ravel(joint.armature)[0]) + values["armature"]
-        if armature >= 0:
-            joint.armature = armature
-            return [f"model.xml: armature of {case.joint} is {armature:.3g}"]
-        return [
-            f"{case.joint} has {-values['armature']:.3g} kg.m2 less inertia than the model's links and armature "
-            "together; change its links' inertia"
-        ]
+        return [add_armature(spec, case.joint, values["armature"])]
+
+
+def add_armature(spec: mujoco.MjSpec, joint: str, inertia: float) -> str:
+    """Adds an inertia [kg.m2, kg for a slide] to a joint's armature, which becomes none at the least; returns what was
+    done, in words."""
+    armature = float(np.ravel(spec.joint(joint).armature)[0]) + inertia
+    spec.joint(joint).armature = max(armature, 0.0)
+    if armature >= 0:
+        return f"model.xml: armature of {joint} is {armature:.3g}"
+    return (
+        f"{joint} has {-inertia:.3g} kg.m2 less inertia than the model's links and armature together; change its "
+        "links' inertia"
+    )
 
 
 LIGHTEST = 0.95  # of a link's believed mass: what may be taken away at most

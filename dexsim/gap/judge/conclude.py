@@ -3,27 +3,32 @@ and model, what was not considered."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
+import mujoco
 import numpy as np
 
+from dexsim.actuator.table import ServoTable
 from dexsim.console.tables import number
 from dexsim.gap import locate
 from dexsim.gap.effects import Effect
+from dexsim.gap.effects.body import add_armature
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
 from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
-from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
+from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
+from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read import wrong_signal
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
+from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.hypotheses import unknown
-from dexsim.gap.search.search import JointSearch, Outcome
+from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -56,12 +61,15 @@ def into_diagnosis(
     noise: Noise,
     how: str,
     channel: list[dict[str, Any]],
-    plains: Sequence[baseline.Baseline] = (),
+    plains: Sequence[baseline.Baseline],
+    written: Written,
+    refused: dict[str, str],
 ) -> None:
     """The joints into a diagnosis that is empty but for its notes and its mechanism.
 
     answers: of each joint, judged and located; how: what was held out, in words; channel: findings about signals, of
-    all joints; plains: the plain model of each joint. (One long list of steps: each needs what those before it found.)
+    all joints; plains: the plain model of each joint; written: what is written of each; refused: of `candidates`. (One
+    long list of steps: each needs what those before it found.)
     """
     data, notes, m = d.data, d.notes, d.mechanism
     assert m is not None  # that of the answers
@@ -104,18 +112,19 @@ def into_diagnosis(
             "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with "
             "others held out"
         )
-    fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
-    worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
-    worse = _withheld(worse, answers, rings)
+    d.written = written
+    refused = refused | {
+        a.case.joint: written.reason(a.case)
+        for a in answers
+        if written.beaten(a.case.joint, max(a.case.sigma, noise.floor))
+    }
     _judged_by_ringing(d, rings)
-    _not_better(d, worse)
+    _not_better(d, refused)
     findings.sort(key=lambda f: -_weight(f, rings))
     _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
-    _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
-    data["baseline"] = baseline.overall(plains)
-    if worse:
-        assert d.servo is not None  # `_hand_on` made it
-        data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
+    _hand_on(d, m, answers, findings)
+    data["baseline"] = baseline.overall(plains, [j for j, name in written.chosen.items() if name == "plain"])
+    notes += baseline.stopped(data["baseline"])
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
     # that says nothing of what is wrong with the reading of the effort alone
@@ -146,20 +155,71 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
                 e.confidence = min(e.confidence, JUDGE.hinted)
 
 
-def _withheld(worse: dict[str, str], answers: Sequence[JointAnswer], rings: Collection[str]) -> dict[str, str]:
-    """Joints of which what was found is not handed on, with the reason: those of `worse` (`baseline.refused`), but of
-    the joints that ring by themselves (`rings`) only those on which the error of what was held out surely rises by it.
-    That no free run keeps step explains an error that does not fall, not one that does nothing but rise."""
-    out = {joint: reason for joint, reason in worse.items() if joint not in rings}
+def candidates(
+    answers: Sequence[JointAnswer],
+    plains: Sequence[baseline.Baseline],
+    told: Mapping[str, logged_torque.Told],
+    joints: Sequence[str],
+) -> tuple[dict[str, list[Candidate]], dict[str, str]]:
+    """(of each joint the ways in which it may be written, joints of which what was found is none of them, with the
+    reason). told: friction that the recorded torque tells, which goes over each; joints: of the mechanism.
+
+    Not what a recorded motion forbids. No free run keeps step with a joint that rings by itself: of it what was found
+    is written, unless the error of what was held out surely rises by it. That explains an error that does not fall, not
+    one that does nothing but rise."""
+    out: dict[str, list[Candidate]] = {}
+    refused: dict[str, str] = {}
+    by = {b.joint: b for b in plains}
     for a in answers:
-        if a.case.joint in rings and a.best.members and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
-            k, unit = 1e3, "mm" if a.case.scales.slide else "mrad"
-            out[a.case.joint] = (
-                f"what was held out is missed by {k * rms(a.before):.3g} {unit} without what was found and, whichever "
-                f"stretches had been recorded, by more with it ({k * rms(a.after):.3g} {unit}), though it rings as the "
-                "joint does"
-            )
-    return out
+        case, plain = a.case, by.get(a.case.joint)
+        rings = _rings(a) > SEARCH.least
+        trials = {"refitted": (a.none, a.before)} | ({"found": (a.best, a.after)} if a.best.members else {})
+        given = [Candidate(BELIEVED, rms(a.before) if plain is None else plain.error_before, _nothing)]
+        for name, (trial, squares) in trials.items():
+            reason = baseline.forbidden(case, trial, a.kept.train)
+            if rings and name == "found" and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
+                k, unit = 1e3, "mm" if case.scales.slide else "mrad"
+                reason = (
+                    f"what was held out is missed by {k * rms(a.before):.3g} {unit} without what was found and, "
+                    f"whichever stretches had been recorded, by more with it ({k * rms(a.after):.3g} {unit}), though "
+                    "it rings as the joint does"
+                )
+            if reason:
+                refused |= {case.joint: reason} if trial is a.best or not a.best.members else {}
+            elif rings and name == "found":
+                given = []
+            for whole in () if reason else ("", WHOLE):
+                write = _write(a, trial, joints, bool(whole))
+                given.append(Candidate(name + whole, rms(squares), write, missing_of(case, trial)))
+        if plain is not None and not (rings and given[-1].found):
+            given.append(Candidate("plain", plain.error, partial(baseline.write, plain)))
+        if case.joint in told:
+            given = [replace(c, write=told[case.joint].over(c.write)) for c in given]
+        out[case.joint] = given
+    return out, refused
+
+
+def _nothing(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
+    return []
+
+
+def _write(
+    a: JointAnswer, trial: Trial, joints: Sequence[str], whole: bool
+) -> Callable[[ServoTable, mujoco.MjSpec], list[str]]:
+    """What writes a fitted hypothesis of a joint, with intervals, into the files' content; whole: all of it that they
+    have a place for."""
+    found = trial is a.best
+    bounds = a.bounds if found else a.search.widen(trial, intervals(trial.fit, a.search.blocks, huber=a.search.r.huber))
+
+    def write(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
+        servo_changes(table, a.case, trial, bounds, joints, whole)
+        said = list(model_changes(spec, a.case, trial, values_of(trial)))
+        factor = next((x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.key == "inertia"), 1.0)
+        if whole and factor != 1.0:
+            said.append(add_armature(spec, a.case.joint, float(factor - 1) * a.case.scales.inertia))
+        return said
+
+    return write
 
 
 def _rings(a: JointAnswer) -> float:
@@ -212,24 +272,29 @@ def _less(a: float, b: float) -> bool:
 
 def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> None:
     """The fitted servo and model; what is not sure reaches towards what was believed."""
-    servo, spec, changed, untrained = copy.deepcopy(m.table), m.spec.copy(), False, set()
-    for a in answers:
-        untrained |= set(servo_changes(servo, a.case, a.best, a.bounds, m.joints))
-        texts = list(model_changes(spec, a.case, a.best, a.raw))
-        changed |= bool(texts)
-        d.notes += texts
-    members = {(a.case.joint, mm.id): (a.case, mm) for a in answers for mm in a.outcome.best.members}
+    assert d.written is not None  # as into_diagnosis has it
+    choice = {a.case.joint: d.written.candidate(a.case.joint) for a in answers}
+    d.servo, d.model_spec, changed = files(m, [a.case for a in answers], choice)
+    d.notes += changed
+    if not changed:
+        d.model_spec = None
+    d.untrained = sorted(x for c in choice.values() for x in c.missing)
+    members = {
+        (a.case.joint, mm.id): (a.case, mm)
+        for a in answers
+        for mm in a.outcome.best.members
+        if choice[a.case.joint].found
+    }
     for f in findings:
         joint, effect = f["where"]["joints"][0], f["effect"]
         if (
             f["confidence"] < JUDGE.sure
             and (joint, effect) in members
-            and widen(servo, *members[joint, effect], f["confidence"], earned(f))
+            and widen(d.servo, *members[joint, effect], f["confidence"], earned(f))
         ):
             d.notes.append(
                 f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed"
             )
-    d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
 
 
 def _judged(

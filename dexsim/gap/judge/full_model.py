@@ -1,9 +1,11 @@
-"""The few final hypotheses once more, in the engine and the servo that train policies.
+"""What is written of each joint, chosen by replay in the engine and the servo that train policies.
 
-The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was held out
-of the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's
-columns and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one
-batch.
+Of a joint there are candidates: as it is believed, its belief refitted, a plain least squares, what was found. Each is
+written as the files would be, and the whole mechanism runs free over all that was held out of the fit, all judged
+joints at once, under the same commands; the others follow their recording. Joint by joint the candidate is written
+that follows best. Then the files are replayed as they are, by the function of `play replay=`: that is the number of
+the report. In C MuJoCo or, for the choice and where asked, in MuJoCo-Warp: every candidate and every recording is a
+world of one batch.
 """
 
 from __future__ import annotations
@@ -11,9 +13,8 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -24,41 +25,51 @@ from dexsim.actuator.columns import COLUMNS, DELAYS
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
-from dexsim.errors import UserError
-from dexsim.gap.effects.catalogue import model_columns
-from dexsim.gap.judge.handed_on import columns_beside, handed, model_changes, moved_friction, undamped
-from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import REFERENCE, Case
-from dexsim.gap.plant.columns import SERIES_INDEX, expand
-from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
-from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.search import Trial
-from dexsim.recording.mechanism import Mechanism
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
+from dexsim.recording.mechanism import (
+    BEFORE,
+    HEAVY,
+    SOON,
+    STEP,
+    Led,
+    Mechanism,
+    begun,
+    held_joints,
+    of_recording,
+    replay,
+)
+from dexsim.recording.schema import Recording
 from dexsim.sim import make_engine
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.batch import Windows
 
-STEP = 5e-4  # s: of the engine; its error is of first order in it
 REPLAY = ("mujoco", "warp", "none")
-TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
+FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
-BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
-MOST = 8.0  # s of what was held out that is replayed at most: a step of the engine is a turn of Python
-PILOT, LEAST = 0.1, 1.0  # s that are replayed to see how long it takes, and at least
+BELIEVED = "believed"  # candidate: nothing is changed
+WHOLE = ", as fitted"  # of a fit's candidate: with the figures that else only absorb the search's plant's inaccuracy
+# of candidates that follow alike the first is written
+ORDER = ("found", f"found{WHOLE}", "refitted", BELIEVED, f"refitted{WHOLE}", "plain")
 
 
-class NoTime(Exception):
-    """Less can be replayed in the time that there is than would say anything."""
-
-
-@dataclass
-class Hypothesis:
-    """A name and the fitted trial of each joint that has one; joints without one are driven as believed."""
+@dataclass(frozen=True)
+class Candidate:
+    """One way to write a joint. name: of `ORDER`; plant: rms [rad or m] that it leaves of what was held out in the
+    search's own plant; write(table, spec): puts it into the files' content and returns what it changed of the model, in
+    words; missing: what of it training cannot be given."""
 
     name: str
-    trials: dict[str, Trial]
+    plant: float
+    write: Callable[[ServoTable, mujoco.MjSpec], list[str]]
+    missing: tuple[str, ...] = ()
+
+    @property
+    def found(self) -> bool:
+        """Whether it is what was found."""
+        return self.name.startswith("found")
 
 
 @dataclass
@@ -69,7 +80,8 @@ class World:
     rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first
     position and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K,
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
-    from where a joint that drags another is counted (None: q)."""
+    from where a joint that drags another is counted (None: q); led: joints that follow their recording, in every world
+    of a batch the same."""
 
     rows: np.ndarray
     table: ServoTable
@@ -83,134 +95,165 @@ class World:
     enabled: tuple[np.ndarray, np.ndarray] | None = None
     warmth: tuple[np.ndarray, np.ndarray] | None = None
     home: np.ndarray | None = None
+    led: Led | None = None
 
 
 @dataclass
-class Confirmation:
-    """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the
-    gap's own plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot
-    be given; recordings: replayed; agrees: see `agree`."""
+class Replayed:
+    """What the files leave of what was held out, replayed as they are by the function of `play replay=`: rms [rad or m]
+    over all judged joints, by joint, and by recording and joint; engine; step_s; parts: (recording, start s, end s);
+    whole: whether these are all of what was held out."""
 
-    engine: str
-    step_s: float
-    errors: dict[str, tuple[float, float]]
-    joints: dict[str, tuple[float, float]]
-    missing: list[str]
-    recordings: list[str]
-    agrees: bool
-    floor: float
-    at_tasks_step: float = math.nan
-    simulated: dict[str, np.ndarray] = field(default_factory=dict)
-
-    def text(self, unit: str = "mrad") -> str:
-        """The result in a sentence; unit: what a thousandth of the position's is called."""
-        engine, plant = list(self.errors.values())[min(1, len(self.errors) - 1)]
-        if self.agrees:
-            together = ", all joints at once," if len(self.joints) > 1 else ""
-            return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
-        believed = next(iter(self.errors.values()))[0]
-        removed = believed - engine >= JUDGE.removed * max(believed - self.floor, 0.0)
-        if not self.missing and len(self.errors) > 1 and removed:
-            return (
-                f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, "
-                "more than in the search's own plant."
-            )
-        because = (
-            f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
-        )
-        return (
-            f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own "
-            f"plant leaves {1e3 * plant:.3g} ({because})."
-        )
+    error: float
+    joints: dict[str, float]
+    recordings: dict[str, dict[str, float]]
+    parts: list[tuple[str, float, float]]
+    engine: str = "C MuJoCo"
+    step_s: float = STEP
 
     def entry(self) -> dict[str, Any]:
-        """As diagnosis.json has it."""
-        out = {
-            "engine": self.engine,
-            "step_s": self.step_s,
+        """As `diagnosis.json` has it."""
+        parts = [{"recording": name, "start": round(a, 4), "end": round(b, 4)} for name, a, b in self.parts]
+        return {"error": self.error, "joints": self.joints, "engine": self.engine, "step_s": self.step_s} | {
             "recordings": self.recordings,
-            "agrees": self.agrees,
-            "not_handed_on": self.missing,
+            "parts": parts,
         }
-        out["engine_at_tasks_step"] = {"step_s": TASKS, "after": self.at_tasks_step}
-        out |= {name: {"engine": a, "plant": b} for name, (a, b) in self.errors.items()}
-        return out | {"joints": {j: {"engine": a, "plant": b} for j, (a, b) in self.joints.items()}}
 
 
-def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hypothesis) -> np.ndarray:
-    """[J, C] servo columns of the mechanism's joints in one run, with what the hypothesis hands on."""
-    rows = run.servo.nominal(m.joints).copy()
+@dataclass
+class Written:
+    """What is written of each joint. candidates: by joint; errors: rms [rad or m] by joint and candidate's name, of the
+    replay (of the search's own plant where nothing was replayed); chosen: a candidate's name by joint; replayed: the
+    files as they are, None where they were not."""
+
+    candidates: dict[str, list[Candidate]]
+    errors: dict[str, dict[str, float]]
+    chosen: dict[str, str]
+    by_replay: bool = False
+    replayed: Replayed | None = None
+
+    def candidate(self, joint: str) -> Candidate:
+        """What is written of a joint."""
+        return next(c for c in self.candidates[joint] if c.name == self.chosen[joint])
+
+    def beaten(self, joint: str, noise: float) -> bool:
+        """Whether the plain model of a joint is written although something was found, and follows better in the
+        search's own plant too. noise: of the joint [rad or m]."""
+        plant = {c.name: c.plant for c in self.candidates[joint]}
+        alike = max((1 + BELIEF.tolerance) * plant.get("plain", math.inf), JUDGE.within * noise)
+        return self.chosen[joint] == "plain" and plant.get("found", 0.0) > alike
+
+    def reason(self, case: Case) -> str:
+        """Why the plain model of a joint is written and not what was found, in words."""
+        k, unit, mine = 1e3, "mm" if case.scales.slide else "mrad", self.errors[case.joint]
+        where = "in the engine that trains" if self.by_replay else "in the search's own plant"
+        return (
+            f"a plain least squares follows what was held out to {k * mine['plain']:.3g} {unit}, what was found to "
+            f"{k * min(x for n, x in mine.items() if n.startswith('found')):.3g} ({where})"
+        )
+
+
+    def text(self, unit: str = "mrad") -> str:
+        """The headline in a sentence; unit: what a thousandth of the position's is called."""
+        assert self.replayed is not None  # as looked at by who asks
+        return (
+            f"The files as they are written, replayed in the engine that trains, leave {1e3 * self.replayed.error:.3g} "
+            f"{unit}."
+        )
+
+    def differences(self, judged: Mapping[str, Mapping[str, float]]) -> list[str]:
+        """Joints on which the replay differs from the search's own plant by more than a tenth, each with the reason, in
+        words. judged: `sigma` of each."""
+        out = []
+        for joint, engine in self.replayed.joints.items() if self.replayed is not None else ():
+            written, noise = self.candidate(joint), judged[joint]["sigma"]
+            if abs(engine - written.plant) <= FAR * written.plant or max(engine, written.plant) <= noise:
+                continue
+            why = (
+                f"its servo has no {', '.join(written.missing)}"
+                if written.missing
+                else "there each joint is simulated alone along the others' recorded motion, from a fitted state, "
+                "with figures refitted that the files do not carry (inertia and gravity within their tolerance)"
+            )
+            out.append(
+                f"{joint}: what is written ({written.name}) leaves {1e3 * engine:.3g} mrad in the engine that trains "
+                f"and {1e3 * written.plant:.3g} in the search's own plant: {why}"
+            )
+        return out
+
+
+def choose(errors: Mapping[str, float], noise: float) -> str:
+    """The candidate that is written of a joint, by what each leaves: the least error; of those as good, to what is
+    believed of figures or to the noise, the first of `ORDER`. What was found is none of them where a belief is
+    better."""
+    alike = max((1 + BELIEF.tolerance) * min(errors.values()), JUDGE.within * noise)
+    belief = min((x for n, x in errors.items() if n.startswith(("refitted", BELIEVED))), default=math.inf)
+    named = min(alike, max(belief, JUDGE.within * noise))
+    return next(n for n in ORDER if n in errors and errors[n] <= (named if n.startswith("found") else alike))
+
+
+def files(
+    m: Mechanism, cases: Sequence[Case], choice: Mapping[str, Candidate]
+) -> tuple[ServoTable, mujoco.MjSpec, list[str]]:
+    """(servo table, model, what changed of the model, in words): what is handed on with one candidate a joint."""
+    table, spec, said = copy.deepcopy(m.table), m.spec.copy(), []
+    table.fitted = {c.joint: {} for c in cases}
     for case in cases:
-        trial = h.trials.get(case.joint)
-        if trial is None:
-            continue
-        plant = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, index]
-        j = m.joints.index(case.joint)
-        for p in trial.fit.params:
-            for name in p.columns if handed(p, case) else ():
-                if name in SERVO_INDEX:
-                    c = COLUMNS[SERVO_INDEX[name]]
-                    rows[j, SERVO_INDEX[name]] = np.clip(plant[SERVO_INDEX[name]], c.low, c.high)
-        kd = SERVO_INDEX["kd"]
-        rows[j, kd] = max(rows[j, kd] - undamped(trial, rows[j, SERVO_INDEX["kp"]]), 0.0)
-        for name, value in columns_beside(case, trial, m.joints).items():
-            rows[j, SERVO_INDEX[name]] = value
-        for name, more in moved_friction(case, trial).items():
-            rows[j, SERVO_INDEX[name]] += more
+        for name, i in SERVO_INDEX.items():  # what all recordings state of their drive and the file does not
+            stated = {float(row[i]) for row in case.plant.nominal}
+            if name in case.stated and len(stated) == 1 and not table.value(case.joint, name).unknown:
+                value = stated.pop()
+                if value != table.value(case.joint, name).value:
+                    table.set(case.joint, name, value)
+        said += choice[case.joint].write(table, spec)
+    return table, spec, said
+
+
+def rows_of(table: ServoTable, run: Run, joints: Sequence[str]) -> np.ndarray:
+    """[J, C] servo columns in one run, of a table that was fitted: as `mechanism.of_recording` lays them over what the
+    recording says itself."""
+    rows = run.servo.nominal(joints).copy()
+    mine = table.nominal(joints)
+    for joint, factors in (table.fitted or {}).items():
+        j = joints.index(joint)
+        for name in table.entries.get(joint, {}):
+            i = SERVO_INDEX[name]
+            rows[j, i] = rows[j, i] * factors[name] if name in factors else mine[j, i]
     if run.supply is not None and run.servo.supply_voltage:
         rows[:, SERVO_INDEX["supply"]] *= float(np.mean(run.supply)) / run.servo.supply_voltage
     return rows
 
 
-def model_of(m: Mechanism, cases: Sequence[Case], h: Hypothesis) -> tuple[mujoco.MjSpec, bool]:
-    """(model with the fields that the hypothesis hands on, whether anything differs)."""
-    spec, changed = m.spec.copy(), False
-    for case in cases:
-        trial = h.trials.get(case.joint)
-        if trial is not None:
-            changed |= bool(model_changes(spec, case, trial, values_of(trial)))
-    return spec, changed
-
-
-def values_of(trial: Trial) -> dict[str, dict[str, float]]:
-    """Fitted values of each member by parameter."""
-    known = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
-    return {x.id: {p.key: float(known[f"{x.id}.{p.key}"]) for p in x.variant.params} for x in trial.members}
-
-
-def missing_of(h: Hypothesis) -> list[str]:
-    """Fitted parameters of effects that neither the servo's table nor the model has, as effect@joint."""
-    out = []
-    for joint, trial in h.trials.items():
-        for x in trial.members:
-            columns = {c for p in x.variant.params for c in p.columns}
-            fixed = {name for name, value in x.variant.fixed if value}
-            if (columns | fixed) - set(SERVO_INDEX) - model_columns():
-                out.append(f"{x.id} ({x.variant.label})@{joint}" if x.variant.label else f"{x.id}@{joint}")
-    return sorted(out)
-
-
-def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows: Windows) -> list[World]:
-    """One world a window (a whole run, or the part of it that was held out)."""
+def worlds_of(
+    m: Mechanism,
+    runs: Sequence[Run],
+    recordings: Mapping[str, Recording],
+    cases: Sequence[Case],
+    table: ServoTable,
+    windows: Windows,
+) -> list[World]:
+    """One world a window (a whole run, or the part of it that was held out), driven by a fitted table and begun as
+    `play replay=` begins."""
     out = []
     at_rest = m.spec.compile()
     rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
+    mine = Mechanism(m.spec, m.joints, table, m.robot)
     for w in range(len(windows.window)):
-        r = int(windows.run[w])
-        run, start = runs[r], float(windows.window_t[w])
-        rows = servo_rows(m, run, r, cases, h)
+        run = runs[int(windows.run[w])]
+        start = _start(recordings[run.name], float(windows.window_t[w]))
+        held = held_joints(mine, recordings[run.name].joints)
+        rows = rows_of(table, run, m.joints)
         scale, offset = rows[:, SERVO_INDEX["position_scale"]], rows[:, SERVO_INDEX["position_offset"]]
-        q, v, home = scale * rest + offset, np.zeros(len(m.joints)), scale * rest + offset
-        for case in cases:
-            series = case.plant.series[windows.window[w, 0]]
-            j = m.joints.index(case.joint)
-            q[j], v[j] = series[SERIES_INDEX["q"]], series[SERIES_INDEX["v"]]
+        q, home = scale * rest + offset, scale * rest + offset
         place = [m.joints.index(j) for j in run.joints]
-        first = int(np.clip(np.searchsorted(run.cmd_t, start - BEFORE) - 1, 0, len(run.cmd_t) - 1))
-        targets = np.full((len(run.cmd_t) - first, len(m.joints)), np.nan)
-        targets[:, place] = run.cmd[first:]
+        initial, v, paths = begun(recordings[run.name], m, start)
+        q = np.where(np.isfinite(initial), initial, q)
+        sent = max(int(np.searchsorted(run.cmd_t, start - BEFORE)) - 1, 0)
+        targets = np.full((len(run.cmd_t) - sent, len(m.joints)), np.nan)
+        targets[:, place] = run.cmd[sent:]
         target = q.copy()
-        target[place] = run.cmd[first]
+        if run.cmd_t[sent] < start:
+            target[place] = run.cmd[sent]
         enabled = None
         if run.enabled is not None:
             on = np.ones((len(run.t), len(m.joints)))
@@ -221,9 +264,9 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
             heat = np.zeros((len(run.t), len(m.joints)))
             heat[:, place] = np.nan_to_num(run.temperature - REFERENCE)
             warmth = (run.t - start, heat)
-        home[place] = run.qs[0] if run.qs is not None else run.q[0]
-        samples = windows.sample_row[windows.sample_window == w]
-        end = float(cases[0].plant.t[samples[-1]])
+        home[place] = q[place]
+        led = Led({j: paths[j] for j in held if j in paths})
+        end = float(cases[0].plant.t[windows.sample_row[windows.sample_window == w][-1]])
         out.append(
             World(
                 rows,
@@ -233,11 +276,12 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
                 q,
                 v,
                 target,
-                run.cmd_t[first:] - start,
+                run.cmd_t[sent:] - start,
                 targets,
                 enabled,
                 warmth,
                 home,
+                led if held else None,
             )
         )
     return out
@@ -278,6 +322,9 @@ def _batch(
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    led = worlds[0].led.joints if worlds[0].led is not None else []
+    for joint in led:
+        spec.joint(joint).armature = HEAVY
     N = len(worlds)
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
@@ -318,16 +365,44 @@ def _batch(
     given = torch.zeros_like(seen) if torque else None
     heated = "warmth" in varied or "rare" in servo.features
     changes = Changes(servo, worlds, now, steps, timestep, up, heated)
-    seen = _stepped(engine, servo, changes, seen, given)
+    path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
+    seen = _stepped(engine, servo, changes, seen, given, path)
     q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
     return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
 
 
+def _path(
+    engine: Any, servo: Servo, worlds: Sequence[World], joints: Sequence[str], t: np.ndarray
+) -> Callable[[int], None]:
+    """What leads joints along their recordings in step k: their state before the servo acts, their acceleration after
+    it (`_stepped` calls it twice)."""
+    mine = [servo.joints.index(j) for j in joints]
+    offset, scale = (servo.column(f"position_{x}")[:, mine].cpu().numpy() for x in ("offset", "scale"))
+    each = [w.led.at(t, o, s) for w, o, s in zip(worlds, offset, scale, strict=True) if w.led is not None]
+    to = lambda x: torch.as_tensor(np.stack(x, 1), dtype=engine.t.qpos.dtype, device=engine.t.qpos.device)  # noqa: E731
+    q, v, a = (to(x) for x in zip(*each, strict=True))
+    at, dofs, begun = engine.qpos_index(joints), engine.dof_index(joints), [False]
+
+    def lead(k: int) -> None:
+        if begun[0]:
+            engine.t.qfrc_applied[:, dofs] = HEAVY * a[k]
+        else:
+            engine.t.qpos[:, at], engine.t.qvel[:, dofs] = q[k], v[k]
+        begun[0] = not begun[0]
+
+    return lead
+
+
 def _stepped(
-    engine: Any, servo: Servo, changes: Changes, seen: torch.Tensor, given: torch.Tensor | None
+    engine: Any,
+    servo: Servo,
+    changes: Changes,
+    seen: torch.Tensor,
+    given: torch.Tensor | None,
+    lead: Callable[[int], None],
 ) -> torch.Tensor:
     """The positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise; given
-    [S, N, J]: filled with the drives' torques."""
+    [S, N, J]: filled with the drives' torques; lead: of `_path`."""
     steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
@@ -338,11 +413,13 @@ def _stepped(
             k = next(step)
             if k in changes.when:
                 changes.before(k)
+            lead(k)
             if kept is None:
                 seen[k].copy_(servo.position())
             else:
                 kept[k] = at
             servo.before_each()
+            lead(k)
             if given is not None:
                 given[k].copy_(servo.torque)
 
@@ -354,8 +431,9 @@ def _stepped(
             if k == steps:
                 break
             changes.before(k)
+            lead(k)
             seen[k].copy_(servo.position())
-            engine.step(1, servo.before_each)
+            engine.step(1, lambda k=k: (servo.before_each(), lead(k)))
             if given is not None:
                 given[k].copy_(servo.torque)
     return seen
@@ -435,127 +513,130 @@ def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: np.ndarray) -> np.nd
     return np.array(out)
 
 
-def confirm(
+# -- the choice -------------------------------------------------------------------------------------------------------
+
+
+def write_best(
     m: Mechanism,
     runs: Sequence[Run],
+    recordings: Mapping[str, Recording],
     cases: Sequence[Case],
-    hypotheses: Sequence[Hypothesis],
+    candidates: dict[str, list[Candidate]],
+    noise: Mapping[str, float],
     test: list[int],
     span_test: dict[int, tuple[float, float]] | None,
-    floor: float,
     device: str = "cpu",
-    replay: str = "mujoco",
-    timestep: float = STEP,
-    finer: Sequence[Case] = (),
-    room: float = math.inf,
-) -> Confirmation | None:
-    """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over
-    what was held out. finer: the cases with the plants in which the errors of the search's own plant are judged; room:
-    s that it may take, by a pilot: of each recording less is replayed where it would take longer. None where nothing
-    can be replayed. Raises UserError where the model or a drive does not serve, NoTime."""
-    device = "cpu" if replay == "mujoco" else device
+    engine: str = "mujoco",
+) -> Written:
+    """Of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m]; engine:
+    of `REPLAY`; none: by the search's own plant. Raises UserError where the model or a drive does not serve the
+    engine."""
+    errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
-    if not cases or not len(windows[0].window):
+    if engine == "none" or not cases or not len(windows[0].window):
+        return Written(candidates, errors, {j: choose(x, noise[j]) for j, x in errors.items()})
+    by = {j: {c.name: c for c in given} for j, given in candidates.items()}
+    first = windows[0]
+    starts = [
+        _start(recordings[runs[int(r)].name], float(t)) for r, t in zip(first.run, first.window_t, strict=True)
+    ]
+
+    def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
+        """rms by joint of each choice."""
+        given = [files(m, cases, {j: by[j][name] for j, name in x.items()}) for x in choices]
+        groups: dict[str, list[int]] = {}  # those that change the model alike share an engine
+        for i, (_, spec, said) in enumerate(given):
+            groups.setdefault(spec.to_xml() if said else "", []).append(i)
+        found: dict[int, list[np.ndarray]] = {}
+        count = len(windows[0].window)
+        for group in groups.values():
+            worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0])]
+            q = free_runs(given[group[0]][1], m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
+            for k, i in enumerate(group):
+                found[i] = q[k * count : (k + 1) * count]
+        pairs = [(c, ws, m.joints.index(c.joint)) for c, ws in zip(cases, windows, strict=True)]
+        return [{c.joint: _rms(c, ws, starts, found[i], j) for c, ws, j in pairs} for i in range(len(choices))]
+
+    # every joint as its own kind first, then the best of each together; where joints pull at one another that may be
+    # none of them: then each is asked once more with what the others now are
+    kinds = [k for k in ORDER if any(k in x for x in by.values())]
+    every = [{j: k if k in x else next(iter(x)) for j, x in by.items()} for k in kinds]
+    for found, choice in zip(replayed(every), every, strict=True):
+        for j, name in choice.items():
+            errors[j][name] = found[j]
+    chosen = {j: choose(x, noise[j]) for j, x in errors.items()}
+    if len(by) > 1 and len(set(chosen.values())) > 1:
+        (together,) = replayed([chosen])
+        moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * errors[j][chosen[j]] and len(by[j]) > 1]
+        swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
+        for (j, k), found in zip(swaps, replayed([chosen | {j: k} for j, k in swaps]), strict=True):
+            errors[j][k] = found[j]
+        for j in by:
+            errors[j][chosen[j]] = together[j]
+        chosen = {j: choose(x, noise[j]) for j, x in errors.items()}
+    return Written(candidates, errors, chosen, True)
+
+
+def _start(r: Recording, start: float) -> float:
+    """Where a replay begins [s] of what was recorded from `start` on: with the recording where that is its begin."""
+    first = float(r.states.position.t[0])
+    return 0.0 if start - first < STEP and first <= SOON else start
+
+
+def _rms(case: Case, ws: Windows, starts: Sequence[float], q: Sequence[np.ndarray], j: int) -> float:
+    """What free runs q, [T, J] a window from `starts` [s] on, leave of a joint at its samples in recordings that tell
+    of it."""
+    plant, left = case.plant, []
+    for w, x in enumerate(q):
+        if int(ws.run[w]) in plant.left_out:
+            continue
+        rows = ws.sample_row[ws.sample_window == w]
+        left.append(plant.q[rows] - np.interp(plant.t[rows] - starts[w], STEP * np.arange(len(x)), x[:, j]))
+    square = float(np.mean(np.concatenate(left) ** 2)) if left else 0.0
+    return math.sqrt(square) if np.isfinite(square) else math.inf
+
+
+def replay_files(
+    m: Mechanism,
+    table: ServoTable,
+    spec: mujoco.MjSpec,
+    runs: Sequence[Run],
+    recordings: Mapping[str, Recording],
+    cases: Sequence[Case],
+    test: list[int],
+    span_test: dict[int, tuple[float, float]] | None,
+) -> Replayed | None:
+    """What the files leave of all that was held out, as `play replay=` says it of each recording or part of one; None
+    where there is nothing to replay."""
+    ws = cases[0].plant.windows(None, test, span=span_test, every_run=True) if cases else None
+    if ws is None or not len(ws.window):
         return None
-    seconds = np.cumsum(windows[0].window[:, 1]) * cases[0].plant.dt
-    use = np.flatnonzero(seconds <= max(MOST, seconds[0]))
-    errors, joints, simulated = {}, {}, {}
-    final = min(1, len(hypotheses) - 1)
-    parts = [model_of(m, cases, h) for h in hypotheses]
-    worlds = [[w for i, w in enumerate(worlds_of(m, runs, cases, h, windows[0])) if i in use] for h in hypotheses]
-    plain = [i for i, (_, changed) in enumerate(parts) if not changed]
-    groups = ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]
-    most = MOST
-    worlds = [_until(x, most) for x in worlds]
-    if room < math.inf:
-        run = lambda s: free_runs(parts[0][0], m.joints, _until(worlds[0], s), device, timestep, replay)  # noqa: E731
-        most = min(most, _affordable(run, room, len(groups), len(parts) + timestep / TASKS))
-        worlds = [_until(x, most) for x in worlds]
-    found: dict[int, list[np.ndarray]] = {}
-    for group in groups:
-        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, replay)
-        for k, i in enumerate(group):
-            found[i] = q[k * len(use) : (k + 1) * len(use)]
-
-    def told(case: Case, ws: Windows) -> np.ndarray:
-        """[n] bool: samples of the windows replayed, in recordings that tell of this joint."""
-        t = case.plant.t[ws.sample_row] - ws.window_t[ws.sample_window]
-        left_out = np.isin(ws.run[ws.sample_window], list(case.plant.left_out))
-        return np.isin(ws.sample_window, use) & (t <= most) & ~left_out
-
-    def error(q: list[np.ndarray], step: float, case: Case, ws: Windows) -> tuple[np.ndarray, np.ndarray]:
-        """(simulated position, squared error) [n] of one joint at its samples."""
-        on = told(case, ws)
-        t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
-        out = np.empty(len(t))
-        for k, w in enumerate(use):
-            here = ws.sample_window[on] == w
-            x = q[k][:, m.joints.index(case.joint)]
-            out[here] = np.interp(t[here], step * np.arange(len(x)), x)
-        return out, (case.plant.q[ws.sample_row[on]] - out) ** 2
-
-    rms = lambda x: float(np.sqrt(np.mean(np.concatenate(x))))  # noqa: E731
-    for i, h in enumerate(hypotheses):
-        square, own = [], []
-        for case, ws, fine in zip(cases, windows, finer or cases, strict=True):
-            trial, on = h.trials[case.joint], told(case, ws)
-            if not on.any():
+    t = cases[0].plant.t
+    written = Mechanism(spec, m.joints, table, m.robot, m.hand, m.part_of)
+    judged, parts = [c.joint for c in cases], []
+    total = {j: np.zeros(2) for j in judged}
+    each: dict[str, dict[str, np.ndarray]] = {}
+    for w in range(len(ws.window)):
+        run, rows = int(ws.run[w]), ws.sample_row[ws.sample_window == w]
+        r, start, end = recordings[runs[run].name], float(ws.window_t[w]), float(t[rows[-1]])
+        start, whole = _start(r, start), float(r.states.position.t[-1]) - end < STEP
+        end = max(r.duration, end) if whole else end
+        done = replay(r, of_recording(written, r), start=start, end=None if whole else end)
+        parts.append((r.path.name, start, end))
+        state = r.states.position.between(done.t[0] - 1e-9, done.t[-1] + 1e-9)
+        for case in cases:
+            if run in case.plant.left_out or case.joint not in r.joints:
                 continue
-            same = ws if fine is case else fine.plant.windows(None, test, span=span_test, every_run=True)
-            fast = free_run(
-                fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed]
-            )[0][on]
-            there, miss = error(found[i], timestep, case, ws)
-            square.append(miss)
-            own.append((case.plant.q[ws.sample_row[on]] - fast) ** 2)
-            if i == final:
-                joints[case.joint] = (rms(square[-1:]), rms(own[-1:]))
-                simulated[case.joint] = there
-        errors[h.name] = (rms(square), rms(own))
-    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, replay)
-    at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
-    engine, plant = errors[hypotheses[final].name]
-    before = errors[hypotheses[0].name][1] if final else 0.0
-    if not np.isfinite(engine):
-        raise UserError("the engine's state did not stay finite")
-    names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
-    return Confirmation(
-        "MuJoCo-Warp" if replay == "warp" else "C MuJoCo",
-        timestep,
-        errors,
-        joints,
-        missing_of(hypotheses[final]),
-        names,
-        agree(engine, plant, floor, before),
-        floor,
-        at_tasks_step,
-        simulated,
+            q = np.interp(state.t, done.t, done.position[:, m.joints.index(case.joint)])
+            d = state.value[:, r.joints.index(case.joint)] - q
+            mine = np.array([np.nansum(d**2), np.isfinite(d).sum()])
+            total[case.joint] += mine
+            here = each.setdefault(r.path.name, {})
+            here[case.joint] = here.get(case.joint, np.zeros(2)) + mine
+    rms = lambda x: float(np.sqrt(x[0] / max(x[1], 1.0)))  # noqa: E731
+    return Replayed(
+        rms(sum(total.values())),
+        {j: rms(x) for j, x in total.items()},
+        {name: {j: rms(x) for j, x in given.items()} for name, given in each.items()},
+        parts,
     )
-
-
-def _until(worlds: Sequence[World], most: float) -> list[World]:
-    """The worlds, for so many s at most."""
-    return [replace(w, duration=min(w.duration, most)) for w in worlds]
-
-
-def _affordable(run: Callable[[float], Any], room: float, groups: int, times: float) -> float:
-    """s of each recording that can be replayed in `room` s, by how long `run` (s that are replayed) takes for one
-    hypothesis: `times` as often in all, in `groups` engines and one more. Raises NoTime."""
-    took = []
-    for pilot in (PILOT, 2 * PILOT):
-        begun = time.monotonic()
-        run(pilot)
-        took.append(time.monotonic() - begun)
-    each = max(took[1] - took[0], 0.1 * took[1]) / PILOT
-    fixed = max(took[1] - 2 * PILOT * each, 0.0)
-    most = (room - sum(took) - (groups + 1) * fixed) / (times * each)
-    if most < LEAST:
-        raise NoTime
-    return most
-
-
-def agree(engine: float, plant: float, floor: float, before: float) -> bool:
-    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.within times as much, or what it
-    leaves beyond that is JUDGE.earns beside the error before (the figures by which the plant absorbs its own
-    inaccuracy are not handed on)."""
-    return engine <= max(JUDGE.within * max(plant, floor), math.hypot(plant, JUDGE.earns * before))

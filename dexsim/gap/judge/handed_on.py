@@ -122,18 +122,26 @@ def moved_friction(case: Case, trial: Trial) -> dict[str, float]:
     }
 
 
-def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
-    """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the
-    table has no column for. Where something changes with temperature, training is given the temperatures that were
+def state(table: ServoTable, case: Case, name: str, value: float, low: float, high: float) -> None:
+    """Writes a fitted column of a joint with its interval into the servo table; where the recordings state different
+    ones, also the factor on what each states."""
+    stated = [float(row[INDEX[name]]) for row in case.plant.nominal]
+    if table.fitted is not None and np.ptp(stated) > 0 and case.scales.nominal[name]:
+        table.fitted.setdefault(case.joint, {})[name] = round(value / case.scales.nominal[name], 9)
+    table.set(case.joint, name, round(value, 9), round(min(low, value), 9), round(max(high, value), 9))
+
+
+def servo_changes(
+    table: ServoTable, case: Case, trial: Trial, bounds: np.ndarray, joints: Sequence[str], whole: bool = False
+) -> None:
+    """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; whole: what is
+    not `handed` too. Where something changes with temperature, training is given the temperatures that were
     recorded."""
-    left, fields = [], model_columns()
     for p, x, (low, high) in zip(trial.fit.params, trial.fit.x, bounds, strict=True):
-        if not handed(p, case):
+        if not (whole or handed(p, case)):
             continue
         for name in p.columns:
             if name not in INDEX:
-                if not p.nuisance and name not in fields and name not in APPROXIMATED:
-                    left.append(f"{name}@{case.joint}")
                 continue
             column = COLUMNS[INDEX[name]]
             nominal = case.scales.nominal[name]
@@ -144,9 +152,7 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
             else:
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
-            table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
-    for what, instead in filter(None, (m.effect.lacks(m.variant) for m in trial.members)):
-        left.append(f"{what}@{case.joint} ({instead})")
+            state(table, case, name, value, lo, hi)
     kp, kd = table.value(case.joint, "kp"), table.value(case.joint, "kd")
     assert kp.value is not None  # a table with an unknown one is refused
     lost = undamped(trial, kp.value)
@@ -162,7 +168,25 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
     if any(name in BY_WARMTH for p in trial.fit.params for name in p.columns):
         warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
         table.set(case.joint, "warmth", *(round(float(v), 2) for v in (np.median(warmth), warmth.min(), warmth.max())))
-    return left
+
+
+def values_of(trial: Trial) -> dict[str, dict[str, float]]:
+    """Fitted values of each member by parameter."""
+    known = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
+    return {x.id: {p.key: float(known[f"{x.id}.{p.key}"]) for p in x.variant.params} for x in trial.members}
+
+
+def missing_of(case: Case, trial: Trial) -> tuple[str, ...]:
+    """What of a fitted hypothesis training cannot be given, as effect@joint, with what it is given instead if
+    anything."""
+    out = []
+    for x in trial.members:
+        columns = {c for p in x.variant.params for c in p.columns} | {n for n, v in x.variant.fixed if v}
+        if lacks := x.effect.lacks(x.variant):
+            out.append(f"{lacks[0]}@{case.joint} ({lacks[1]})")
+        elif columns - set(INDEX) - model_columns() - APPROXIMATED:
+            out.append(f"{x.id} ({x.variant.label})@{case.joint}" if x.variant.label else f"{x.id}@{case.joint}")
+    return tuple(out)
 
 
 def earned(finding: dict[str, Any]) -> float:

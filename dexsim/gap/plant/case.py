@@ -19,8 +19,10 @@ from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
-from dexsim.gap.read import Run, local_polynomial, spans
+from dexsim.gap.read import Run, spans
 from dexsim.gap.rules import BELIEF, SEARCH
+from dexsim.recording.mechanism import QUICK
+from dexsim.recording.smooth import local_polynomial
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
@@ -798,7 +800,11 @@ def _one(
     v = np.gradient(x, step)
     v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     a = np.gradient(v, step)
-    miss, dv, da = (c[:, 0] for c in run.local(WIDTH)((q - np.interp(t, times, x))[:, None]))
+    left = (q - np.interp(t, times, x))[:, None]
+    miss, dv, da = (c[:, 0] for c in run.local(WIDTH)(left))
+    # a belief that is far off leaves much of the motion to the smoothing, which must not cut what is fast
+    if float(np.std(left[:, 0] - miss)) > SEARCH.enough * noise(t, q)[0]:
+        miss, dv, da = (c[:, 0] for c in local_polynomial(t, left, WIDTH, QUICK))
     fine = lambda y: np.interp(times, t, y)  # noqa: E731
     return times, x + fine(miss), v + fine(dv), a + fine(da)
 

@@ -23,7 +23,7 @@ from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.conclude import place, spoken, words_of
-from dexsim.gap.judge.full_model import TASKS
+from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
 from dexsim.gap.read import wrong_signal
 from dexsim.gap.report import charts
@@ -92,7 +92,7 @@ RESULTS = (
     "report.html",
 )
 """Everything that `save` and the plan of the next recording may write."""
-BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexplained", "not_considered"))
+BEYOND = (("reason",), ("held_out", "how"), ("unexplained", "not_considered"))
 
 
 def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -181,8 +181,8 @@ class Hero(Section):
         d, h = self.d, self.held_out
         word, tone = VERDICTS[d.data["verdict"]]
         said, replayed = d.sentence, ""
-        if d.confirmation is not None:
-            text = d.confirmation.text(unit_of(h["error"])[0])
+        if d.written is not None and d.written.replayed is not None:
+            text = d.written.text(unit_of(h["error"])[0])
             if said.endswith(text):
                 said, replayed = said[: -len(text)].rstrip(), text
         kept = h.get("how") or ", ".join(h["recordings"])
@@ -272,8 +272,11 @@ class Where(Section):
             return name, k * h[which], low, high, colour
 
         rows = [row("before", "before", charts.BEFORE)]
+        replayed = h.get("replayed") if h["error"].startswith("position") else None
         if any(not wrong_signal(f) for f in d.data["findings"]):
-            rows.append(row("after", "after", charts.AFTER))
+            rows.append(row("after, search's plant" if replayed else "after", "after", charts.AFTER))
+        if replayed:
+            rows.insert(1, ("as written, replayed", k * replayed["error"], None, None, charts.AFTER))
         plain = d.data["baseline"] if h["error"].startswith("position") else {}
         if plain:
             rows.append(("plain model", k * plain["error"], None, None, charts.FLOOR))
@@ -339,7 +342,7 @@ class Findings(Section):
         """The runner-up and why it lost, or the set that cannot be told apart."""
         rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
         out: dict[str, Any] = dict.fromkeys(
-            ("set", "separating", "lone", "open", "rival", "then", "wins", "replayed"), ""
+            ("set", "separating", "lone", "open", "rival", "then", "wins"), ""
         )
         if f["indistinguishable"]:
             return out | {
@@ -356,16 +359,7 @@ class Findings(Section):
             "wins": f"{100 * first['confidence']:.0f}",
             "open": first["confidence"] > f["confidence"],
             "then": ", ".join(_name(a["effect"]) for a in rest),
-            "replayed": self._replayed(first["effect"]),
         }
-
-    def _replayed(self, effect: str) -> str:
-        """What the runner-up leaves in the engine that trains, where it was replayed there."""
-        errors = self.d.confirmation.errors if self.d.confirmation is not None else {}
-        if f"{effect} instead" not in errors or "found" not in errors:
-            return ""
-        rival, found = (number(1e3 * errors[name][0]) for name in (f"{effect} instead", "found"))
-        return f"Over all joints, in the engine that trains, it leaves {rival} {self.unit}, the finding {found}."
 
     def _nearest(self) -> list[dict[str, str]]:
         """The effects that a search priced highest and did not find."""
@@ -436,7 +430,7 @@ class Details(Section):
             "spots": _ratios(d, ((10, "position"), (10, "effort"))) if d.spots else None,
             "stages": d.stages,
             "absent": [(_name(e), why) for e, why in d.data["unexplained"].get("not_considered", {}).items()],
-            "confirmed": self._confirmed() if d.confirmation is not None else None,
+            "written": self._written() if d.written is not None else None,
             "nuisance": ", ".join(f"{k} {v:.4g}" for k, v in d.data["nuisance"].items()),
             "took": f"Took {total:.0f} s: {', '.join(f'{k} {v:.1f} s' for k, v in d.shares.items())}." if total else "",
         }
@@ -456,19 +450,25 @@ class Details(Section):
             )
         return notes
 
-    def _confirmed(self) -> dict[str, Any]:
-        """The hypotheses in the engine that trains beside the search's own plant."""
-        c = self.d.confirmation
-        assert c is not None  # as looked at by who asks
+    def _written(self) -> dict[str, Any]:
+        """Of each joint what its candidates leave, which is written and what that leaves as written."""
+        w = self.d.written
+        assert w is not None  # as looked at by who asks
+        r, columns = w.replayed, [name for name in ORDER if any(name in x for x in w.errors.values())]
         return {
-            "engine": c.engine,
-            "step": f"{1e3 * c.step_s:g}",
-            "recordings": ", ".join(c.recordings),
-            "tasks_step": f"{1e3 * TASKS:g}",
-            "at_tasks_step": number(1e3 * c.at_tasks_step),
+            "by": "in the engine that trains" if w.by_replay else "in the search's own plant",
+            "parts": "" if r is None else ", ".join(f"{n} {a:.3g} to {b:.3g} s" for n, a, b in r.parts),
+            "engine": "" if r is None else f"{r.engine}, {1e3 * r.step_s:g} ms a step",
+            "columns": columns,
             "rows": [
-                {"name": name.replace("_", " "), "engine": number(1e3 * a), "plant": number(1e3 * b)}
-                for name, (a, b) in c.errors.items()
+                {
+                    "joint": joint,
+                    "errors": [number(1e3 * mine[c]) if c in mine else "" for c in columns],
+                    "chosen": w.chosen[joint],
+                    "plant": number(1e3 * w.candidate(joint).plant),
+                    "replayed": "" if r is None else number(1e3 * r.joints[joint]),
+                }
+                for joint, mine in w.errors.items()
             ],
         }
 

@@ -1,5 +1,5 @@
-"""The plain model that an engineer fits first, of every joint: PD gains, torque limit, Coulomb and viscous friction,
-delay.
+"""The plain model that an engineer fits first, of every joint: PD gains, torque limit, no-load speed, Coulomb and
+viscous friction, delay, lag, added inertia, offset.
 
 A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the
 bounds. Whatever else a diagnosis finds has to follow what was held out better than this, or this is what is handed on.
@@ -15,38 +15,50 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from dexsim import intervals
 from dexsim.actuator.columns import DRY_FRICTION
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.reference import dry_friction, gear_load_friction
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.effects.body import add_armature
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
-GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside what is believed
+GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside what is believed
 AT_ONCE = 49  # guesses that are simulated together: between them there is a look at the clock
-ITERATIONS = 8  # of the fit from each guess
-GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
-LATEST = 0.08  # s
-DRAWS = 400  # of the bootstrap
+ITERATIONS = 10  # of the fit from each guess
+GAIN, DAMPING, LIMIT = (0.2, 5.0), 20.0, (0.3, 3.0)  # x what is believed, where no range is stated
+WIDER = 2.0  # x: a stated range may be off by as much
+LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
+MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
+OFFSET = 0.5  # of a joint's typical torque
 UNSTATED = ("braking_slope",)  # what is believed of an unknown drive is not the servo table's default (`plant.case`)
-UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
+UNITS = {
+    "torque_limit": "N.m",
+    "no_load_speed": "rad/s",
+    "coulomb_friction": "N.m",
+    "viscous_friction": "N.m.s/rad",
+    "delay": "s",
+    "lag": "s",
+    "inertia": "kg.m2",
+    "offset": "N.m",
+}
 
 
 @dataclass
 class Baseline:
-    """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over
-    what was held out [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples,
-    of half a second a block [n]; at_bound: columns that stopped there; beside: columns of which the servo's file says
-    nothing, as they were when it was judged, where the file's default is another."""
+    """Of one joint. value: figures that were fitted, in their units, servo columns but for `inertia` (added) and
+    `offset` (a constant torque); factor: of columns in which the recordings differ, on what each states; error_before,
+    error: rms of a free run over what was held out [rad or m] with what is believed and with them; squares [n]: those
+    errors squared; at_bound: figures that stopped there; beside: columns of which the servo's file says nothing, as
+    they were when it was judged, where the file's default is another."""
 
     joint: str
     value: dict[str, float]
@@ -54,22 +66,23 @@ class Baseline:
     error: float
     squares_before: np.ndarray = field(repr=False)
     squares: np.ndarray = field(repr=False)
-    block: np.ndarray = field(repr=False)
     slide: bool = False
     at_bound: tuple[str, ...] = ()
     beside: dict[str, float] = field(default_factory=dict)
+    factor: dict[str, float] = field(default_factory=dict)
 
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
 
         def unit(n: str) -> str:
             hinge = UNITS.get(n, "1")
-            return hinge.replace("N.m", "N").replace("rad", "m") if self.slide else hinge
+            return hinge.replace("N.m", "N").replace("rad", "m").replace("kg.m2", "kg") if self.slide else hinge
 
         return {
             "error_before": self.error_before,
             "error": self.error,
             "parameters": {n: {"value": x, "unit": unit(n)} for n, x in self.value.items()},
+            "at_bound": list(self.at_bound),
         }
 
 
@@ -81,12 +94,17 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
     def factor(name: str, wide: tuple[float, float]) -> None:
         value = s.nominal[name]
         if 0 < value < 1e8:
-            low, high = case.ranges.get(name, (wide[0] * value, wide[1] * value))
+            low, high = case.ranges.get(name, (0.0, 0.0))
+            low, high = (low / WIDER, WIDER * high) if high > low else (wide[0] * value, wide[1] * value)
             out.append(Param(name, (name,), "factor", min(low / value, 1.0), max(high / value, 1.0), 1.0))
+
+    def most(name: str, high: float) -> None:
+        value = min(s.nominal[name], high)
+        out.append(Param(name, (name,), "set", 0.0, high, value, UNITS[name]))
 
     factor("kp", GAIN)
     if s.nominal["kd"] > 0:
-        factor("kd", (0.0, GAIN[1]))
+        factor("kd", (0.0, DAMPING))
     elif s.nominal["kp"] > 0:  # a loop that is said not to damp: up to critical damping
         stiffness = s.nominal["kp"] * (s.nominal["torque_limit"] if s.voltage else 1.0)
         out.append(
@@ -100,35 +118,19 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
             )
         )
     factor("torque_limit", LIMIT)
+    factor("no_load_speed", LIMIT)
     if not case.told:  # what the recorded torque has told is known
         room = min(min(room_for_friction(case, train).values()) - case.constants.friction, s.tau)
-        low, high = case.ranges.get("coulomb_friction", (0.0, np.inf))
-        room = min(room, high) if high > low else room
+        stated = case.ranges.get("coulomb_friction", (0.0, 0.0))[1]
+        room = min(room, WIDER * stated) if stated > 0 else room
         if room > 0:
-            out.append(
-                Param(
-                    "coulomb_friction",
-                    ("coulomb_friction",),
-                    "set",
-                    0.0,
-                    room,
-                    min(s.nominal["coulomb_friction"], room),
-                    UNITS["coulomb_friction"],
-                )
-            )
-        most = max(s.tau / s.speed, 2 * s.nominal["viscous_friction"])
-        out.append(
-            Param(
-                "viscous_friction",
-                ("viscous_friction",),
-                "set",
-                0.0,
-                most,
-                s.nominal["viscous_friction"],
-                UNITS["viscous_friction"],
-            )
-        )
-    out.append(Param("delay", ("delay",), "set", 0.0, max(LATEST, 2 * s.nominal["delay"]), s.nominal["delay"], "s"))
+            most("coulomb_friction", room)
+        most("viscous_friction", max(3 * s.tau / s.speed, 2 * s.nominal["viscous_friction"]))
+        out.append(Param("offset", ("bias",), "set", -OFFSET * s.tau, OFFSET * s.tau, 0.0, UNITS["offset"]))
+    most("delay", max(LATEST, 2 * s.nominal["delay"]))
+    most("lag", max(SLOWEST, 2 * s.nominal["lag"]))
+    least = max(LEAST_INERTIA * s.inertia, -case.constants.armature)  # what the model's rotor can give
+    out.append(Param("inertia", ("armature",), "add", least, MOST_INERTIA * s.inertia, 0.0, UNITS["inertia"]))
     return out
 
 
@@ -177,16 +179,17 @@ def judged(
         p.key: float(v * case.scales.nominal[p.key] if p.mode == "factor" else v)
         for p, v in zip(params, x, strict=True)
     }
+    differ = {n for n in SERVO if len({float(row[SERVO[n]]) for row in case.plant.nominal}) > 1}
+    factor = {p.key: float(v) for p, v in zip(params, x, strict=True) if p.mode == "factor" and p.key in differ}
     stopped = tuple(
         p.key
         for p, v in zip(params, x, strict=True)
-        if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0)
+        if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low != 0)
     )
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
-    block = (here.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * here.plant.run_of[kept.sample_row]
     beside = {n: case.scales.nominal[n] for n in UNSTATED if n not in case.stated}
     return Baseline(
-        case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped, beside
+        case.joint, value, rms(before), rms(after), before, after, case.scales.slide, stopped, beside, factor
     )
 
 
@@ -200,7 +203,12 @@ def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np
     # factors evenly in their logarithm; the rest denser near none
     spread = np.array([p.mode == "factor" and p.low > 0 for p in params])
     safe = np.where(spread, low, 1.0)
-    guesses = np.where(spread, safe * (np.where(spread, high, 2.0) / safe) ** share, low + (high - low) * share**2)
+    about = np.where(spread, 0.0, np.clip(start, low, high) * (low < 0))  # none, of what may be on both sides
+    up = about + (high - about) * np.maximum(2 * share - 1, 0) ** 2 + (low - about) * np.maximum(1 - 2 * share, 0) ** 2
+    one_sided = low + (high - low) * share**2
+    guesses = np.where(
+        spread, safe * (np.where(spread, high, 2.0) / safe) ** share, np.where(low < 0, up, one_sided)
+    )
     guesses = np.concatenate([start[None], guesses])
     loss = np.full(len(guesses), np.inf)
     for i in range(0, len(guesses), AT_ONCE):
@@ -215,8 +223,9 @@ def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np
     return min(fits, key=lambda f: f.loss).x
 
 
-def overall(given: Sequence[Baseline]) -> dict[str, Any]:
-    """All joints together as `diagnosis.json` has them; empty where there is none."""
+def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:
+    """All joints together as `diagnosis.json` has them; empty where there is none. handed_on: joints of which it is
+    written."""
     if not given:
         return {}
     rms = lambda parts: float(np.sqrt(np.mean(np.concatenate(parts))))  # noqa: E731
@@ -225,67 +234,30 @@ def overall(given: Sequence[Baseline]) -> dict[str, Any]:
         "error": rms([b.squares for b in given]),
         "parameters": sorted({n for b in given for n in b.value}),
         "joints": {b.joint: b.entry() for b in given},
-        "handed_on": [],
+        "handed_on": list(handed_on),
     }
 
 
-def refused(
-    given: Sequence[Baseline],
-    joints: dict[str, dict[str, float]],
-    fits: Sequence[tuple[Case, Any, np.ndarray]],
-    train: Sequence[int],
-    floor: float,
-) -> dict[str, str]:
-    """Joints of which what was fitted is not handed on, with the reason: it follows what was held out worse than the
-    plain model, or its friction forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); fits:
-    each joint's case, the trial that it would hand on and its squared errors on what was held out, at the plain model's
-    samples; floor: of the noise, as `joints`."""
-    out = {}
-    by = {b.joint: b for b in given}
-    for case, trial, squares in fits:
-        joint = case.joint
-        row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
-        dry = {n: float(row[INDEX[n]]) for n in DRY}
-        # than was believed: that is not this answer's
-        more = any(dry[n] > (1 + BELIEF.tolerance) * case.scales.nominal.get(n, 0.0) + 1e-12 for n in HOLDING)
-        reason = forbids(case, train, dry["coulomb_friction"], dry["friction_asymmetry"], dry) if more else ""
-        plain, after = by.get(joint), joints[joint]["after"]
-        if reason:
-            out[joint] = reason
-        elif (
-            plain is not None
-            and after > max((1 + BELIEF.tolerance) * plain.error, JUDGE.within * max(joints[joint]["sigma"], floor))
-            and _surely(squares, plain)
-        ):
-            k, unit = 1e3, "mm" if case.scales.slide else "mrad"
-            out[joint] = (
-                "a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was held out to "
-                f"{k * plain.error:.3g} {unit}, "
-                f"what was found to {k * after:.3g}"
-            )
-    return out
+def forbidden(case: Case, trial: Any, train: Sequence[int]) -> str:
+    """Why a fitted hypothesis of a joint cannot be: its friction forbids a motion that was recorded. Empty where none
+    is forbidden."""
+    row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
+    dry = {n: float(row[INDEX[n]]) for n in DRY}
+    # than was believed: that is not this answer's
+    more = any(dry[n] > (1 + BELIEF.tolerance) * case.scales.nominal.get(n, 0.0) + 1e-12 for n in HOLDING)
+    return forbids(case, train, dry["coulomb_friction"], dry["friction_asymmetry"], dry) if more else ""
 
 
-def _surely(squares: np.ndarray, plain: Baseline) -> bool:
-    """Whether squared errors [n] are larger than the plain model's, whichever stretches had been recorded."""
-    if len(squares) != len(plain.squares):
-        return False
-    _, block = np.unique(plain.block, return_inverse=True)
-    more = np.bincount(block, squares - plain.squares)
-    draws = intervals.draws((more,), np.sum, 0, DRAWS)
-    return float(np.mean(draws > 0)) >= TORQUE.surely
-
-
-def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str]) -> list[str]:
-    """Writes the plain model of `joints` into the servo table that is handed on; returns those that have one."""
-    done = []
-    for b in given:
-        if b.joint in joints and b.error < b.error_before:
-            for name, x in (b.beside | b.value).items():
-                if name in SERVO:
-                    servo.set(b.joint, name, round(x, 9))
-            done.append(b.joint)
-    return done
+def write(plain: Baseline, table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
+    """Writes the plain model of a joint into the servo table and the model; returns what changed of the model, in
+    words."""
+    for name, x in (plain.beside | plain.value | {"standin_constant": plain.value.get("offset", 0.0)}).items():
+        if name in SERVO and (x or name != "standin_constant"):
+            table.set(plain.joint, name, round(x, 9))
+    if plain.factor and table.fitted is not None:
+        table.fitted.setdefault(plain.joint, {}).update({n: round(x, 9) for n, x in plain.factor.items()})
+    added = plain.value.get("inertia", 0.0)
+    return [add_armature(spec, plain.joint, added)] if added else []
 
 
 def left_by_what_is_handed_on(data: dict[str, Any]) -> float | None:
@@ -299,10 +271,20 @@ def text(data: dict[str, Any], unit: str) -> str:
     if not data:
         return ""
     said = (
-        f"A plain least squares (gains, limit, Coulomb, viscous, delay) leaves {1e3 * data['error']:.3g} {unit} of "
-        f"{1e3 * data['error_before']:.3g} on what was held out"
+        f"A plain least squares (gains, limits, friction, delay, lag, inertia, offset) leaves "
+        f"{1e3 * data['error']:.3g} {unit} of {1e3 * data['error_before']:.3g} on what was held out"
     )
-    return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
+    return said + (f"; use it for {', '.join(data['handed_on'])}: it is what is written" if data["handed_on"] else "")
+
+
+def stopped(data: dict[str, Any]) -> list[str]:
+    """Sentences about figures of the plain model that ended at the bounds of what was tried."""
+    return [
+        f"{joint}: the plain least squares ends at its bound in {' and '.join(n.replace('_', ' ') for n in x)}: "
+        "what is believed of the drive is further off than was tried, or another law acts"
+        for joint, b in data.get("joints", {}).items()
+        if (x := b["at_bound"])
+    ]
 
 
 # columns of dry friction that may hold a joint at rest

@@ -3,7 +3,7 @@ it, and pushes from outside."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +37,7 @@ from dexsim.gap.search.inverse_dynamics import (
 if TYPE_CHECKING:
     Spans = dict[int, tuple[float, float]]  # by run: the part [s from its start] to keep to
 
-    from dexsim.gap.inquiry import Diagnosis
+    from dexsim.actuator.table import ServoTable
     from dexsim.gap.plant.case import Case
     from dexsim.gap.read.stage_tests import Stage
     from dexsim.gap.search.search import JointSearch, SearchedJoint, Trial
@@ -177,54 +177,74 @@ def believe(given: Sequence[IdentifiedJoint]) -> list[str]:
     return said
 
 
-def hand_on(
+@dataclass(frozen=True)
+class Told:
+    """What the recorded torque tells of a joint's friction, and goes before what its closed loop was refitted to.
+    columns: servo columns, (value, low, high); inertia: factor on the model's, None where it is not told."""
+
+    joint: str
+    columns: dict[str, tuple[float, float, float]]
+    inertia: float | None
+
+    def over(
+        self, write: Callable[[ServoTable, mujoco.MjSpec], list[str]]
+    ) -> Callable[[ServoTable, mujoco.MjSpec], list[str]]:
+        """The same as `write`, then these figures."""
+
+        def both(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
+            said = write(table, spec)
+            for name, values in self.columns.items():
+                table.set(self.joint, name, *(round(v, 9) for v in values))
+            return said
+
+        return both
+
+    def note(self, nuisance: dict[str, float]) -> str:
+        """Puts them among the refitted beliefs; in words."""
+        given = {n: x[0] for n, x in self.columns.items() if f"{n}@{self.joint}" in nuisance}
+        given |= {} if self.inertia is None else {"inertia_factor": self.inertia}
+        nuisance |= {f"{n}@{self.joint}": round(x, 6) for n, x in given.items()}
+        return (
+            f"{self.joint}: friction is handed on as the recorded torque tells it; its closed loop does not tell it "
+            "better"
+        )
+
+
+def told(
     given: Sequence[IdentifiedJoint],
-    d: Diagnosis,
     searched: Sequence[SearchedJoint],
     test: Sequence[int],
     span_test: Spans | None,
     stages: Sequence[Stage] = (),
-) -> None:
-    """Writes the torque's figures into the servo table that is handed on, and the nuisances, where a joint's closed
-    loop does not say otherwise: what it was refitted to then is the fit's own wandering.
+) -> dict[str, Told]:
+    """The torque's figures of each joint that is handed them on: where its closed loop does not say otherwise, what it
+    was refitted to is the fit's own wandering.
 
     A closed loop says otherwise where a free run over what was held out is followed better with its own figures, by
-    more than `BELIEF.tolerance`, or where a finding of at least a half is about them; not where `stages` say that the
-    drive itself is not as believed, since what its loop does then speaks of the drive.
+    more than `BELIEF.tolerance`, or where what was found is about them; not where `stages` say that the drive itself is
+    not as believed, since what its loop does then speaks of the drive.
     """
     strange = {x.joint for x in stages if not x.sound}
-    by = {x.case.joint: x for x in searched}
+    by, out = {x.case.joint: x for x in searched}, {}
     for joint in given:
         case, x = joint.case, joint.inverse
         if not case.told or case.joint not in by:
             continue
-        search, outcome = by[case.joint].search, by[case.joint].outcome
-        held = [f for f in d.data["findings"] if f["confidence"] >= JUDGE.firm and case.joint in f["where"]["joints"]]
-        trial = search.polish(outcome.best if held else outcome.none)
+        search = by[case.joint].search
+        trial = search.polish(by[case.joint].outcome.best)
         claimed = {c for m in trial.members for p in m.variant.params for c in p.columns}
-        told = [
+        known = [
             n
             for n in ("viscous_friction", "coulomb_friction", "friction_asymmetry")
             if n in case.ranges and n not in claimed
         ]
-        ours: dict[str, float] = {n: case.scales.nominal[n] for n in told}
+        ours: dict[str, float] = {n: case.scales.nominal[n] for n in known}
         if "inertia" in case.factors and "inertia_scale" not in claimed:
             ours["inertia"] = x.value["inertia"] / case.scales.inertia
-        assert d.servo is not None  # what is handed on
-        if not told or not (case.joint in strange or _alike(case, search, trial, ours, test, span_test)):
-            continue
-        for name in told:
-            d.servo.set(
-                case.joint, name, round(case.scales.nominal[name], 9), *(round(v, 9) for v in case.ranges[name])
-            )
-            if f"{name}@{case.joint}" in d.data["nuisance"]:
-                d.data["nuisance"][f"{name}@{case.joint}"] = round(case.scales.nominal[name], 6)
-        if "inertia" in ours:
-            d.data["nuisance"][f"inertia_factor@{case.joint}"] = round(ours["inertia"], 6)
-        d.notes.append(
-            f"{case.joint}: friction is handed on as the recorded torque tells it; its closed loop does not tell it "
-            "better"
-        )
+        if known and (case.joint in strange or _alike(case, search, trial, ours, test, span_test)):
+            columns = {n: (case.scales.nominal[n], *case.ranges[n]) for n in known}
+            out[case.joint] = Told(case.joint, columns, ours.get("inertia"))
+    return out
 
 
 def unknown_controllers(given: Sequence[IdentifiedJoint], stages: Sequence[Stage], notes: list[str]) -> set[str]:

@@ -16,10 +16,11 @@ from dexsim import yaml_text
 from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.gap.plant.case import noise
-from dexsim.gap.read import local_polynomial, spans
+from dexsim.gap.read import spans
 from dexsim.gap.rules import TOUCH
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
+from dexsim.recording.smooth import local_polynomial
 from dexsim.tactile import reference as ref
 from dexsim.tactile.sensors import Sensors
 

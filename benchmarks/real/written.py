@@ -1,0 +1,292 @@
+"""What `diagnose` writes on real machines, replayed, beside what is believed and plain least squares.
+
+    python -m benchmarks.real.written [sets=igris,igris_other,igris_pair,sage,ergocub,bam,panda] [data=PATH]
+                                      [out=out/real/written] [jobs=1] [limit=0] [only=NAME]
+
+Of each set (a part of one: a gain, a finger, a joint) `diagnose` is run, then `play replay=` on every recording that
+was held out with the files that it wrote, and a least squares of our own (`baseline.py`) is fitted to the same
+recordings. By joint: rms of what was held out as believed, by our own least squares (in its own simulation), by the
+tool's plain fit (as written, in the engine that trains), as reported (`held_out.replayed`) and as `play` prints it.
+Passed where the last is within a tenth of what was reported, and at most 1.05 x the better of belief and plain. limit:
+seconds a diagnosis may take (0: none). Results of each part in out/NAME.json, all in out/written.json.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.real.fold import brief
+from dexsim.console.ending import guard
+from dexsim.console.tables import table
+from dexsim.errors import UserError
+
+SETS = ("igris", "igris_other", "igris_pair", "sage", "ergocub", "bam", "panda")
+FOLDERS = {"sage": "sage_so101", "ergocub": "ergocub_fingers", "bam": "bam_xl330", "panda": "panda"}
+AGREE, WORSE = 0.10, 1.05  # the two criteria
+
+
+@dataclass
+class Part:
+    """What one process does. judged: joints that are judged (None: all that are driven)."""
+
+    name: str
+    recordings: list[Path]
+    held_out: list[Path]
+    model: Path
+    servo: Path
+    judged: tuple[str, ...] | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def igris(data: Path, out: Path, name: str) -> list[Part]:
+    """Eight joints with either split of the segments, or two of them."""
+    from benchmarks.real.convert_igris import JOINTS, PAIR, SPLITS, convert
+
+    made = convert(data / "igris", out / f"recordings_{name}")
+    held = SPLITS[name == "igris_other"]
+    kept = [made.recordings[k] for k in held]
+    rest = [p for p in made.recordings if p not in kept]
+    return [Part(name, rest, kept, made.model, made.servo, PAIR if name == "igris_pair" else JOINTS)]
+
+
+def sage(data: Path, out: Path, name: str) -> list[Part]:
+    """Six joints of an arm, each alone; ten of thirty motions held out."""
+    from benchmarks.real.convert_sage import JOINTS, convert
+
+    made = convert(data, out / f"recordings_{name}")
+    return [Part(f"sage_{j}", made.recordings, made.held_out, made.model, made.servo, (j,)) for j in JOINTS]
+
+
+def ergocub(data: Path, out: Path, name: str) -> list[Part]:
+    """The runs of each finger together, every third held out."""
+    from benchmarks.real.convert_ergocub import FINGERS, convert, held_out
+
+    made, parts = convert(data, out / f"recordings_{name}"), []
+    for which, runs in FINGERS.items():
+        kept = held_out(which)
+        if kept:
+            clips, judged = ([p for r in runs if (r in kept) is held for p in made.runs[r]] for held in (False, True))
+            parts.append(Part(f"ergocub_{which}", clips, judged, made.model, made.servo))
+    return parts
+
+
+def bam(data: Path, out: Path, name: str) -> list[Part]:
+    """One of four gains held out."""
+    from benchmarks.real.convert_bam import convert
+
+    made, parts = convert(data, out / f"recordings_{name}"), []
+    for gain in sorted(set(made.gains.values())):
+        kept = [p for p in made.recordings if made.gains[p.name] == gain]
+        rest = [p for p in made.recordings if p not in kept]
+        parts.append(Part(f"bam_{gain}", rest, kept, made.model, made.servo))
+    return parts
+
+
+def panda(data: Path, out: Path, name: str) -> list[Part]:
+    """One trajectory, its last quarter held out."""
+    from benchmarks.real.convert_panda import convert
+
+    made = convert(data, out / f"recordings_{name}")
+    return [Part("panda", [made.recording], [], made.model, made.servo)]
+
+
+MAKE: dict[str, Callable[[Path, Path, str], list[Part]]] = {
+    "igris": igris, "igris_other": igris, "igris_pair": igris, "sage": sage, "ergocub": ergocub, "bam": bam,
+    "panda": panda,
+}  # fmt: skip
+
+
+def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
+    """One part: diagnosed, written and replayed."""
+    from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.sim.quiet import quiet_warp
+
+    part, out, limit = job
+    quiet_warp("cpu")
+    begun, folder = time.perf_counter(), out / part.name
+    log = (out / f"{part.name}.log").open("w", encoding="utf-8", buffering=1)
+    d = diagnose(
+        Settings(
+            part.recordings,
+            folder,
+            part.held_out or None,
+            str(part.model),
+            str(part.servo),
+            next_recording=False,
+            joints=None if part.judged is None else set(part.judged),
+            limit=limit,
+        ),
+        say=lambda text: print(f"{time.perf_counter() - begun:6.0f} s  {text}", file=log),
+    )
+    save(d, folder)
+    took = time.perf_counter() - begun
+    said = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    reported = said["held_out"].get("replayed")
+    files = {p.name: p for p in (*part.recordings, *part.held_out)}
+    rows, parts = {}, [] if reported is None else reported["parts"]
+    played = play(part, folder, files, parts) if parts else {}
+    for joint, v in d.joints.items():
+        w = d.written
+        left = {} if w is None else w.errors[joint]
+        rows[joint] = {
+            "believed": left.get("believed"),
+            "plain": left.get("plain"),
+            "candidates": left,
+            "written": None if w is None else w.chosen[joint],
+            "by_search": {"before": v["before"], "after": v["after"]},
+            "reported": None if reported is None else reported["joints"].get(joint),
+            "replayed": played.get(joint),
+        }
+    log.close()
+    result = {
+        "part": part.name,
+        "joints": rows,
+        "parts": parts,
+        "verdict": said["verdict"],
+        "sentence": d.sentence,
+        "findings": [brief(f) for f in said["findings"]],
+        "reported": None if reported is None else reported["error"],
+        "floor": said["noise_floor"],
+        "baseline": said["baseline"],
+        "notes": d.notes,
+        "seconds": took,
+        "shares": d.shares,
+    }
+    (out / f"{part.name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
+    return result
+
+
+def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """By joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
+    from dexsim.cli import recorded
+    from dexsim.paths import CONFIGS
+    from dexsim.recording import read
+
+    total: dict[str, np.ndarray] = {}
+    model = folder / "model.xml" if (folder / "model.xml").is_file() else part.model
+    for k, x in enumerate(parts):
+        argv = [f"replay={files[x['recording']]}", f"model={model}", f"servo={folder / 'servo.yaml'}", "video=false",
+                f"out={folder / 'play' / str(k)}", f"start={x['start']}", f"end={x['end']}"]  # fmt: skip
+        with contextlib.redirect_stdout(io.StringIO()):
+            recorded.run(recorded.settings(argv, CONFIGS))
+        said = json.loads((folder / "play" / str(k) / "metrics.json").read_text(encoding="utf-8"))
+        state = read(files[x["recording"]]).states.position
+        on = (state.t >= x["start"] - 1e-9) & (state.t <= x["end"] + 1e-3)
+        for joint, error in said["position_rmse_rad"].items():
+            if error is not None and joint not in said["follow_their_recording"]:
+                total[joint] = total.get(joint, np.zeros(2)) + np.array([error**2 * on.sum(), on.sum()])
+    return {joint: float(np.sqrt(a / b)) for joint, (a, b) in total.items()}
+
+
+def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
+    """Our own least squares of one joint of a part. parts: what was held out."""
+    from benchmarks.real import baseline
+    from dexsim.recording import mechanism, read
+    from dexsim.sim.quiet import quiet_warp
+
+    part, out, joint, held = job
+    quiet_warp("cpu")
+    begun = time.perf_counter()
+    m = mechanism.mechanism(str(part.model), str(part.servo))
+    files = {p.name: read(p, joints=m.joints) for p in (*part.recordings, *part.held_out)}
+    test = [(files[x["recording"]], x["start"], x["end"]) for x in held]
+    if part.held_out:
+        train = [(files[p.name], 0.0, np.inf) for p in part.recordings]
+    else:
+        train = [(r, 0.0, next(x["start"] for x in held if x["recording"] == n)) for n, r in files.items()]
+    found = baseline.fit(m, joint, train, test) | {"part": part.name, "joint": joint}
+    found["seconds"] = time.perf_counter() - begun
+    (out / f"{part.name}.{joint}.hand.json").write_text(json.dumps(found, default=float), encoding="utf-8")
+    return found
+
+
+def judged(row: dict[str, Any]) -> dict[str, bool | None]:
+    """The two criteria of a joint; None where it cannot be said."""
+    replayed, reported, plain, believed = (row.get(k) for k in ("replayed", "reported", "plain", "believed"))
+    if replayed is None or reported is None:
+        return {"as_reported": None, "no_worse": None}
+    least = min(x for x in (plain, believed) if x is not None)
+    return {
+        "as_reported": abs(replayed - reported) <= AGREE * reported,
+        "no_worse": replayed <= WORSE * least,
+    }
+
+
+def shown(results: Sequence[dict[str, Any]]) -> str:
+    """The table."""
+    rows, errors = [], ("believed", "by hand", "plain", "reported", "replayed")
+    mrad = lambda x: "-" if x is None else f"{1e3 * x:.3g}"  # noqa: E731
+    word = {True: "pass", False: "FAIL", None: "-"}
+    for r in results:
+        for joint, row in r["joints"].items():
+            passed = judged(row)
+            rows.append(
+                (
+                    r["part"],
+                    joint,
+                    *(mrad(row.get(k.replace(" ", "_"))) for k in errors),
+                    row["written"] or "-",
+                    word[passed["as_reported"]],
+                    word[passed["no_worse"]],
+                )
+            )
+    head = ("part", "joint", *errors, "written", "as reported", "no worse")
+    return table("held out, rms, mrad", head, rows)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the sets; returns the exit status."""
+    given = dict(a.partition("=")[::2] for a in argv)
+    if set(given) - {"sets", "data", "out", "jobs", "limit", "only"} or not given.get("jobs", "1").isdigit():
+        print(__doc__)
+        return 2
+    sets = given.get("sets", ",".join(SETS)).split(",")
+    if bad := [s for s in sets if s not in SETS]:
+        raise UserError(f"sets={','.join(bad)}: must be of {', '.join(SETS)}")
+    data, out = Path(given.get("data", "../shared/realdata")), Path(given.get("out", "out/real/written"))
+    out.mkdir(parents=True, exist_ok=True)
+    limit, parts = float(given.get("limit", 0)) or None, []
+    for name in sets:
+        folder = data / FOLDERS.get(name, "igris")
+        if not folder.is_dir():
+            print(json.dumps({"set": name, "skipped": f"{folder} is absent"}))
+            continue
+        parts += MAKE[name](data if name.startswith("igris") else folder, out, name)
+    parts = [p for p in parts if given.get("only", p.name) == p.name]
+    by, results = {p.name: p for p in parts}, {}
+    with ProcessPoolExecutor(max(int(given.get("jobs", 1)), 1), mp_context=get_context("spawn")) as pool:
+        waiting = {pool.submit(diagnosed, (p, out, limit)) for p in parts}
+        while waiting:
+            done = next(as_completed(waiting))
+            waiting.discard(done)
+            r = done.result()
+            if "joint" in r:
+                results[r["part"]]["joints"][r["joint"]]["by_hand"] = r["error"]
+                continue
+            results[r["part"]] = r
+            print(f"{r['part']}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
+            waiting |= {pool.submit(by_hand, (by[r["part"]], out, j, r["parts"])) for j in r["joints"] if r["parts"]}
+            (out / "written.json").write_text(json.dumps(list(results.values()), default=float), encoding="utf-8")
+    ordered = [results[p.name] for p in parts]
+    for r in ordered:
+        for row in r["joints"].values():
+            row |= {"passed": judged(row)}
+    (out / "written.json").write_text(json.dumps(ordered, default=float), encoding="utf-8")
+    print("\n" + shown(ordered))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(guard(main, sys.argv[1:]))
