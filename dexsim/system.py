@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -109,6 +110,17 @@ def renderers() -> tuple[str, ...]:
 def renderer_environment(name: str) -> dict[str, str]:
     """Environment of a process that renders by one of :func:`renderers`."""
     return {"MUJOCO_GL": name} | ({"PYOPENGL_PLATFORM": name} if name in RENDERERS["linux"] else {})
+
+
+def renderer() -> str | None:
+    """Return the first of :func:`renderers` that opens, None where none does: each is tried in a process of its own,
+    since a driver may crash."""
+    probe = "import mujoco; c = mujoco.GLContext(8, 8); c.make_current()"
+    for name in renderers():
+        env = os.environ | renderer_environment(name)
+        if subprocess.run([sys.executable, "-c", probe], env=env, capture_output=True, timeout=60).returncode == 0:
+            return name
+    return None
 
 
 def no_renderer() -> str:

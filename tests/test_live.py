@@ -218,14 +218,6 @@ def test_a_port_in_use_is_one_line(view, env):
         LiveView(env, view.policy, "close", ["close"], view._load, "127.0.0.1", view.port)
 
 
-def test_without_viser_it_says_what_to_install(env, monkeypatch):
-    from dexsim.view.live import LiveView
-
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(UserError, match="pip install viser"):
-        LiveView(env, None, "x", ["x"], None, "127.0.0.1", 8080)
-
-
 # --- the page
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "iterations": (1, 10**9, True),
     "episodes": (1, 10**7, True),
     "view_port": (1, 65535, True),
+    "view_seconds": (1, 1e9, False),
     "seed": (0, 2**31 - 1, True),
     "save_interval": (1, 10**9, True),
     "final_episodes": (0, 10**7, True),

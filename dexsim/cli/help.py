@@ -30,7 +30,7 @@ examples:
   dexsim play checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
   dexsim play checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
   dexsim play policy=random task=grasp tactile=raw record=a.mcap realistic=true
-  dexsim play checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install viser)
+  dexsim play checkpoint=checkpoints/grasp.pt view=true            live in a browser
   dexsim play replay=a.mcap                                        recorded against simulated: plots, video
   dexsim play replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
 """

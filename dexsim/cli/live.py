@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,10 @@ def run(start: Start, env: Any, policy: Policy) -> int:
             " then the same address there",
             flush=True,
         )
+    if play["view_open"]:
+        webbrowser.open(f"http://{name}:{view.port}{asked}")
     try:
-        view.run()
+        view.run(play["view_seconds"])
     except KeyboardInterrupt:
         print()
     finally:

@@ -25,6 +25,7 @@ class Command:
 
 
 COMMANDS: dict[str, Command] = {
+    "demo": Command("dexsim.cli.demo:main", "find a hidden effect, then play a trained hand in the browser", True),
     "train": Command("dexsim.cli.commands:train", "train a policy in many simulated worlds at once"),
     "play": Command(
         "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
@@ -44,9 +45,10 @@ COMMANDS: dict[str, Command] = {
     "export": Command("dexsim.export:main", "write a policy as one folder that a robot can run"),
     "deploy": Command("dexsim.cli.deploy:main", "run an exported policy on a hand, real or simulated"),
     "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from"),
+    "doctor": Command("dexsim.cli.doctor:main", "say what this machine has and lacks, for a report of a bug"),
     "nan-dump": Command("dexsim.tasks.nan_replay:main", "repeat the step at which a world stopped being finite"),
 }
-RARER = ("stable-grasps", "nan-dump")
+RARER = ("stable-grasps", "doctor", "nan-dump")
 FIRST_SCREEN = """usage: dexsim COMMAND [key=value ...]
 
 Train dexterous hands in simulation, feel like the real hand, and find what the simulator left out.
@@ -58,7 +60,7 @@ rarer:
 {rarer}
 
 first steps:
-  dexsim diagnose demo=true                          hides an effect in a simulated joint, finds it, shows the answer
+  dexsim demo                                        a hidden effect found, a trained hand in the browser: a minute
   dexsim train worlds=64 iterations=10 device=cpu    a first look at training
   dexsim play policy=scripted task=grasp             a policy that needs no training
 

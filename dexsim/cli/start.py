@@ -22,7 +22,7 @@ from dexsim.assets.objects.own import PARTS
 from dexsim.cli import checks, objects, settings
 from dexsim.cli import help as help_page
 from dexsim.errors import UserError
-from dexsim.learning import weights_and_biases
+from dexsim.learning import policies, weights_and_biases
 
 WORLDS = {"cpu": 64, "cuda": 8192}  # where neither the user nor the task's preset says
 ITERATIONS = {"cpu": 200, "cuda": 1000}
@@ -102,6 +102,8 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
         )
     if play["policy"] not in (None, "random", "zero", "scripted"):
         raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
+    if play["checkpoint"] is not None:
+        play["checkpoint"] = str(policies.place(play["checkpoint"]))
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
     with _blamed(play["checkpoint"] if data is not None else None, request):
         if data is not None:

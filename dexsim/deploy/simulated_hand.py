@@ -326,18 +326,11 @@ class SimulatedCamera:
 
 
 def choose_gl() -> str:
-    """The OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start: each is tried in a
-    process of its own, since a driver may crash. Raises UserError where there is none."""
-    import subprocess
-    import sys
-
-    probe = "import mujoco; c = mujoco.GLContext(8, 8); c.make_current()"
-    for name in system.renderers():
-        env = system.renderer_environment(name)
-        done = subprocess.run([sys.executable, "-c", probe], env=os.environ | env, capture_output=True, timeout=60)
-        if done.returncode == 0:
-            os.environ.update(env)
-            return name
+    """The OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start. Raises UserError
+    where there is none."""
+    if (name := system.renderer()) is not None:
+        os.environ.update(system.renderer_environment(name))
+        return name
     raise UserError(f"vision=camera: no OpenGL for offscreen rendering; {system.no_renderer()}; or use vision=truth")
 
 

@@ -29,7 +29,7 @@ import torch
 
 from dexsim import files
 from dexsim.errors import UserError
-from dexsim.learning import parts
+from dexsim.learning import parts, policies
 
 
 class SaveError(UserError):
@@ -104,7 +104,7 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     Raises UserError, one line each: no such file, truncated or damaged, pickled code (refused), not a dexsim
     checkpoint, another format version, a missing part, one of the wrong type, weights that are not finite.
     """
-    path = Path(path).expanduser()
+    path = policies.place(path)
     _check_whole(path)
     try:
         data = torch.load(path, map_location=device, weights_only=True)
@@ -141,7 +141,8 @@ def _first_line(error: Exception) -> str:
 def _check_whole(path: Path) -> None:
     """Tell a missing, truncated, damaged or pickled file apart before torch gets it."""
     if not path.exists():
-        raise UserError(f"{path}: no such checkpoint{_nearby(path)}")
+        names = ", ".join(policies.included())
+        raise UserError(f"{path}: no such checkpoint{_nearby(path)}; dexsim comes with {names}")
     if path.is_dir():
         raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
     files.check(path, MOST_BYTES, "checkpoint")

@@ -1,6 +1,6 @@
 """A live view of a policy in a browser: the hand, the object, what the fingertips feel, rewards, and controls.
 
-`dexsim play checkpoint=PATH view=true` serves one web page (viser, the extra `view`), on this machine only unless
+`dexsim play checkpoint=PATH view=true` serves one web page (viser), on this machine only unless
 `view_host` says otherwise; nothing here needs a display. The environment steps in the main thread, in real time where
 it can; the page's controls only set what the loop reads next.
 """
@@ -8,6 +8,7 @@ it can; the page's controls only set what the loop reads next.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import socket
 import threading
@@ -58,7 +59,7 @@ class LiveView:
         env: a `dexsim.tasks.env.HandEnv` (raw taxel forces are shown if `env.touch.raw` is there).
         policy: observations to actions [N, 12]. name: its name among `choices`.
         choices: names of policies to switch to. load: name to policy; may raise UserError, which the page then shows.
-        host, port: where to serve. Raises UserError where that cannot be, or viser is not installed.
+        host, port: where to serve. Raises UserError where that cannot be.
     """
 
     def __init__(
@@ -71,7 +72,8 @@ class LiveView:
         host: str,
         port: int,
     ) -> None:
-        viser = _viser()
+        viser: Any = importlib.import_module("viser")  # slow to load
+
         _check_free(host, port)
         self.env, self.policy, self.name, self._load = env, policy, name, load
         self.wishes = Wishes()
@@ -414,14 +416,6 @@ def _lighter(rgba: tuple[float, float, float, float]) -> tuple[float, float, flo
     """Return a black hand shows no form in a browser's plain light: dark colours are lifted."""
     r, g, b = (c + 0.16 * (1 - c) ** 2 for c in rgba[:3])
     return r, g, b
-
-
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError:
-        raise UserError("view=true needs viser, which is not installed: pip install viser") from None
-    return viser
 
 
 def _check_free(host: str, port: int) -> None:
