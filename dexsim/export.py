@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.typed import whole
 
@@ -397,18 +398,10 @@ def check(path: str | Path) -> bool:
 
 def _golden_rows(file: Path) -> dict[str, Any]:
     """The arrays of a golden file, which may unpack to MOST_GOLDEN bytes."""
-    import zipfile
-
-    import numpy as np
-
-    with zipfile.ZipFile(file) as archive:
-        size = sum(i.file_size for i in archive.infolist())
-    if size > MOST_GOLDEN:
-        raise UserError(
-            f"{file}: unpacks to {size / 2**20:.0f} MiB, allowed {MOST_GOLDEN >> 20} MiB; export the bundle again"
-        )
-    with np.load(file, allow_pickle=False) as stored:
-        return {k: stored[k] for k in stored.files}
+    try:
+        return files.arrays(file, MOST_GOLDEN)
+    except ValueError as error:
+        raise UserError(f"{file}: {error}; export the bundle again") from None
 
 
 def _settings(argv: Sequence[str]) -> dict[str, str]:

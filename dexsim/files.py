@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dexsim import system
+from dexsim import guard, system
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
@@ -78,20 +78,22 @@ def place(text: Any) -> Path:
 def arrays(path: Path, most: int) -> dict[str, np.ndarray]:
     """The arrays of a NumPy archive by name; nothing pickled is read. Raises ValueError, in one line, where it is no
     plain file, none that can be read, or larger than `most` bytes, as it is or unpacked."""
+    size = check(path, most, "file")
+    return _arrays(path, most) if guard.ours(path) else guard.call(_arrays, path, most, what="it", size=size)
+
+
+def _arrays(path: Path, most: int) -> dict[str, np.ndarray]:
     import numpy as np
 
-    try:
-        check(path, most, "file")
-        with zipfile.ZipFile(path) as archive:
-            size = sum(i.file_size for i in archive.infolist())
-        if size > most:
-            raise ValueError(f"it unpacks to {size / 2**30:.3g} GiB; at most {most / 2**30:.3g} GiB is read")
-        with np.load(path, allow_pickle=False) as stored:
-            return {str(k): stored[k] for k in stored.files}
-    except Exception as error:  # readers of archives, headers and arrays raise whatever they like
-        text = " ".join(str(error).split())[:200] or type(error).__name__
-        hint = "; save plain arrays of numbers, no objects" if "pickle" in text.lower() else ""
-        raise ValueError(f"{text}{hint}") from None
+    with zipfile.ZipFile(path) as archive:
+        names = [i.filename for i in archive.infolist()]
+        size = sum(i.file_size for i in archive.infolist())
+    if size > most:
+        raise UserError(f"it unpacks to {size / 2**30:.3g} GiB; at most {most / 2**30:.3g} GiB is read")
+    if odd := [n for n in names if names.count(n) > 1 or not n.endswith(".npy")]:
+        raise UserError(f"its entry '{odd[0]}' is there twice, or is no array (.npy)")
+    with np.load(path, allow_pickle=False) as stored:
+        return {str(k): stored[k] for k in stored.files}
 
 
 def unfinished(path: Path) -> Path:

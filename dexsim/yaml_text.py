@@ -1,5 +1,5 @@
-"""YAML that strangers wrote, read within limits: plain data only, and neither size, depth nor aliases can hang or fill
-the machine."""
+"""YAML that strangers wrote: plain data only (text, numbers, true and false, lists, mappings; a date is text), and
+neither size, depth nor aliases can hang or fill the machine."""
 
 from __future__ import annotations
 
@@ -8,53 +8,58 @@ from typing import Any
 
 import yaml
 
-from dexsim import files
+from dexsim import files, guard
 from dexsim.errors import UserError
 
 MOST_BYTES = 8 << 20
-MOST_DEPTH = 60
+SMALL = 4096
+"""Bytes of a text that is read at once; a longer one in a process of its own."""
 MOST_NODES = 500_000
 """Values in a file, what an alias (*name) repeats counted each time."""
+_YAML = "tag:yaml.org,2002:"
+_OTHER = {_YAML + kind for kind in ("timestamp", "binary", "set", "omap", "pairs")}
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that counts depth while it reads, so that no nesting reaches Python's recursion limit."""
+    """SafeLoader without the kinds of data that no setting has."""
 
-    depth = 0
+    yaml_constructors = {k: v for k, v in yaml.SafeLoader.yaml_constructors.items() if k not in _OTHER}
+    yaml_implicit_resolvers = {
+        first: [r for r in rules if r[0] not in _OTHER]
+        for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        self.depth += 1
-        if self.depth > MOST_DEPTH:
-            raise yaml.MarkedYAMLError(
-                problem=f"nested more than {MOST_DEPTH} deep", problem_mark=self.peek_event().start_mark
-            )
-        try:
-            return super().compose_node(parent, index)
-        finally:
-            self.depth -= 1
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Refuse merge keys and keys that stand twice."""
+        seen = set()
+        for key, _ in node.value:
+            if key.tag == _YAML + "merge":
+                raise yaml.MarkedYAMLError(None, None, "merge keys (<<) are not read; write values out", key.start_mark)
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in seen:
+                    raise yaml.MarkedYAMLError(None, None, f"key '{key.value}' stands twice", key.start_mark)
+                seen.add((key.tag, key.value))
 
 
 def parse(text: str | bytes, source: object) -> Any:
     """The plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the limit that
-    was passed: size, depth, number of values (aliases expanded), merge keys (<<), a node that holds itself, tags of
-    Python objects."""
+    was passed: size, depth, number of values (aliases expanded), merge keys (<<), a key that stands twice, a value that
+    holds itself, tags of other data than plain."""
     if len(text) > MOST_BYTES:
         raise UserError(f"{source}: {len(text) / 2**20:.1f} MiB of YAML, allowed {MOST_BYTES >> 20} MiB")
-    loader = None
+    if len(text) <= SMALL:
+        return _parse(text, source)
+    return guard.call(_parse, text, source, what=str(source), size=len(text))
+
+
+def _parse(text: str | bytes, source: object) -> Any:
     try:
-        loader = _Loader(text)
-        node = loader.get_single_node()
-        if node is None:
-            return None
-        _count(node, source, {}, set())
-        return loader.construct_document(node)
-    except UserError:
-        raise
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, OverflowError, RecursionError) as error:
-        raise UserError(f"{source}: cannot be read as YAML: {' '.join(str(error).split())[:300]}") from None
-    finally:
-        if loader is not None:
-            loader.dispose()
+        return _plain(yaml.load(text, _Loader), [MOST_NODES])
+    except RecursionError:
+        said = "nested too deeply, or a value holds itself"
+    except (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        said = " ".join(str(error).split())[:300]
+    raise UserError(f"{source}: cannot be read as YAML: {said}")
 
 
 def load(path: Path, what: str) -> Any:
@@ -63,26 +68,15 @@ def load(path: Path, what: str) -> Any:
     return parse(files.text(path, files.MAX_YAML, what), f"{what} '{path}'")
 
 
-def _count(node: yaml.Node, source: object, known: dict[int, int], open_: set[int]) -> int:
-    """Values below a node, aliases expanded; the node graph itself is as small as the file."""
-    if id(node) in known:
-        return known[id(node)]
-    if id(node) in open_:
-        raise UserError(
-            f"{source}: line {node.start_mark.line + 1}: a value holds itself (an alias inside its own anchor)"
-        )
-    total = 1
-    if isinstance(node, (yaml.MappingNode, yaml.SequenceNode)):
-        open_.add(id(node))
-        for inner in node.value:
-            for child in inner if isinstance(inner, tuple) else (inner,):
-                if child.tag == "tag:yaml.org,2002:merge":
-                    raise UserError(
-                        f"{source}: line {child.start_mark.line + 1}: merge keys (<<) are not read; write values out"
-                    )
-                total += _count(child, source, known, open_)
-        open_.discard(id(node))
-    if total > MOST_NODES:
-        raise UserError(f"{source}: more than {MOST_NODES} values, aliases expanded")
-    known[id(node)] = total
-    return total
+def _plain(node: Any, rest: list[int]) -> Any:
+    """The data, each alias a copy. Raises ValueError for more than `rest[0]` values, and for text that is none."""
+    rest[0] -= 1
+    if rest[0] < 0:
+        raise ValueError(f"more than {MOST_NODES} values, aliases expanded")
+    if isinstance(node, dict):
+        return {_plain(k, rest): _plain(v, rest) for k, v in node.items()}
+    if isinstance(node, list):
+        return [_plain(v, rest) for v in node]
+    if isinstance(node, str):
+        node.encode()
+    return node

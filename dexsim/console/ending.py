@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 import time
@@ -21,6 +22,9 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
     """Run ``main(argv)`` and turn its errors into a line on stderr and an exit status.
 
     about: what ``-h`` or ``--help`` print instead of running, for a command that has no help of its own."""
+    for stream in (sys.stdout, sys.stderr):  # halves of characters are printed as \\ud800, in any locale
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     if about and {"-h", "--help"} & set(argv):
         print(about.strip())
         return 0

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import yaml_text
+from dexsim import files, guard, yaml_text
 from dexsim.deploy import manifests
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
@@ -36,8 +36,7 @@ class Bundle:
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Actions [N, A] of observations [N, D], float32."""
-        p = self.manifest["policy"]
-        return self.session.run([p["output"]], {p["input"]: np.asarray(observation, np.float32)})[0]
+        return _act(self.session, self.manifest["policy"], observation)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -57,16 +56,14 @@ def load(path: str | Path) -> Bundle:
     manifests.check(manifest, path / MANIFEST, hand)
     _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
-    if not policy.is_file():
+    if not policy.exists():
         raise UserError(f"{path}: {POLICY} is missing; export the bundle again")
-    if policy.stat().st_size > MOST_BYTES:
-        raise UserError(f"{policy}: {policy.stat().st_size / 2**20:.0f} MiB, allowed {MOST_BYTES >> 20} MiB")
+    files.check(policy, MOST_BYTES, "network")
     data = policy.read_bytes()
     if hashlib.sha256(data).hexdigest() != manifest["policy"]["sha256"]:
         raise UserError(f"{policy}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
-    bundle = Bundle(path, manifest, session(data, policy), hand)
-    _try(bundle, policy)
-    return bundle
+    guard.rehearse(_tried, data, policy, manifest["policy"], what=f"{policy}", size=len(data))
+    return Bundle(path, manifest, session(data, policy), hand)
 
 
 def _hand(which: manifests.HandEntry, path: Path) -> Hand:
@@ -109,12 +106,7 @@ def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
 
 
 def _mapping(file: Path) -> dict[str, Any]:
-    try:
-        with open(file, "rb") as opened:
-            text = opened.read(yaml_text.MOST_BYTES + 1)  # a device file has no end
-    except OSError as error:
-        raise UserError(f"{file}: cannot be read: {error.strerror}") from None
-    data = yaml_text.parse(text, file)
+    data = yaml_text.parse(files.text(file, yaml_text.MOST_BYTES, "bundle's"), file)
     if not isinstance(data, dict):
         raise UserError(f"{file}: is {type(data).__name__}, must map keys to values; export the bundle again")
     return data
@@ -159,11 +151,15 @@ def _tensors(message: Any) -> Iterator[Any]:
             yield from _tensors(inner)
 
 
-def _try(bundle: Bundle, policy: Path) -> None:
+def _act(session: Any, p: dict[str, Any], observation: np.ndarray) -> np.ndarray:
+    return session.run([p["output"]], {p["input"]: np.asarray(observation, np.float32)})[0]
+
+
+def _tried(data: bytes, policy: Path, p: dict[str, Any]) -> None:
     """The network answers an observation of zeros with one finite action a joint."""
-    p = bundle.manifest["policy"]
+    loaded = session(data, policy)
     try:
-        out = np.asarray(bundle.act(np.zeros((1, p["observation_size"]), np.float32)))
+        out = np.asarray(_act(loaded, p, np.zeros((1, p["observation_size"]), np.float32)))
     except Exception as error:  # onnxruntime's
         raise UserError(
             f"{policy}: does not take the observations that {MANIFEST} states: {str(error).splitlines()[0][:160]}"

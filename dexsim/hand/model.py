@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim import model_file
+from dexsim import guard, model_file
 from dexsim.errors import UserError
 from dexsim.hand.schema import HandFile
 
@@ -61,12 +61,8 @@ def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
         "tendon": [t.name for t in spec.tendons],
         "equality constraint": [e.name or e.name1 for e in spec.equalities],
     }
-    try:
-        root = ET.parse(path).getroot()
-    except (ET.ParseError, OSError):
-        root = None
-    if root is not None and root.tag == "robot":
-        coupled["mimic joint"] = [j.get("name", "") for j in root.iter("joint") if j.find("mimic") is not None]
+    if not guard.ours(path):
+        coupled["mimic joint"] = guard.call(_mimics, path, what=where)
     for kind, names in coupled.items():
         if names:
             shown = ", ".join(n or "unnamed" for n in names[:3]) + (" ..." if len(names) > 3 else "")
@@ -88,6 +84,12 @@ def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
         raise UserError(
             f"{where}: {len(roots)} bodies hang on the world ({', '.join(roots[:4])}); must be one, the hand"
         )
+
+
+def _mimics(path: Path) -> list[str]:
+    """Names of a URDF's joints that follow others, which MuJoCo does not read."""
+    root = ET.parse(path).getroot()
+    return [j.get("name", "") for j in root.iter("joint") if root.tag == "robot" and j.find("mimic") is not None]
 
 
 def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:

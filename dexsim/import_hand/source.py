@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim import files, model_file
+from dexsim import files, guard, model_file
 from dexsim.errors import UserError
 from dexsim.import_hand import drives, inertias, urdf
 from dexsim.import_hand.drives import Drives
@@ -54,19 +54,24 @@ def read(
     Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
     coupled joints, links without inertia, limits that are none.
     """
-    files.check(path, urdf.MAX_MODEL, "model")
-    with (
-        model_file.warned() as said,
-        warnings.catch_warnings(),
-        tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch,
-    ):
+    size = files.check(path, urdf.MAX_MODEL, "model")
+    with tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch:
+        given = path, packages, coupled, density, inertia, Path(scratch)
+        return guard.call(_read, *given, what=f"model {path}", size=size)
+
+
+def _read(
+    path: Path, packages: Sequence[Path], coupled: str, density: float | None, inertia: str | None, scratch: Path
+) -> Source:
+    with model_file.warned() as said, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of textures, which are left out
-        out = _read(path, packages, coupled, density, inertia, Path(scratch))
+        out = _source(path, packages, coupled, density, inertia, scratch)
+    model_file.step(out.model, f"model {path}")
     out.notes += [f"MuJoCo warns: {text}" for text in dict.fromkeys(said)]
     return out
 
 
-def _read(
+def _source(
     path: Path, packages: Sequence[Path], coupled: str, density: float | None, inertia: str | None, scratch: Path
 ) -> Source:
     speeds: dict[str, float] = {}
@@ -77,7 +82,6 @@ def _read(
         speeds, bare, limits = text.speeds, text.bare, text.limits
         spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
     else:
-        model_file.check(path, f"model {path}")
         spec = _parsed(path, lambda: model_file.parsed(path))
         _meshes_there(spec, path)
     notes: list[str] = []

@@ -35,16 +35,15 @@ def is_urdf(path: Path) -> bool:
 
 
 def _root_of_any(path: Path, what: str = "mesh") -> ET.Element:
-    text = files.text(path, MAX_MODEL, what)
-    if "<!ENTITY" in text:  # nothing that a robot needs, and a few of them can fill the memory
-        raise UserError(f"{what} {path}: defines XML entities; write their values out")
-    return ET.fromstring(text)
+    return ET.fromstring(files.text(path, MAX_MODEL, what))
 
 
 def _root(path: Path) -> ET.Element:
     try:
         root = _root_of_any(path, "model")
-    except ET.ParseError as error:
+    except UserError:
+        raise
+    except (ET.ParseError, ValueError, LookupError) as error:  # the latter two of an encoding
         what = "a xacro program's input? run xacro on it first" if path.suffix == ".xacro" else "URDF or MJCF is needed"
         raise UserError(f"model {path}: is not XML ({error}); {what}") from None
     if root.tag == "mujocoinclude":

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dexsim import files
+from dexsim import files, guard
 from dexsim.errors import UserError
 from dexsim.learning import parts, policies
 
@@ -106,6 +106,11 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     """
     path = policies.place(path)
     _check_whole(path)
+    guard.rehearse(_load, path, "cpu", what=f"{path}", size=path.stat().st_size)
+    return _load(path, device)
+
+
+def _load(path: Path, device: str) -> dict[str, Any]:
     try:
         data = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:

@@ -94,6 +94,9 @@ def check(data: dict[str, Any], path: object) -> None:
     again = "use another checkpoint of its run folder"
     typed.convert(data, Train if data["kind"] == "train" else Policy, f"{path}: damaged checkpoint", again)
     for name, tensor in tensors(data):
+        if tensor.layout != torch.strided or tensor.is_quantized or tensor.device.type == "meta":
+            kind = "quantized" if tensor.is_quantized else "meta" if tensor.is_meta else str(tensor.layout)
+            raise UserError(f"{path}: damaged checkpoint, {name} is a {kind} tensor, must be a plain one; {again}")
         if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
             raise UserError(
                 f"{path}: damaged checkpoint, {name} is said to have the shape {list(tensor.shape)}, which is more than"

@@ -530,7 +530,6 @@ def _numeric(line: str) -> bool:
 
 def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
     """Columns of a NumPy archive: arrays [T], or [T, J] with `joint_names` [J]. Nothing pickled is read."""
-    files.check(path, MAX_BYTES, "recording")
     try:
         arrays = files.arrays(path, MAX_BYTES)
     except ValueError as error:

@@ -24,10 +24,17 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
     if encoding == "cdr":
         return _ros2(schema)
     if encoding == "json":
-        return json.loads
+        return _json
     if encoding == "protobuf":
         return _protobuf(schema)
     raise Unreadable(f"its messages are encoded as '{encoding}', which is not read; cdr (ROS 2), json and protobuf are")
+
+
+def _json(data: bytes) -> Any:
+    out = json.loads(data)
+    if b"\\ud" in data.lower():  # half a character is no name
+        json.dumps(out, ensure_ascii=False).encode()
+    return out
 
 
 def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from mcap.records import Channel, Message
 from mcap.records import Schema as McapSchema
 
+from dexsim import guard
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
@@ -60,7 +61,20 @@ def read(
     a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
     """
     path = Path(path).expanduser()
-    remap, (meta, units) = dict(remap or {}), split(dict(meta or {}))
+    size = sum(p.stat().st_size for p in _files(path) if p.is_file())
+    given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand
+    return guard.call(_read, *given, what=f"recording {path}", size=size)
+
+
+def _read(
+    path: Path,
+    remap: dict[str, str],
+    given: dict[str, Any],
+    joints: Sequence[str] | None,
+    audit: bool,
+    hand: Hand | None,
+) -> Recording:
+    meta, units = split(given)
     if path.suffix.lower() in columns.SUFFIXES:
         stated, units, findings = metadata.collect(path, {}, meta, units)
         table = _TableReading(path, columns.read_table(path, remap, stated, units.get("time", "")), remap, hand)

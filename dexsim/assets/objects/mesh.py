@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from dexsim import files, guard
 from dexsim.assets.objects.baking import MARGIN, shape_from_hulls
 from dexsim.assets.objects.geometry import mass_properties, principal_axes, simplify_hull, union_boundary
 from dexsim.assets.objects.shape import Shape
@@ -19,6 +20,9 @@ from dexsim.errors import UserError
 SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold
 _CELLS = 62  # along the longest side of the grid, margin included
 _FINE_CELLS = 90  # the same of what is split into many parts
+MOST_BYTES = 256 << 20
+PATIENCE = 40.0
+"""Times the usual limits for a sound surface: CoACD splits a hollow one by a search, and a distance grid is baked."""
 MOST_PARTS = 32  # convex parts of one object
 _CONVEX = 0.99  # share of its hull that a mesh fills to pass for convex
 
@@ -43,8 +47,6 @@ def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
     """Triangles [T, 3, 3] (m) of a closed surface, outward, and notes; `UserError` names what is wrong."""
     import trimesh
 
-    if not path.is_file():
-        raise UserError(f"mesh {path}: no such file")
     try:
         mesh: Any = trimesh.load(path, force="mesh")  # a Trimesh, or what has neither vertices nor faces
     except Exception as error:  # trimesh raises whatever its reader for the format does
@@ -145,11 +147,17 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
         )
     if not (np.isfinite(scale) and scale > 0):
         raise UserError(f"mesh {paths[0]}: scale={scale}, must be a positive number; 0.001 for a file in millimetres")
+    sizes = [files.check(p, MOST_BYTES, "mesh") for p in paths]
+    surfaces = [guard.call(_read, p, scale, what=f"mesh {p}", size=n) for p, n in zip(paths, sizes, strict=True)]
+    what = f"mesh {paths[0]}"
+    return guard.call(_made, paths, surfaces, scale, parts, single, what=what, size=sum(sizes), patience=PATIENCE)
+
+
+def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: int, single: bool) -> Shape:
     notes: list[str] = []
     hulls: list[np.ndarray] = []
     split = False
-    for file in paths:
-        triangles, said = _read(file, scale)
+    for file, (triangles, said) in zip(paths, surfaces, strict=True):
         notes += said
         points = triangles.reshape(-1, 3)
         try:

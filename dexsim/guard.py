@@ -1,0 +1,211 @@
+"""Files of strangers are read in a process of their own, with limits: whatever a library does with one, a command ends
+with one line.
+
+A reader is a function of this package that takes plain arguments and answers with plain data (numbers, text, lists,
+arrays, dataclasses of them, a compiled `mujoco.MjModel`)::
+
+    recording = guard.call(_read, path, remap, what=f"recording {path}", size=path.stat().st_size)
+
+What cannot leave a process (a `mujoco.MjSpec`, tensors on a device) is rehearsed there and then read here, where it
+takes the same time and memory again::
+
+    guard.rehearse(_parse, path, what=f"model {path}")
+    spec = _parse(path)
+
+The reader's own UserError comes through as it is; any other error, a signal (a fault in the library), and a limit
+passed are a UserError that begins with `what`. Files that come with dexsim are read without (`ours`).
+
+The process is a fork, which costs some 10 ms and needs no imports; it touches no GPU and starts no threads of torch, as
+torch's own loaders of data do. Where there is no safe fork (macOS, Windows) it is spawned, once a call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import multiprocessing
+import os
+import pickle
+import re
+import signal
+import stat
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+from dexsim.errors import UserError
+
+T = TypeVar("T")
+SECONDS, BYTES = 6.0, 1 << 30
+"""Processor time and memory of a call."""
+SECONDS_A_MIB, TIMES_SIZE = 3.0, 16
+"""What is added for a file's size: s a MiB, and bytes a byte."""
+WAITING_S = 1.5
+"""s without any processor time, asleep, after which a reader is taken to wait for a pipe or a device."""
+FULL = re.compile("(could not|unable to|cannot|failed to) allocate|out of memory|bad_alloc|unknown exception", re.I)
+"""What libraries say where they are given no more memory; the last is MuJoCo."""
+TRUSTED = "DEXSIM_LIMITS"
+"""Environment variable: a number that all limits are multiplied with."""
+PACKAGE = Path(__file__).parent
+_inside = False
+
+
+def call(function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0) -> T:
+    """`function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size: bytes of
+    the file, with which the limits grow; patience: what they are multiplied with, where more than reading is done.
+    Raises UserError."""
+    return _run(function, args, what, size, True, patience)
+
+
+def rehearse(function: Callable[..., Any], *args: Any, what: str, size: int = 0) -> None:
+    """As `call`, the answer left there. Raises UserError where `function(*args)` cannot be worked out within limits."""
+    _run(function, args, what, size, False, 1.0)
+
+
+def ours(path: Path) -> bool:
+    """Whether a file comes with dexsim."""
+    return Path(os.path.abspath(path)).is_relative_to(PACKAGE)
+
+
+def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted: bool, patience: float) -> Any:
+    if _inside:  # within a reader's limits already
+        return function(*args)
+    times = _times()
+    seconds = times * patience * (SECONDS + SECONDS_A_MIB * size / 2**20)
+    most = int(times * (BYTES + TIMES_SIZE * size))
+    context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    receive, send = context.Pipe(False)
+    child = context.Process(target=_child, args=(send, function, args, seconds, most, wanted))
+    try:
+        child.start()
+        send.close()
+        answer = _answer(receive, child.pid or 0, 10 * seconds)
+        child.join(1.0)
+    finally:
+        receive.close()
+        if child.is_alive():
+            child.kill()
+        child.join()
+    if isinstance(answer, BaseException):
+        raise answer
+    if isinstance(answer, tuple):
+        return answer[0]
+    more = f"; if you trust the file, {TRUSTED}={times * 10:g} in the environment allows ten times as much"
+    ended = -(child.exitcode or 0)
+    if answer:
+        raise UserError(f"{what}: {answer}{more if 'memory' in answer else ''}")
+    if ended in (getattr(signal, "SIGXCPU", -1), signal.SIGKILL if hasattr(signal, "SIGKILL") else -1):
+        raise UserError(f"{what}: takes more than {seconds:.0f} s of processor time to read{more}")
+    how = signal.Signals(ended).name if ended > 0 else f"exit status {child.exitcode}"
+    raise UserError(f"{what}: breaks the library that reads it ({how}, with at most {most / 2**30:.3g} GiB of memory)")
+
+
+def _times() -> float:
+    text = os.environ.get(TRUSTED, "1")
+    try:
+        if 1.0 <= float(text) <= 1e6:
+            return float(text)
+    except ValueError:
+        pass
+    raise UserError(f"{TRUSTED}={text} (environment): must be a number from 1 to 1e6")
+
+
+def _answer(receive: Connection, pid: int, wall: float) -> Any:
+    """The child's answer in a tuple, its error, what it waits for in words, or "" where it ended without."""
+    begun = moved = time.monotonic()
+    used = -1
+    while not receive.poll(0.2):
+        now = time.monotonic()
+        asleep, spent = _state(pid)
+        if spent != used or not asleep:
+            used, moved = spent, now
+        if now - moved > WAITING_S:
+            return "names a pipe, a device or a socket, which is no file: reading it waits without end"
+        if now - begun > wall:
+            return f"takes more than {wall:.0f} s to read"
+    try:
+        parts = [receive.recv_bytes()]
+        buffers = []
+        for size in pickle.loads(parts[0]):
+            buffers.append(bytearray(size))
+            receive.recv_bytes_into(buffers[-1]) if size else receive.recv_bytes()
+        return pickle.loads(receive.recv_bytes(), buffers=buffers)
+    except EOFError:
+        return ""
+
+
+def _state(pid: int) -> tuple[bool, int]:
+    """(whether a process sleeps, what processor time it has used), where the system tells."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False, 0
+    return fields[0] == "S", int(fields[11]) + int(fields[12])
+
+
+def _child(
+    send: Connection, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
+) -> None:
+    """The process: works out, answers, ends."""
+    global _inside
+    _inside = True
+    with contextlib.suppress(ValueError, OSError):
+        _limit(seconds, most)
+    faulthandler.disable()
+    silent = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(silent, stream)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN if name == "SIGINT" else signal.SIG_DFL)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)  # the threads of before the fork are not there
+    sys.addaudithook(_opened)
+    answer: Any
+    try:
+        answer = (function(*args) if wanted else function(*args) and None,)
+    except BaseException as error:  # a reader of a stranger's file raises whatever it likes
+        text = " ".join(str(error).split())[:200]
+        full = isinstance(error, MemoryError) or FULL.search(text) is not None
+        answer = error if isinstance(error, UserError) and not full else (
+            f"needs more than {most / 2**30:.3g} GiB of memory to read" if full
+            else "is nested too deeply to be read" if isinstance(error, RecursionError)
+            else f"cannot be read ({type(error).__name__}{': ' * bool(text)}{text})"
+        )
+    buffers: list[pickle.PickleBuffer] = []
+    data = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+    raw = [b.raw() for b in buffers]
+    send.send_bytes(pickle.dumps([len(r) for r in raw]))
+    for r in raw:
+        send.send_bytes(r)
+    send.send_bytes(data)
+    send.close()
+    os._exit(0)
+
+
+def _limit(seconds: float, most: int) -> None:
+    """Of this process: processor time, and memory beyond what it has."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (max(1, round(seconds)), max(1, round(seconds)) + 1))
+    try:
+        has = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    except OSError:
+        has = 0
+    resource.setrlimit(resource.RLIMIT_DATA, (has + most, has + most))
+
+
+def _opened(event: str, about: tuple) -> None:
+    """Python's readers open regular files only."""
+    if event != "open" or not isinstance(about[0], (str, bytes)):
+        return
+    try:
+        mode = os.stat(about[0]).st_mode
+    except (OSError, ValueError):
+        return  # who opens it says so
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode) and about[0] not in (os.devnull, "/dev/urandom"):
+        raise UserError(f"{os.fsdecode(about[0])} is a device, a pipe or a socket, not a file")

@@ -1,0 +1,92 @@
+"""The process in which files of strangers are read: what it answers, and what ends it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+
+import numpy as np
+import pytest
+
+from dexsim import guard
+from dexsim.errors import UserError
+
+
+def _arrays(n):
+    return {"a": np.arange(n), "none": np.zeros(0), "text": "x"}
+
+
+def _raise(error):
+    raise error
+
+
+def _deep():
+    return _deep()
+
+
+def _spin():
+    while True:
+        pass
+
+
+ENDS = {
+    "a fault of the library": (lambda: os.kill(os.getpid(), signal.SIGSEGV), "breaks the library.*SIGSEGV"),
+    "its end": (lambda: os._exit(3), "breaks the library.*exit status 3"),
+    "memory": (lambda: np.ones(1 << 28), "needs more than 1 GiB of memory.*DEXSIM_LIMITS=10"),
+    "processor time": (_spin, "takes more than 1 s of processor time.*DEXSIM_LIMITS=10"),
+    "depth": (_deep, "nested too deeply"),
+    "any error": (lambda: _raise(KeyError("x")), r"cannot be read \(KeyError: 'x'\)"),
+    "an error of ours": (lambda: _raise(UserError("file x: field y: 3")), "^file x: field y: 3$"),
+    "an end of Python": (lambda: _raise(SystemExit(4)), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("kind", ENDS)
+def test_whatever_ends_a_reader_is_one_line(kind, monkeypatch, capfd):
+    monkeypatch.setattr(guard, "SECONDS", 1.0)
+    function, said = ENDS[kind]
+    with pytest.raises(UserError, match=said) as error:
+        guard.call(function, what="file x")
+    assert str(error.value).startswith("file x") and "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_answer_comes_back_whole():
+    out = guard.call(_arrays, 300_000, what="file x")
+    assert (out["a"] == np.arange(300_000)).all() and out["a"].flags.writeable
+    assert out["none"].shape == (0,) and out["text"] == "x"
+    guard.rehearse(_arrays, 10, what="file x")
+
+
+def test_only_regular_files_are_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    there = socket.socket(socket.AF_UNIX)
+    there.bind(str(tmp_path / "socket"))
+    for name in ("pipe", "socket", "/dev/zero"):
+        begun = time.monotonic()
+        with pytest.raises(UserError, match="a device, a pipe or a socket"):
+            guard.call(lambda name=name: open(tmp_path / name).read(), what="file x")
+        assert time.monotonic() - begun < 5
+    there.close()
+
+
+def test_a_library_that_waits_for_a_pipe_is_ended(tmp_path, monkeypatch):
+    """As C code opens one: no hook of Python's sees it."""
+    monkeypatch.setattr(guard, "WAITING_S", 0.3)
+    read, _write = os.pipe()
+    with pytest.raises(UserError, match="^file x: names a pipe"):
+        guard.call(os.read, read, 1, what="file x")
+
+
+def test_limits_grow_with_the_file_and_where_it_is_trusted(monkeypatch):
+    monkeypatch.setattr(guard, "BYTES", 16 << 20)
+    with pytest.raises(UserError, match="needs more than 0.0156 GiB"):
+        guard.call(np.ones, 1 << 22, what="file x")
+    assert len(guard.call(np.ones, 1 << 22, what="file x", size=10 << 20)) == 1 << 22
+    monkeypatch.setenv(guard.TRUSTED, "10")
+    assert len(guard.call(np.ones, 1 << 22, what="file x")) == 1 << 22
+    monkeypatch.setenv(guard.TRUSTED, "0.5")
+    with pytest.raises(UserError, match="DEXSIM_LIMITS=0.5"):
+        guard.call(np.ones, 1, what="file x")
