@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from dexsim import typed
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim excite out=DIR [key=value ...]
@@ -61,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"model={given['model']}: is not moved beside hand=; say one of them")
     m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity, hand=hand)
     limits = Limits(
-        **{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
+        **{k: typed.number(k, given[k]) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
     )
     seed, rate, repeats = (_within(given, k) for k in RANGES)
     out = files.place(given["out"])
@@ -153,19 +154,9 @@ def _flag(given: dict[str, str], key: str) -> bool:
     return given.get(key) == "true"
 
 
-def _number(given: dict[str, str], key: str, default: float = 0.0) -> float:
-    try:
-        return float(given.get(key, default))
-    except ValueError:
-        raise UserError(f"{key}={given[key]}: must be a number") from None
-
-
 def _within(given: dict[str, str], key: str) -> float:
     default, low, high, whole = RANGES[key]
-    value = _number(given, key, default)
-    if not low <= value <= high or (whole and value != int(value)):
-        raise UserError(f"{key}={given[key]}: must be a {'whole ' * whole}number in [{low:g}, {high:g}]")
-    return value
+    return typed.number(key, given.get(key, default), low, high, exact=whole)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ torch's own loaders of data do. Where there is no safe fork (macOS, Windows) it 
 
 from __future__ import annotations
 
-import contextlib
 import faulthandler
 import multiprocessing
 import os
@@ -36,6 +35,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
+from dexsim import system
 from dexsim.errors import UserError
 
 T = TypeVar("T")
@@ -76,7 +76,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     times = _times()
     seconds = times * patience * (SECONDS + SECONDS_A_MIB * size / 2**20)
     most = int(times * (BYTES + TIMES_SIZE * size))
-    context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    context: Any = multiprocessing.get_context(system.start_method())
     receive, send = context.Pipe(False)
     child = context.Process(target=_child, args=(send, function, args, seconds, most, wanted))
     try:
@@ -119,7 +119,7 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
     used = -1
     while not receive.poll(0.2):
         now = time.monotonic()
-        asleep, spent = _state(pid)
+        asleep, spent = system.at_work(pid)
         if spent != used or not asleep:
             used, moved = spent, now
         if now - moved > WAITING_S:
@@ -137,23 +137,13 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         return ""
 
 
-def _state(pid: int) -> tuple[bool, int]:
-    """(whether a process sleeps, what processor time it has used), where the system tells."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return False, 0
-    return fields[0] == "S", int(fields[11]) + int(fields[12])
-
-
 def _child(
     send: Connection, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
 ) -> None:
     """The process: works out, answers, ends."""
     global _inside
     _inside = True
-    with contextlib.suppress(ValueError, OSError):
-        _limit(seconds, most)
+    system.limit(seconds, most)
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
@@ -184,19 +174,6 @@ def _child(
     send.send_bytes(data)
     send.close()
     os._exit(0)
-
-
-def _limit(seconds: float, most: int) -> None:
-    """Of this process: processor time, and memory beyond what it has."""
-    import resource
-
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (max(1, round(seconds)), max(1, round(seconds)) + 1))
-    try:
-        has = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
-    except OSError:
-        has = 0
-    resource.setrlimit(resource.RLIMIT_DATA, (has + most, has + most))
 
 
 def _opened(event: str, about: tuple) -> None:

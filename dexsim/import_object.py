@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import files, outputs
+from dexsim import files, outputs, typed
 from dexsim.assets.objects import own
 from dexsim.assets.objects.mesh import MOST_PARTS
 from dexsim.assets.objects.shape import Shape
@@ -53,9 +53,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError("say where to write: out=FOLDER, e.g. out=objects/mug")
     if given["picture"] not in ("true", "false"):
         raise UserError(f"picture={given['picture']}: must be true or false")
-    scale, hulls = _number("scale", given["scale"]), _number("hulls", given["hulls"])
-    if hulls not in range(1, MOST_PARTS + 1):
-        raise UserError(f"hulls={given['hulls']}: must be a whole number from 1 to {MOST_PARTS}")
+    scale, hulls = typed.number("scale", given["scale"]), typed.whole("hulls", given["hulls"], 1, MOST_PARTS)
     path, out = files.place(meshes[0]), files.place(given["out"])
     if path.is_dir():
         raise UserError(f"mesh {path} is a folder; import its meshes one by one, or give the folder to objects=")
@@ -63,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     there = out.exists()
     outputs.claim(out, "out=", written, [path])
     try:
-        shape = own.own_shape(str(path), scale, int(hulls))
+        shape = own.own_shape(str(path), scale, hulls)
     except UserError:
         if not there:
             out.rmdir()
@@ -87,13 +85,6 @@ def main(argv: Sequence[str]) -> int:
             draw(shape, path, stage / "picture.png")
     print(f"{out}: dexsim train task=grasp objects='[{out}]'")
     return 0
-
-
-def _number(key: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise UserError(f"{key}={text}: must be a number") from None
 
 
 def hull_obj(points: np.ndarray) -> str:

@@ -5,6 +5,7 @@ Looked up at each call, so that a test can take away what a system lacks.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -128,6 +129,36 @@ def no_renderer() -> str:
     if sys.platform in ("darwin", "win32"):
         return "it needs a session with a screen (not ssh), or a driver of the graphics card"
     return f"install one: {INSTALL}"
+
+
+def start_method() -> str:
+    """How a process is begun that works for this one: as a fork of it where that is safe."""
+    return "fork" if sys.platform == "linux" else "spawn"
+
+
+def limit(seconds: float, more: int) -> None:
+    """Limit this process to so much processor time [s] and so many bytes more than it has, where the system can."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    whole = max(1, round(seconds))
+    try:
+        has = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    except OSError:
+        has = 0
+    for name, soft, hard in (("CORE", 0, 0), ("CPU", whole, whole + 1), ("DATA", has + more, has + more)):
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (soft, hard))
+
+
+def at_work(pid: int) -> tuple[bool, int]:
+    """(whether a process sleeps, what processor time it has used), where the system tells."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False, 0
+    return fields[0] == "S", int(fields[11]) + int(fields[12])
 
 
 def crashed(status: int) -> bool:

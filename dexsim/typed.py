@@ -3,6 +3,7 @@ file."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -15,6 +16,27 @@ Real = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
 """A finite number."""
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e12)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+def real(value: Any) -> float:
+    """The number that a text or a value is (YAML reads 1e-3 as text); NaN where it is none, or no double holds it."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)) or (isinstance(value, str) and "_" in value):
+        return math.nan
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return math.nan
+
+
+def number(key: str, value: Any, low: float = -1e12, high: float = 1e12, unit: str = "", exact: bool = False) -> float:
+    """A number as it was typed or stands in a file; exact: a whole one. Raises UserError for what is none, and outside
+    [low, high]."""
+    out = real(value)
+    if not low <= out <= high or not math.isfinite(out) or (exact and out != int(out)):
+        bounds = f"from {low:g} up" if high == math.inf else f"from {low:g} to {high:g}"
+        kind = "a whole number" if exact else "a number"
+        raise UserError(f"{key}={value}: must be {kind} {bounds}{' ' * bool(unit)}{unit}")
+    return out
 
 
 def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:

@@ -209,13 +209,7 @@ def main(argv: list[str]) -> int:
             raise UserError(f"say {key}=FILE (python -m dexsim.actuator.bam --help)")
 
     def number(key: str, low: float) -> float:
-        try:
-            value = float(own.get(key, ""))
-        except ValueError:
-            raise UserError(f"{key}={own.get(key)}: must be a number") from None
-        if not low <= value < 1e6:
-            raise UserError(f"{key}={own[key]}: must lie in [{low:g}, 1e6)")
-        return value
+        return typed.number(key, own.get(key, ""), low, 1e6)
 
     out = Path(own["out"]).expanduser()
     if own["in"].endswith(".json"):

@@ -83,17 +83,9 @@ class Value:
 
 
 def _number(x: Any) -> float | None:
-    """x as a float, or None if it is not a number (YAML reads 1e-3 as text: accept that)."""
-    if isinstance(x, bool) or x is None:
-        return None
-    if isinstance(x, (int, float)):
-        return float(x)
-    if isinstance(x, str):
-        try:
-            return float(x)
-        except ValueError:
-            return None
-    return None
+    """x as a float, or None if it is not a number."""
+    number = typed.real(x)
+    return None if number != number else number
 
 
 def parse_value(raw: Any, column: Column, where: str) -> Value:

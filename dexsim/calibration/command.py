@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from dexsim import typed
 from dexsim.console import program
 from dexsim.errors import UserError
 
@@ -328,16 +329,8 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
                 raise UserError(f"{key}={text}: must be true or false")
             out[key] = text == "true"
         elif isinstance(defaults[key], (int, float)) or key in ("area",):
-            try:
-                out[key] = float(text)
-            except ValueError:
-                out[key] = float("nan")
             least = {"levels": 4, "seed": 0, "stretch_max": 1.01}.get(key, 1e-12)
-            if not least <= out[key] < float("inf") or (key in ("levels", "seed") and out[key] != int(out[key])):
-                raise UserError(
-                    f"{key}={text}: must be a{' whole' if key in ('levels', 'seed') else ''} number of at least"
-                    f" {least:g}"
-                )
+            out[key] = typed.number(key, text, least, exact=key in ("levels", "seed"))
         else:
             out[key] = text
         if key in CHOICES and out[key] not in CHOICES[key]:

@@ -8,9 +8,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from dexsim import typed
 from dexsim.errors import UserError
 
 INF = math.inf
+MOST_LAYERS, MOST_UNITS = 32, 16_384
+"""Of a network."""
 # setting: (lowest, highest, whole number?); a missing or null setting is not checked
 LIMITS: dict[str, tuple[float, float, bool]] = {
     "worlds": (1, 1 << 20, True),
@@ -47,7 +50,9 @@ def check(cfg: dict[str, Any]) -> None:
     for key, (low, high, whole) in LIMITS.items():
         value = get(cfg, key)
         if value is not None:
-            _number(key, value, low, high, whole)
+            if isinstance(value, str):
+                raise UserError(f"{key}='{value}': must be a number, not text")
+            typed.number(key, value, low, high, exact=whole)
     if cfg.get("save_worlds") not in (None, True, False):
         raise UserError(f"save_worlds={cfg['save_worlds']}: must be true, false or null")
     step, period = get(cfg, "sim.timestep"), get(cfg, "sim.control_period")
@@ -58,8 +63,10 @@ def check(cfg: dict[str, Any]) -> None:
         )
     for key in ("agent.actor.hidden_dims", "agent.critic.hidden_dims"):
         sizes = get(cfg, key)
-        if sizes is not None and (not isinstance(sizes, list) or not sizes or not all(_whole(s, 1) for s in sizes)):
-            raise UserError(f"{key}={sizes}: must be a list of whole numbers from 1 up, e.g. [512,256,128]")
+        if sizes is not None and (not isinstance(sizes, list) or not 1 <= len(sizes) <= MOST_LAYERS):
+            raise UserError(f"{key}={sizes}: must be a list of 1 to {MOST_LAYERS} whole numbers, e.g. [512,256,128]")
+        for size in sizes or ():
+            typed.number(key, size, 1, MOST_UNITS, exact=True)
     worlds, steps = cfg.get("worlds"), get(cfg, "agent.num_steps_per_env")
     batches = get(cfg, "agent.algorithm.num_mini_batches")
     if worlds and steps and batches and worlds * steps < 2 * batches:
@@ -67,18 +74,6 @@ def check(cfg: dict[str, Any]) -> None:
             f"agent.algorithm.num_mini_batches={batches}: {worlds} worlds x {steps} steps are too few samples;"
             " raise worlds or agent.num_steps_per_env"
         )
-
-
-def _number(key: str, value: Any, low: float, high: float, whole: bool) -> None:
-    kind = "a whole number" if whole else "a number"
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or not low <= value <= high or (whole and int(value) != value):
-        above = f"from {low:g} to {high:g}" if high != INF else f"from {low:g} up"
-        raise UserError(f"{key}={value}: must be {kind} {above}")
-
-
-def _whole(value: Any, low: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= low
 
 
 def get(cfg: dict[str, Any], key: str) -> Any:

@@ -9,9 +9,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from dexsim import system
+from dexsim import system, typed
 from dexsim.errors import UserError
-from dexsim.typed import whole
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
 
@@ -155,10 +154,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
             raise UserError(f"{key}={given[key]}: the policy in {b.path} is of task={task}, which does not use it")
     place = None
     if "place" in given:
-        try:
-            at = np.array([float(x) for x in given["place"].replace(",", " ").split()])
-        except ValueError:
-            at = np.zeros(0)
+        at = np.array([typed.real(x) for x in given["place"].replace(",", " ").split()])
         if at.shape != (3,) or not (np.abs(at) < 0.5).all():
             raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
         place = FixedPlace(at)
@@ -193,7 +189,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
     shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
     if given.get("shape", shapes[0]) not in shapes:
         raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
-    seed, grip = whole("seed", given.get("seed", "0")), b.manifest.get("grip")
+    seed, grip = typed.whole("seed", given.get("seed", "0")), b.manifest.get("grip")
     simulated: Any = None
     if fake:
         from dexsim.deploy.simulated_hand import faked
@@ -274,15 +270,11 @@ def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
         if key in OWN:
             given[key] = value
             continue
-        try:
-            if "bool" in fields[key]:
-                changes[key] = {"true": True, "false": False}[value]
-            else:
-                changes[key] = int(value) if fields[key] == "int" else float(value)
-                if not 0 <= changes[key] < float("inf"):
-                    raise ValueError
-        except (ValueError, KeyError):
-            raise UserError(
-                f"{key}={value}: must be {'true or false' if 'bool' in fields[key] else 'a number of at least 0'}"
-            ) from None
+        if "bool" in fields[key]:
+            if value not in ("true", "false"):
+                raise UserError(f"{key}={value}: must be true or false")
+            changes[key] = value == "true"
+        else:
+            whole = fields[key] == "int"
+            changes[key] = typed.whole(key, value) if whole else typed.number(key, value, 0.0)
     return given, changes

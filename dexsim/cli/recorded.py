@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import outputs, yaml_text
+from dexsim import outputs, typed, yaml_text
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
@@ -62,13 +62,7 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
         raise UserError(f"hold={own['hold']}: must be recorded or limp")
 
     def seconds(key: str, low: float, high: float) -> float | None:
-        try:
-            x = float(own[key]) if key in own else None
-        except ValueError:
-            x = -1.0
-        if x is not None and not low <= x <= high:
-            raise UserError(f"{key}={own[key]}: must be a number from {low:g} to {high:g} s")
-        return x
+        return typed.number(key, own[key], low, high, "s") if key in own else None
 
     timestep, start, end = seconds("timestep", 1e-4, 0.02), seconds("start", 0.0, 1e6), seconds("end", 0.0, 1e6)
     servo = own.get("servo_file") or own.get("servo")
@@ -106,10 +100,7 @@ def _object(own: dict[str, str]) -> Any:
         return None
     values: dict[str, Any] = {}
     for key in rest:
-        try:
-            numbers = tuple(float(x) for x in own[key].strip("[]").replace(",", " ").split())
-        except ValueError:
-            numbers = ()
+        numbers = tuple(typed.real(x) for x in own[key].strip("[]").replace(",", " ").split())
         low, high = {"object_size": (1e-3, 1.0), "object_mass": (1e-4, 10.0), "object_friction": (0.01, 5.0)}[key]
         if not numbers or not all(low <= x <= high for x in numbers) or (key != "object_size" and len(numbers) > 1):
             raise UserError(

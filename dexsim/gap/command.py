@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from dexsim import yaml_text
 from dexsim.console import program
 from dexsim.errors import UserError
-from dexsim.typed import whole
+from dexsim.typed import number, whole
 
 if TYPE_CHECKING:
     from dexsim.gap.compute import TimeLimit
@@ -126,12 +126,7 @@ def parse(argv: list[str]) -> dict:
                 raise UserError(f"{key}={text}: must be true or false")
             out[key] = value
         elif key == "limit":
-            try:
-                out[key] = float(text)
-            except ValueError:
-                out[key] = 0.0
-            if not 1.0 <= out[key] < 1e7:
-                raise UserError(f"limit={text}: must be a number of seconds from 1 on")
+            out[key] = number(key, text, 1.0, 1e7, "s")
         elif key == "seed":
             out[key] = whole(key, text)
         else:

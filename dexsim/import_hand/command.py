@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dexsim import yaml_text
+from dexsim import typed, yaml_text
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim import-hand MODEL out=FOLDER [key=value ...]     MODEL: a URDF or MJCF file
@@ -134,12 +134,9 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
         ("density", 1.0, 3e4, "kg/m3"),
     ):
         if given.get(key):
-            setattr(out, key, _number(key, given[key], low, high, unit))
+            setattr(out, key, typed.number(key, given[key], low, high, unit))
     if given.get("drops"):
-        count = given["drops"]
-        if not count.isdecimal() or not count.isascii() or int(count) > MOST_DROPS:
-            raise UserError(f"drops={count}: must be a whole number from 0 to {MOST_DROPS}")
-        out.drops = int(count)
+        out.drops = typed.whole("drops", given["drops"], 0, MOST_DROPS)
     if given.get("packages"):
         out.packages = [Path(p.strip()).expanduser() for p in given["packages"].split(",")]
         for p in out.packages:
@@ -156,16 +153,6 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
             raise UserError(f"pads={pads}: must be ROWSxCOLUMNS (1 to 40 each, e.g. 8x6), none, or a .csv file")
         out.pads = (int(rows), int(columns))
     return out
-
-
-def _number(key: str, text: str, low: float, high: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise UserError(f"{key}={text}: must be a number from {low:g} to {high:g} {unit}")
-    return value
 
 
 def _yes(text: str) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim import files, outputs
+from dexsim import files, outputs, typed
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import folder, picture
@@ -104,12 +104,7 @@ def main(argv: Sequence[str]) -> int:
         if not equals or key not in given:
             raise UserError(f"'{text}': expected out=FOLDER, seconds=NUMBER, film=true or hand_mirror=true")
         given[key] = value
-    try:
-        seconds = float(given["seconds"])
-    except ValueError:
-        seconds = 0.0
-    if not 0.2 <= seconds <= 20:
-        raise UserError(f"seconds={given['seconds']}: must be a number from 0.2 to 20, of each joint's move")
+    seconds = typed.number("seconds", given["seconds"], 0.2, 20.0, "s of each joint's move")
     if given["hand_mirror"] not in ("true", "false"):
         raise UserError(f"hand_mirror={given['hand_mirror']}: must be true or false")
     hand = load_hand(where, given["hand_mirror"] == "true")

@@ -62,7 +62,7 @@ def read(
     """
     path = Path(path).expanduser()
     size = sum(p.stat().st_size for p in _files(path) if p.is_file())
-    given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand
+    given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand, limits
     return guard.call(_read, *given, what=f"recording {path}", size=size)
 
 
@@ -73,6 +73,7 @@ def _read(
     joints: Sequence[str] | None,
     audit: bool,
     hand: Hand | None,
+    limits: Mapping[str, tuple[float, float]] | None,
 ) -> Recording:
     meta, units = split(given)
     if path.suffix.lower() in columns.SUFFIXES:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.tactile.kernel import LAWS
 from dexsim.tactile.pads import PadConfig, pad_configs
@@ -136,10 +136,7 @@ def _stiffness(value: object) -> dict[str, dict[str, float]]:
 
 
 def _number(key: str, value: object, low: float, high: float) -> float:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not isinstance(value, (int, float)) or not (math.isfinite(value) and low <= value <= high):
-        raise UserError(f"tactile.{key}={value}: must be a number from {low:g} to {high:g}")
-    return float(value)
+    return typed.number(f"tactile.{key}", value, low, high)
 
 
 def _range(key: str, value: object) -> Range:

@@ -164,12 +164,7 @@ def value_range(where: str, value: object, unit: str, low: float, high: float) -
 
 def _number(x: object) -> float | None:
     """x as a finite float, None where it is none (YAML reads 1e-3 as text: that is accepted)."""
-    if isinstance(x, bool) or not isinstance(x, (int, float, str)):
-        return None
-    try:
-        number = float(x)
-    except ValueError:
-        return None
+    number = typed.real(x)
     return number if math.isfinite(number) else None
 
 
