@@ -93,7 +93,11 @@ def _arrays(path: Path, most: int) -> dict[str, np.ndarray]:
     if odd := [n for n in names if names.count(n) > 1 or not n.endswith(".npy")]:
         raise UserError(f"its entry '{odd[0]}' is there twice, or is no array (.npy)")
     with np.load(path, allow_pickle=False) as stored:
-        return {str(k): stored[k] for k in stored.files}
+        try:
+            return {str(k): stored[k] for k in stored.files}
+        except ValueError as error:
+            hint = "; save plain arrays of numbers, no objects" if "pickle" in str(error) else ""
+            raise UserError(f"{error}{hint}") from None
 
 
 def unfinished(path: Path) -> Path:

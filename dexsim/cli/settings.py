@@ -55,11 +55,14 @@ def parse(argv: list[str], config_dir: Path) -> Request:
             raise UserError(f"{text!r} is not a setting: write it as key=value (--help lists them)")
         try:
             item = parser.parse_override(text)
-        except HydraException:
+        except HydraException as error:
             key, _, value = text.partition("=")
-            raise UserError(
-                f"cannot read {text!r}: a value with special characters needs quotes, {key}='\"{value}\"' in a shell"
-            ) from None
+            try:  # a path with spaces, umlauts or brackets is what was typed
+                quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+                item = parser.parse_override(text if value[:1] in tuple("[{(\"'$") else f"{key}='{quoted}'")
+            except HydraException:
+                said = " ".join(str(error).split())[:200]
+                raise UserError(f"cannot read {text!r}: {said}; lists are written [a,b], text 'a b'") from None
         if item.is_sweep_override():
             raise UserError(
                 f"{text!r} gives several values: one run takes one value for each setting (--multirun runs them all)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -9,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 
+from dexsim.console import folders
 from dexsim.errors import UserError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -29,7 +31,11 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
         print(about.strip())
         return 0
     try:
-        return main(argv)
+        os.getcwd()
+        folders.caches()
+        status = main(argv)
+        sys.stdout.flush()  # here, where a full device is a line
+        return status
     except UserError as error:
         if _silent():
             # torchrun ends all ranks as soon as one has ended: the first, too, before it has said anything
@@ -51,6 +57,13 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
             2,
         )
     except OSError as error:
+        if error.errno == errno.ENOENT and not error.filename:
+            if "temporary" in str(error):
+                return _say("no folder for temporary files can be written: say one with TMPDIR=FOLDER", 2)
+            with contextlib.suppress(OSError):
+                os.getcwd()
+                raise
+            return _say("the folder that you are in is gone: go to one that is there (cd)", 2)
         if error.errno in PLACES and error.filename:
             return _say(f"{str(error.filename)[:200]}: {error.strerror}; give another path, or its rights", 2)
         if error.errno not in FULL:
@@ -72,6 +85,9 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def _say(message: object, status: int, prefix: str = "error: ") -> int:
-    sys.stdout.flush()
+    try:
+        sys.stdout.flush()
+    except OSError:  # it would be tried again at the end of Python, with a traceback
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     print(f"\n{prefix}{message}" if status == 130 else f"{prefix}{message}", file=sys.stderr, flush=True)
     return status

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -28,3 +31,22 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
         why = getattr(error, "strerror", None) or error
         raise UserError(f"cannot write into {folder}: {why}; choose another place with {setting}") from None
     return folder
+
+
+def caches() -> None:
+    """See that libraries can write what they keep for later (Warp its kernels, matplotlib its fonts): where the user's
+    own place cannot be written, or there is none, in a folder that goes with this process."""
+    home = os.path.join(os.path.expanduser("~"), ".cache")
+    places = {name: os.environ.get(name) for name in ("XDG_CACHE_HOME", "WARP_CACHE_PATH", "MPLCONFIGDIR")}
+    places["XDG_CACHE_HOME"] = places["XDG_CACHE_HOME"] or home
+    own = ""
+    for name, place in places.items():
+        try:
+            if place:
+                make(Path(place), name)
+        except UserError:
+            own = own or tempfile.mkdtemp(prefix="dexsim_cache_")
+            os.environ[name] = own
+            os.environ.setdefault("MPLCONFIGDIR", own)
+    if own:
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
