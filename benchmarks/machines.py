@@ -114,8 +114,8 @@ class Nodes:
         where = ["ip", "netns", "exec", self.names[node]] if self.apart else []
         run = ["-m", "torch.distributed.run", f"--nnodes={nodes}", f"--nproc_per_node={ranks}",
                "--rdzv_backend=c10d", f"--rdzv_endpoint={self.addresses[0]}:{PORT}", "--rdzv_id=dexsim",
-               f"--local-addr={self.addresses[node]}", f"--rdzv_conf=last_call_timeout=1,timeout=120,is_host={int(node == 0)}",
-               "--max-restarts=0"]  # fmt: skip
+               f"--rdzv_conf=last_call_timeout=1,timeout=120,is_host={int(node == 0)}",
+               f"--local-addr={self.addresses[node]}", "--max-restarts=0"]  # fmt: skip
         network = "eth0" if self.apart else "lo"
         env = os.environ | {
             "NCCL_HOSTID": f"node{node}", "NCCL_NET": "Socket", "NCCL_IB_DISABLE": "1", "NCCL_MNNVL_ENABLE": "0",
