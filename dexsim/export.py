@@ -29,15 +29,14 @@ settings (key=default):
   check=              a bundle to recompute
   steps=64            golden rows from a simulated episode; as many again are drawn at random
   seed=0              of both
+  task=               module:Class of a task of your own that the checkpoint names, and no installed package provides
   agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class);
                       typed here, its code runs
 """
-KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed")
+KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed", "task")
 TOLERANCE = 1e-5
 MOST_GOLDEN = 512 << 20  # bytes
 OPSET = 17
-BUILDERS = ("grasp", "rotate")
-"""Tasks whose observation the real-time loop can build."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -46,6 +45,10 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = _settings(argv)
+    if "task" in given:
+        from dexsim.tasks import registry
+
+        registry.find(given["task"])
     if "check" in given:
         if len(given) > 1:
             raise UserError("check=DIR goes alone")
@@ -76,23 +79,15 @@ def export(
     from dexsim import outputs
     from dexsim.calibration.file import Calibration
     from dexsim.console import folders
-    from dexsim.deploy import bundle
+    from dexsim.deploy import bundle, measure
     from dexsim.learning import checkpoint as checkpoints
     from dexsim.learning.ppo import load_policy
     from dexsim.sim.quiet import quiet_warp
+    from dexsim.tasks import registry
     from dexsim.tasks.env import hand_of
 
     data = checkpoints.load(checkpoint)
-    task = data["config"]["choices"]["task"]
-    if data["config"]["task"].get("name", task) not in BUILDERS:
-        raise UserError(
-            f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of {', '.join(BUILDERS)}"
-        )
-    if data["config"]["task"].get("mode", "palm") != "palm":
-        raise UserError(
-            f"{checkpoint}: trained on task={task}, whose camera and arm the deployed loop does not read; "
-            f"export a policy of task={' or task='.join(BUILDERS)}"
-        )
+    registry.task_class(data["config"], str(checkpoint)).check_deployed(str(checkpoint))
     measured = None if calibration is None else Calibration.load(calibration, hand=hand_of(data["config"]))
     out = Path(out).expanduser()
     if out.is_dir():
@@ -123,6 +118,9 @@ def export(
                               opset_version=OPSET,
                               input_names=["observation"], output_names=["action"],
                               dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
+            of = measure.of(env.task["name"])
+            if hasattr(of, "write"):
+                of.write(env, part / bundle.TERMS, OPSET)
         rows = golden(env, policy, model, steps, seed)
         np.savez_compressed(part / bundle.GOLDEN, **rows)
         measured = Calibration.default(env.effort.double().numpy(), env.hand) if measured is None else measured
@@ -170,9 +168,12 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     and after they were built from and led to, and as many random observations."""
     import torch
 
-    from dexsim.deploy import bundle
+    from dexsim.deploy import measure
 
-    observations = bundle.builder(env.task["name"])
+    of = measure.of(env.task["name"])
+    if not hasattr(of, "SIGNALS"):
+        return _golden_terms(env, of.Observation(env), policy, model, steps, seed)
+    observations = of.SIGNALS
     seen: list[Any] = []  # the `Signals` of the task
     build = observations.build
     kept: dict[str, list] = {
@@ -201,6 +202,13 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
                     kept[name].append(value)
     finally:
         observations.build = build
+    return _with_random(kept, model, steps, seed)
+
+
+def _with_random(kept: dict[str, list], model: Any, steps: int, seed: int) -> dict[str, Any]:
+    """What was kept of an episode, and as many random observations, with their actions."""
+    import torch
+
     rng = torch.Generator().manual_seed(seed)
     episode = torch.stack(kept["observation"])
     spread = episode.mean(0) + 3 * episode.std(0).clamp(min=0.05) * torch.randn(steps, episode.shape[1], generator=rng)
@@ -211,25 +219,56 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     return out | {"observation": everything.numpy(), "action": action.numpy()}
 
 
+def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
+    """The same of a task of declared terms, without the noise, delay and dropout of its readings. begins: where an
+    episode does."""
+    import torch
+
+    for row in env._sensed:
+        row.noise, row.dropout, row.delay = 0.0, 0.0, (0.0, 0.0)
+    kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", "begins")}
+    kept |= {f"signal_{k}": [] for k in of.names}
+    env.rng.manual_seed(seed)
+    with torch.no_grad():
+        env.reset_all()
+        begins = True
+        while len(kept["observation"]) < steps:
+            now = {f"signal_{k}": v[0] for k, v in of.of_env().items()}
+            now |= {"observation": env.get_observations()["actor"][0].clone(), "q": env.q[0].clone(),
+                    "before": env.target[0].clone(), "begins": torch.tensor(begins)}  # fmt: skip
+            env.step(policy(env.get_observations()))
+            begins = bool(env.done[0])
+            if begins:  # the target is the new episode's: begin with that one
+                env.reset_all()
+                continue
+            for name, value in (now | {"target": env.target[0].clone()}).items():
+                kept[name].append(value)
+    return _with_random(kept, model, steps, seed)
+
+
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
     """Everything that a robot must know, as plain data."""
-    from dexsim.deploy import bundle
+    from dexsim.deploy import bundle, measure
+    from dexsim.deploy.manifests import floats
     from dexsim.tactile.layout import touch_shape
 
     hand, (pads, taxels) = env.hand, touch_shape(env.hand)
     task, cfg = env.task, data["config"]
-    own = _grasp(env) if task["name"] == "grasp" else _rotate(env)
+    of = measure.of(task["name"])
+    own, told = of.parts(env), getattr(of, "SIGNALS", of)
+    if "terms" in own:
+        own["terms"]["sha256"] = bundle.sha256(policy.with_name(bundle.TERMS))
     table, at = [], 0
     for name, width, unit, source, scaling in own.pop("rows"):
         table.append({"name": name, "start": at, "stop": at + width, "unit": unit,
-                      "frame": bundle.builder(task["name"]).FRAME[name],
-                      "order": bundle.builder(task["name"]).ORDER[name], "scaling": scaling,
+                      "frame": told.FRAME.get(name, "palm"), "order": told.ORDER.get(name, "as declared"),
+                      "scaling": scaling,
                       "source": source})  # fmt: skip
         at += width
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
               "lead": float(task["action"]["lead"]),
-              "clip": [-1.0, 1.0], "unit": "rad", "low": _floats(env.q_low), "high": _floats(env.q_high),
-              "speed_limit_rad_s": _floats(hand.speeds), "order": "joints"}  # fmt: skip
+              "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
+              "speed_limit_rad_s": floats(hand.speeds), "order": "joints"}  # fmt: skip
     return {
         "format": bundle.FORMAT, "version": bundle.VERSION, "task": task["name"],
         "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",
@@ -245,7 +284,7 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
         "action": action,
         "initial_pose": own.pop("initial_pose"),
         "rates": {"policy_period_s": env.dt, "policy_hz": round(1 / env.dt, 4), "read_hz": 100.0} | own.pop("rates"),
-        "normalization": {"tau_max": _floats(env.effort)} | own.pop("normalization"),
+        "normalization": {"tau_max": floats(env.effort)} | own.pop("normalization"),
         "calibration": calibration.to_dict(),
         **own,
         "servo": cfg["servo"],
@@ -253,71 +292,6 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
         "versions": _versions(data),
         "trained": {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "git": data["git"]},
     }  # fmt: skip
-
-
-def _grasp(env: Any) -> dict[str, Any]:
-    """The parts of a manifest that differ between tasks."""
-    scaling = {
-        "tau/tau_max": "torque [N.m] / normalization.tau_max",
-        "F/F_max": "force [N] / normalization.force_max_N",
-    }
-    named = {"force_command": "the commanded share of normalization.force_max_N"}
-    rows = [
-        (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
-        for name, width, unit, source in env.rows()
-    ]
-    return {
-        "rows": rows, "initial_pose": _floats(env.pose0),
-        "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
-        "normalization": {"force_max_N": float(env.f_max)},
-        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the"
-                                        " palm's centre,"
-                                        " along the palm's normal", "object_xy": "held at the first value",
-                       "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
-    }  # fmt: skip
-
-
-def _rotate(env: Any) -> dict[str, Any]:
-    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose
-    that is most like all others: where the fingers wait for the cube, and the targets they close to."""
-    import copy
-
-    from dexsim.tasks import observations_rotate
-
-    task, g = env.task, env.grasps
-    targets = task["observe"].get("last_action", "step") != "step"
-    scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
-    rows = [
-        (name, width, unit, source, scaled.get(name, "none"))
-        for name, width, unit, source in observations_rotate.rows(task, *env.sizes)
-    ]
-    imu = task["perception"] == "imu"
-    middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
-    settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
-    settings["reward"] = {"delta_rot": task["reward"]["delta_rot"]}
-    return {
-        "rows": rows, "initial_pose": _floats(g.hand[middle]),
-        "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
-        "normalization": {},
-        "task_settings": settings,
-        "grip": {"hand": _floats(g.hand[middle]), "target": _floats(g.target[middle]),
-                 "object_pose": _floats(g.pose[middle]),
-                 "object": env.names[int(g.shape[middle])],
-                 "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
-                 "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
-        "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up;"
-                                             " any heading" if imu else "none",
-                       "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the"
-                               " angle left is below"
-                               " reward.delta_rot" if imu else "none: the policy turns without end",
-                       "history": "none" if imu else f"{task['history']} control steps, newest first; the first fills"
-                                                     " all",
-                       "critic": "not deployed"},
-    }  # fmt: skip
-
-
-def _floats(x: Any) -> list[float]:
-    return [round(float(v), 9) for v in x]
 
 
 def _versions(data: dict[str, Any]) -> dict[str, Any]:
@@ -336,9 +310,8 @@ def check(path: str | Path) -> bool:
     """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints the
     largest differences. False where one is beyond the manifest's tolerance."""
     import numpy as np
-    import torch
 
-    from dexsim.deploy import bundle
+    from dexsim.deploy import bundle, measure
     from dexsim.deploy.action import ActionRule
 
     b = bundle.load(path)
@@ -354,14 +327,10 @@ def check(path: str | Path) -> bool:
         raise UserError(
             f"{file}: cannot be read ({' '.join(str(error).split())[:100]}); export the bundle again"
         ) from None
-    observations, settings = (
-        bundle.builder(m["task"]),
-        m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"],
-    )
+    of = measure.of(m["task"])
     rule = ActionRule.from_manifest(m["action"])
     try:
-        signals = observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields))
-        built = observations.build(signals, settings).numpy() - observation[:n]
+        built = _rebuilt(of, b, rows) - observation[:n]
         targets = np.stack(
             [rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)]
         )
@@ -394,6 +363,27 @@ def check(path: str | Path) -> bool:
             file=sys.stderr,
         )
     return good
+
+
+def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
+    """The golden observations [n, D], built from the golden signals as the loop builds them."""
+    import numpy as np
+    import torch
+
+    if hasattr(of, "SIGNALS"):
+        own = of.SIGNALS
+        signals = own.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in own.Signals._fields))
+        return own.build(signals, of.settings(b.manifest)).numpy()
+    from dexsim.calibration.file import Calibration
+
+    built = of.measure(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",
+                                                b.manifest["normalization"]["tau_max"], b.hand))  # fmt: skip
+    out = []
+    for k, begins in enumerate(rows["begins"]):
+        if begins:
+            built.reset()
+        out.append(built.built({name: rows[f"signal_{name}"][k] for name in built.names})[0])
+    return np.stack(out)
 
 
 def _golden_rows(file: Path) -> dict[str, Any]:

@@ -49,7 +49,7 @@ safety (key=default):
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
-OWN = ("bundle", "driver", "port", "serial", "calibration", "record", "vision", "place", "imu", "shape", "seed")
+OWN = ("bundle", "driver", "port", "serial", "calibration", "record", "vision", "place", "imu", "shape", "seed", "task")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -64,7 +64,11 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.calibration.file import Calibration
     from dexsim.deploy import bundle as bundles
     from dexsim.deploy.loop import Loop, LoopSettings
+    from dexsim.deploy.measure import of
+    from dexsim.tasks import registry
 
+    if "task" in given:
+        registry.find(given["task"])
     torch.set_num_threads(1)
     if "bundle" not in given:
         raise UserError("say which policy: bundle=DIR (dexsim export writes one)")
@@ -76,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
         calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
     settings = LoopSettings(**changes)
     settings.check()
-    if "command" in changes and b.manifest["task"] != "grasp":
+    if "command" in changes and "command" not in of(b.manifest["task"]).OPTIONS:
         raise UserError(
             f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
             " commanded force"
@@ -146,11 +150,12 @@ def _ending(report: Any, recorder: Any) -> None:
 def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple[Any, Any]:
     import numpy as np
 
+    from dexsim.deploy.measure import ORIENTATION, PLACE, of
     from dexsim.deploy.vision import FixedPlace
 
     kind, task = given.get("driver", "sim"), b.manifest["task"]
-    for key in ("vision", "place", "shape") if task == "rotate" else ("imu",):
-        if key in given:
+    for key in ("vision", "place", "shape", "imu"):
+        if key in given and key not in of(task).OPTIONS:
             raise UserError(f"{key}={given[key]}: the policy in {b.path} is of task={task}, which does not use it")
     place = None
     if "place" in given:
@@ -174,20 +179,21 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
     if kind == "xhand" and not fake:
         from dexsim.deploy.vendor import VendorXHand
 
-        if task == "grasp" and place is None:
+        needs = of(task).measure(b, calibration).needs
+        if needs == PLACE and place is None:
             raise UserError(
                 'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your'
                 " own HeightSource (dexsim.deploy.vision)"
             )
         side = b.hand.handedness
         driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
-        return driver, _imu(given, b) if task == "rotate" else place
+        return driver, _imu(given, b) if needs == ORIENTATION else place
     vision = given.get("vision", "truth")
     if vision not in ("truth", "camera"):
         raise UserError(f"vision={vision}: must be truth or camera")
     config = b.config
     shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
-    if given.get("shape", shapes[0]) not in shapes:
+    if given.get("shape") not in (None, *shapes):
         raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
     seed, grip = typed.whole("seed", given.get("seed", "0")), b.manifest.get("grip")
     simulated: Any = None
@@ -205,11 +211,9 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
 
 
 def _imu(given: dict[str, str], b: Any) -> Any:
-    """The IMU in the object; None where the policy does without."""
+    """The IMU in the object."""
     from dexsim.deploy.imu import UdpImu
 
-    if b.manifest["task_settings"]["perception"] != "imu":
-        return None
     how, _, ports = given.get("imu", "").partition(":")
     port, colon, sender = ports.partition(":")
     if how != "udp" or not port.isdecimal() or (colon and not sender.isdecimal()):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import files, guard, yaml_text
-from dexsim.deploy import manifests
+from dexsim.deploy import manifests, measure
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.load import FILE as HAND_FILE
@@ -19,6 +19,8 @@ from dexsim.hand.load import known
 
 FORMAT, VERSION = manifests.FORMAT, manifests.VERSION
 POLICY, MANIFEST, GOLDEN, CONFIG = "policy.onnx", "manifest.yaml", "golden.npz", "config.yaml"
+TERMS = "observation.onnx"
+"""The observation of a task of declared terms, from signals."""
 HAND = "hand"
 """Folder of a bundle with the hand that it is for, where that does not come with dexsim."""
 MOST_BYTES = 256 << 20
@@ -56,14 +58,27 @@ def load(path: str | Path) -> Bundle:
     manifests.check(manifest, path / MANIFEST, hand)
     _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
-    if not policy.exists():
-        raise UserError(f"{path}: {POLICY} is missing; export the bundle again")
-    files.check(policy, MOST_BYTES, "network")
-    data = policy.read_bytes()
-    if hashlib.sha256(data).hexdigest() != manifest["policy"]["sha256"]:
-        raise UserError(f"{policy}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
+    data = _network(policy, manifest["policy"]["sha256"])
     guard.rehearse(_tried, data, policy, manifest["policy"], what=f"{policy}", size=len(data))
     return Bundle(path, manifest, session(data, policy), hand)
+
+
+def network(file: Path, digest: str) -> Any:
+    """onnxruntime's session of another of a bundle's networks. Raises UserError as `load` does."""
+    data = _network(file, digest)
+    guard.rehearse(session, data, file, what=f"{file}", size=len(data))
+    return session(data, file)
+
+
+def _network(file: Path, digest: str) -> bytes:
+    """The bytes of a network. Raises UserError: missing, too large, not the one that the manifest names."""
+    if not file.exists():
+        raise UserError(f"{file.parent}: {file.name} is missing; export the bundle again")
+    files.check(file, MOST_BYTES, "network")
+    data = file.read_bytes()
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise UserError(f"{file}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
+    return data
 
 
 def _hand(which: manifests.HandEntry, path: Path) -> Hand:
@@ -83,20 +98,10 @@ def _hand(which: manifests.HandEntry, path: Path) -> Hand:
         raise UserError(f"{file}: its hand cannot be read: {error}") from None
 
 
-def builder(task: str) -> Any:
-    """The module that builds a task's observation: `Signals` and `build(signals, settings)`."""
-    from dexsim.tasks import observations, observations_rotate
-
-    return {"grasp": observations, "rotate": observations_rotate}[task]
-
-
 def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
     """The observation that the network was trained on is the one that is built here, row by row."""
     here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
-    own = builder(m["task"])
-    sizes = len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0
-    table = own.rows(m["task_settings"], *sizes) if m["task"] == "rotate" else own.rows(*sizes)
-    ours = [tuple(row[:3]) for row in table]
+    ours = [tuple(row[:3]) for row in measure.of(m["task"]).table(m, hand)]
     if here != ours:
         bad = next(i for i in range(max(len(here), len(ours))) if here[i : i + 1] != ours[i : i + 1])
         raise UserError(

@@ -13,7 +13,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 
@@ -22,12 +21,14 @@ from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.imu import OrientationSource
-from dexsim.deploy.measure import ORIENTATION, TurnMeasure, for_bundle
+from dexsim.deploy.measure import ORIENTATION, POSE, for_bundle
+from dexsim.deploy.measure import PLACE as WHERE
 from dexsim.deploy.readings import (
     Frozen,
     Lasting,
     bad_orientation,
     bad_place,
+    bad_pose,
     bad_sequence,
     bad_stamp,
     copied,
@@ -43,7 +44,7 @@ from dexsim.errors import UserError
 from dexsim.tactile.layout import touch_shape
 
 HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
-SEEN: dict[str, float] = {ORIENTATION: 0.1, "place": 0.5}
+SEEN: dict[str, float] = {ORIENTATION: 0.1, WHERE: 0.5, POSE: 0.5}
 """s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second;
 a camera's thirty, and fingers hide an object for a moment."""
 RELAX_TRIES, RELAX_EVERY = 200, 0.005
@@ -166,8 +167,8 @@ class Loop:
         self.home = np.array(m["initial_pose"], float)
         self.grip = np.array(m["grip"]["target"], float) if m.get("grip") else None
         self.calibration = calibration
-        self.measure = for_bundle(m, calibration)
-        wanted = {None: None, "place": "place", ORIENTATION: "orientation"}[self.measure.needs]
+        self.measure = for_bundle(bundle, calibration)
+        wanted = self.measure.needs
         if wanted is not None and not hasattr(eye, wanted):
             raise UserError(
                 f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it"
@@ -246,7 +247,7 @@ class Loop:
                 _to_its_end(self._confirm)
             finally:
                 _to_its_end(lambda: self._shut(interval, watch))
-        if isinstance(self.measure, TurnMeasure) and self.measure.goals:
+        if getattr(self.measure, "goals", 0):
             self.report.counts["goals_reached"] += self.measure.goals
         return self.report
 
@@ -476,18 +477,10 @@ class Loop:
         if self.measure.needs is None:
             self._seen, self._seen_at = None, now
             return True
-        turned = self.measure.needs == ORIENTATION
         # `__init__` has looked that the eye sees what the measure needs
-        seen = (
-            cast("OrientationSource", self.eye).orientation(now)
-            if turned
-            else cast("HeightSource", self.eye).place(now)
-        )
-        self._unseen = (
-            "there is no reading"
-            if seen is None
-            else bad_stamp(seen[1], now) or (bad_orientation if turned else bad_place)(seen[0])
-        )
+        seen = getattr(self.eye, self.measure.needs)(now)
+        bad = {ORIENTATION: bad_orientation, WHERE: bad_place, POSE: bad_pose}[self.measure.needs]
+        self._unseen = "there is no reading" if seen is None else bad_stamp(seen[1], now) or bad(seen[0])
         if seen is None or self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
@@ -516,10 +509,10 @@ class Loop:
             r = self.recorder
             r.put(OBSERVATION, now, observation[0])
             r.put(ACTION, now, action)
-            if isinstance(self.measure, TurnMeasure) and self.measure.goal is not None:
+            if getattr(self.measure, "goal", None) is not None:
                 r.put(TURNED, now, np.asarray(self._seen, np.float32))
                 r.put(GOAL, now, self.measure.goal[0].numpy())
-            elif self.measure.needs is not None:
+            elif self.measure.needs == WHERE:
                 r.put(FORCE_COMMAND, now, command)
                 r.put(HEIGHT, now, np.asarray(self._seen, np.float32))
         if self.keep:

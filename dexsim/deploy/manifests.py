@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
+from dexsim.deploy import measure
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.typed import Count, Positive, Real, convert
@@ -120,10 +121,29 @@ class HandEntry(msgspec.Struct):
     scale: Annotated[float, msgspec.Meta(ge=0.2, le=5.0)] = 1.0
 
 
+class TermRow(msgspec.Struct):
+    """A declared observation: its value's width, and how many of its last values are seen, the newest first."""
+
+    name: str
+    width: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
+    frames: Annotated[int, msgspec.Meta(ge=1, le=64)]
+
+
+class Terms(msgspec.Struct):
+    """The observation of a task of declared terms: a network from signals to the values of all rows, one after the
+    other; frames of each; then `history` of the whole. constant: commands by name, as the policy is told them."""
+
+    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+    signals: Annotated[dict[str, Count], msgspec.Meta(max_length=100)]
+    rows: Annotated[list[TermRow], msgspec.Meta(min_length=1, max_length=1000)]
+    history: Annotated[int, msgspec.Meta(ge=1, le=64)]
+    commands: dict[str, Several]
+
+
 class Manifest(msgspec.Struct):
     """What `dexsim.export.manifest` writes, as far as the loop and its check depend on it."""
 
-    task: Literal["grasp", "rotate"]
+    task: Annotated[str, msgspec.Meta(pattern="^[a-z][a-z0-9_]{0,63}$")]
     policy: Network
     observation: Annotated[list[Row], msgspec.Meta(min_length=1, max_length=1000)]
     joints: list[str]
@@ -141,6 +161,12 @@ class Manifest(msgspec.Struct):
     hand: HandEntry | None = None
     task_settings: TaskSettings | None = None
     grip: Grip | None = None
+    terms: Terms | None = None
+
+
+def floats(x: Any) -> list[float]:
+    """Numbers as a manifest has them."""
+    return [round(float(v), 9) for v in x]
 
 
 def hand_entry(raw: dict[str, Any], source: object) -> HandEntry:
@@ -156,16 +182,7 @@ def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
     if raw.get("version") != VERSION:
         raise UserError(f"{source}: bundle version {raw.get('version')}; this dexsim reads version {VERSION}: {AGAIN}")
     m = convert(raw, Manifest, source, AGAIN)
-    if m.task == "rotate" and (m.task_settings is None or m.grip is None):
-        raise UserError(f"{source}: lacks task_settings or grip, which task=rotate needs; {AGAIN}")
-    if m.task == "rotate" and m.task_settings is not None:
-        convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", AGAIN)
-        if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
-            raise UserError(
-                f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {AGAIN}"
-            )
-    if m.task == "grasp" and m.normalization.force_max_N is None:
-        raise UserError(f"{source}: lacks normalization.force_max_N, which task=grasp needs; {AGAIN}")
+    measure.of(m.task).check(m, source, AGAIN)
     for key, ours in (("joints", hand.joints), ("fingers", hand.finger_names)):
         if getattr(m, key) != list(ours):
             raise UserError(

@@ -231,6 +231,13 @@ class BusDriver:
         """OrientationSource: as the object's IMU last said."""
         return self._object_seen(slice(4, 9))
 
+    def pose(self, now: float) -> tuple[np.ndarray, float] | None:
+        """Both, [7]: x y z m, w x y z; the older one's time."""
+        place, turned = self.place(now), self.orientation(now)
+        if place is None or turned is None:
+            return None
+        return np.concatenate([place[0], turned[0]]), min(place[1], turned[1])
+
     def _object_seen(self, part: slice) -> tuple[np.ndarray, float] | None:
         if self.body is not None:
             row = self.body.seen()[part]

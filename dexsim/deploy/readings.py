@@ -175,6 +175,14 @@ def bad_orientation(q: Any) -> str | None:
     return None if 0.5 < float(np.linalg.norm(x)) < 2.0 else f"its orientation is {np.round(x, 3).tolist()}"
 
 
+def bad_pose(pose: Any) -> str | None:
+    """Why an object's pose [7], x y z m, w x y z, cannot be true, or None."""
+    x = _array(pose)
+    if x is None or x.shape != (7,):
+        return "its pose is not x y z w x y z"
+    return bad_place(x[:3]) or bad_orientation(x[3:])
+
+
 def _array(x: Any) -> np.ndarray | None:
     """float64, None where it is not (real) numbers."""
     try:

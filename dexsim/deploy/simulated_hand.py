@@ -22,6 +22,7 @@ from dexsim.deploy.process import HANG, BusDriver
 from dexsim.deploy.vendor import VendorXHand
 from dexsim.errors import UserError
 from dexsim.tactile.layout import touch_shape
+from dexsim.tasks import registry
 from dexsim.tasks.env import hand_of
 
 POSITION_LSB = 2 * np.pi / 4096
@@ -62,6 +63,7 @@ class SimulatedHand:
         from dexsim.tasks import make_env
 
         cfg = copy.deepcopy(config)
+        registry.name_class(registry.of_config(cfg))  # looked at by whoever began this, perhaps in another process
         control = float(cfg["sim"]["control_period"])
         self.dt = control / max(1, round(control / TIMESTEP))
         cfg["sim"] |= {"timestep": self.dt, "threads": 1, "engine": "mujoco"}
@@ -86,13 +88,16 @@ class SimulatedHand:
             grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows), shape=which, names=names)
         self.env = make_env(cfg, 1, "cpu", seed, "mujoco", grasps)
         self.taxels = touch_shape(self.env.hand)
-        self.calibration, self.noise = calibration, float(config["task"]["sensors"].get("vision_z_noise", 0.0))
+        self.calibration, self.noise = calibration, float(
+            (config["task"].get("sensors") or {}).get("vision_z_noise", 0.0)
+        )
         self.rng = np.random.default_rng(seed)
         env, self._torch = self.env, torch
         self.imu = None
         if grip is not None:
             env.reset_all()
-            self.imu = SimulatedImu(config, env, self.rng)
+            if "imu.delay" in env.sampler.ranges:
+                self.imu = SimulatedImu(config, env, self.rng)
         self.time, self.sequence, self.held = 0.0, 0, True
         self._nominal = env.servo.params.clone()
         self._start = env.object_pose.clone().double(), torch.zeros(1, 6, dtype=torch.float64)
@@ -118,6 +123,8 @@ class SimulatedHand:
 
     def _hold(self) -> None:
         t = self.env.engine.t
+        if not self.env.scene.free:
+            return
         t.qpos[:, self.env.object_q] = (self._start[0] + self._away).to(t.qpos.dtype)
         t.qvel[:, self.env.object_v] = 0.0
 
@@ -190,8 +197,10 @@ class SimulatedHand:
         return self._seen
 
     def orientation(self) -> tuple[np.ndarray, float] | None:
-        """How the object is turned, [4] w x y z, as its IMU last said, and when [s]; None without one."""
-        return None if self.imu is None else self.imu.newest(self.time)
+        """How the object is turned, [4] w x y z, as its IMU last said, and when [s]; in truth, without one."""
+        if self.imu is None:
+            return self.env.object_pose[0, 3:].double().numpy().copy(), self.time
+        return self.imu.newest(self.time)
 
     def state(self, now: float) -> HandState:
         """The state as the SDK would give it, arriving at host time `now`."""
@@ -417,6 +426,7 @@ class SimulatedXHand(BusDriver):
         grip: dict[str, Any] | None = None,
         hang: float = HANG,
     ):
+        registry.task_class(config)  # refused here where nobody that may has named it
         self._camera, hand = camera, hand_of(config)
         make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip), latency=latency)
         super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
@@ -447,6 +457,7 @@ def faked(
 ) -> VendorXHand:
     """The xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
     `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
+    registry.task_class(config)
     hand = hand_of(config)
     side = hand.handedness
     text = faults if "side=" in faults else f"side={side[0].upper()}," + faults

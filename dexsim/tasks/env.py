@@ -267,6 +267,13 @@ class HandEnv(VecEnv):
                     f" ({', '.join(f'{row[0]} {row[1]}' for row in rows)}): make them equal"
                 )
 
+    @classmethod
+    def check_deployed(cls, source: str) -> None:
+        """UserError where a policy of this task cannot be exported for a robot. source: its checkpoint."""
+        raise UserError(
+            f"{source}: {cls.__name__} declares no terms, so that the deployed loop cannot build what its policy sees"
+        )
+
     # -- for the task to fill in
     # -----------------------------------------------------------------------------------------
     def setup(self) -> None:

@@ -56,6 +56,11 @@ class FingertipEnv(RotateEnv):
         super().__init__(cfg, n_worlds, device, seed, engine, grasps)
 
     @classmethod
+    def check_deployed(cls, source: str) -> None:
+        """UserError: it cannot."""
+        raise UserError(f"{source}: its task's camera and arm are not read by the deployed loop; export another policy")
+
+    @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:
         """Nothing: poses held by fingertips come with dexsim, or are given."""
 

@@ -106,6 +106,22 @@ class Task(HandEnv):
                           for t in terms["event"]}  # fmt: skip
         return out | {"task": task}
 
+    @classmethod
+    def check_deployed(cls, source: str) -> None:
+        """UserError for a task whose machine is more than a hand."""
+        if cls.scene.base is not None:
+            raise UserError(
+                f"{source}: its hand moves on a base of six servos, which the deployed loop does not drive; export a"
+                " policy of a fixed hand, or drive base and hand from a loop of your own (docs/howto/deploying.md)"
+            )
+
+    def __init__(
+        self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
+    ):
+        """grasps: what `hold` begins with, instead of the hand's own held poses."""
+        self._grasps = grasps
+        super().__init__(cfg, n_worlds, device, seed, engine)
+
     # -- setting up
     # --------------------------------------------------------------------------------------------------------------
     def setup(self) -> None:
@@ -130,7 +146,6 @@ class Task(HandEnv):
                 self._due[x.name] = torch.zeros(n, device=dev)
         self.last: dict[str, torch.Tensor] = {x.name: torch.zeros(n, device=dev) for x in self._terms["metric"]}
         self._figures: dict[str, torch.Tensor] = {}
-        self._grasps: GraspSet | None = None
         if self.scene.object is not None:
             self._set_objects()
         self.prepare_task()
@@ -307,17 +322,13 @@ class Task(HandEnv):
         s = self.sampler
         if self._grasps is None:
             edges = [self.unit * x for x in s.range("object.size")[:2]]
-            file = self.task["initial"]["poses"]
             with torch.inference_mode(False):
-                self._grasps = held_poses(self.hand, file).within(*edges).to(self.device)
-                self._half = self.objects.primitive_size(
-                    torch.full((1,), self.shape_names.index(CUBE), device=self.device),
-                    torch.ones(1, 3, device=self.device),
-                )
-        g = self._grasps
+                self._grasps = held_poses(self.hand, self.task["initial"]["poses"]).within(*edges).to(self.device)
+        g, box = self._grasps, torch.full((1,), self.shape_names.index(CUBE), device=self.device)
         pick = (s.uniform() * len(g)).long().clamp(max=len(g) - 1)
         row = torch.full_like(pick, self.shape_names.index(CUBE))
-        self.give_object(mask, row, g.edge[pick][:, None] / 2 / self._half)
+        nominal = self.objects.primitive_size(box, torch.ones(1, 3, device=self.device))
+        self.give_object(mask, row, g.edge[pick][:, None] / 2 / nominal)
         self.place(mask, g.hand[pick], g.pose[pick], torch.zeros_like(self.object_velocity), g.target[pick])
         return g.pose[pick]
 

@@ -1,0 +1,123 @@
+"""The grasp on a real hand: its observation from readings, and its part of a bundle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from dexsim.calibration.file import Calibration
+from dexsim.deploy.driver import HandState
+from dexsim.deploy.kinematics import HandKinematics
+from dexsim.deploy.manifests import floats
+from dexsim.deploy.measure import PLACE, tensor
+from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.tasks import observations
+
+OPTIONS = ("vision", "place", "shape", "command")
+SIGNALS = observations
+
+
+def check(m: Any, source: object, again: str) -> None:
+    """UserError for a manifest that lacks what this task needs."""
+    if m.normalization.force_max_N is None:
+        raise UserError(f"{source}: lacks normalization.force_max_N, which task={m.task} needs; {again}")
+
+
+def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
+    """Rows of the observation as this dexsim builds it."""
+    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0)
+
+
+def settings(m: dict[str, Any]) -> float:
+    """What `SIGNALS.build` takes beside signals."""
+    return float(m["normalization"]["force_max_N"])
+
+
+def measure(bundle: Any, calibration: Calibration) -> Measure:
+    """What the loop calls."""
+    manifest = bundle.manifest
+    width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
+    made = Measure(calibration, settings(manifest), float(manifest["rates"]["policy_period_s"]))
+    made.touch, made.commands = "contact_force" in width, width.get("force_command", 1)
+    return made
+
+
+def parts(env: Any) -> dict[str, Any]:
+    """The parts of a manifest that differ between tasks."""
+    scaling = {
+        "tau/tau_max": "torque [N.m] / normalization.tau_max",
+        "F/F_max": "force [N] / normalization.force_max_N",
+    }
+    named = {"force_command": "the commanded share of normalization.force_max_N"}
+    rows = [
+        (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
+        for name, width, unit, source in env.rows()
+    ]
+    return {
+        "rows": rows, "initial_pose": floats(env.pose0),
+        "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
+        "normalization": {"force_max_N": float(env.f_max)},
+        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the"
+                                        " palm's centre,"
+                                        " along the palm's normal", "object_xy": "held at the first value",
+                       "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
+    }  # fmt: skip
+
+
+class Measure:
+    """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last
+    height.
+
+    period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training. touch:
+    whether the policy has rows of touch (task.observe.touch). commands: 2 for a policy whose thumb has one of its own
+    (task.command.thumb), which is given the others'.
+    """
+
+    needs: str | None = PLACE
+
+    def __init__(self, calibration: Calibration, force_max: float, period: float):
+        self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
+        self.touch, self.commands = True, 1
+        self.hand = HandKinematics(calibration.hand)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: the next object position is the first."""
+        self._xy: np.ndarray | None = None
+        self._z: torch.Tensor | None = None
+
+    @torch.inference_mode()
+    def observe(
+        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame, which
+        is needed; command 0..1."""
+        assert seen is not None
+        s = self.signals(state, seen, command)
+        force = s.touch_force[0].numpy()
+        if not self.touch:  # it is shown and recorded all the same
+            s = s._replace(touch_force=s.touch_force[:, :0], touch_centre=s.touch_centre[:, :0])
+        return self.observation(s), force
+
+    def signals(self, state: HandState, place: np.ndarray, command: float) -> observations.Signals:
+        """See `observe`; of touch, all that the hand feels."""
+        c = self.calibration
+        tips, position, rotation_ = self.hand(state.position)
+        force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation_)
+        if self._xy is None:
+            self._xy = np.array(place[:2], float)
+        z = tensor([place[2]])[0]
+        vz = torch.zeros_like(z) if self._z is None else observations.height_speed(z, self._z, self.period)
+        self._z = z
+        return observations.Signals(
+            tensor(state.position), tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
+            tensor(self._xy), z, vz,
+            tensor(force), tensor(centre), tensor(tips),
+            tensor([command] * self.commands))  # fmt: skip
+
+    def observation(self, signals: observations.Signals) -> np.ndarray:
+        """[1, D] float32, by the builder that training used."""
+        return observations.build(signals, self.force_max).numpy()

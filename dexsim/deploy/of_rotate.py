@@ -1,0 +1,177 @@
+"""The rotation on a real hand: its observation from readings, and its part of a bundle."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from dexsim import rotation
+from dexsim.calibration.file import Calibration
+from dexsim.deploy.driver import HandState
+from dexsim.deploy.kinematics import HandKinematics
+from dexsim.deploy.manifests import Observe, floats
+from dexsim.deploy.measure import ORIENTATION, tensor
+from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.tasks import observations_rotate
+from dexsim.typed import convert
+
+OPTIONS = ("imu",)
+SIGNALS = observations_rotate
+
+
+def check(m: Any, source: object, again: str) -> None:
+    """UserError for a manifest that lacks what this task needs."""
+    if m.task_settings is None or m.grip is None:
+        raise UserError(f"{source}: lacks task_settings or grip, which task={m.task} needs; {again}")
+    convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", again)
+    if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
+        raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {again}")
+
+
+def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
+    """Rows of the observation as this dexsim builds it."""
+    sizes = len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0
+    return observations_rotate.rows(m["task_settings"], *sizes)
+
+
+def settings(m: dict[str, Any]) -> dict[str, Any]:
+    """What `SIGNALS.build` takes beside signals."""
+    return m["task_settings"]
+
+
+def measure(bundle: Any, calibration: Calibration) -> TurnMeasure:
+    """What the loop calls."""
+    return TurnMeasure(calibration, bundle.manifest, float(bundle.manifest["rates"]["policy_period_s"]))
+
+
+def parts(env: Any) -> dict[str, Any]:
+    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose
+    that is most like all others: where the fingers wait for the cube, and the targets they close to."""
+    task, g = env.task, env.grasps
+    targets = task["observe"].get("last_action", "step") != "step"
+    scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
+    rows = [
+        (name, width, unit, source, scaled.get(name, "none"))
+        for name, width, unit, source in observations_rotate.rows(task, *env.sizes)
+    ]
+    imu = task["perception"] == "imu"
+    middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
+    settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
+    settings["reward"] = {"delta_rot": task["reward"]["delta_rot"]}
+    return {
+        "rows": rows, "initial_pose": floats(g.hand[middle]),
+        "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
+        "normalization": {},
+        "task_settings": settings,
+        "grip": {"hand": floats(g.hand[middle]), "target": floats(g.target[middle]),
+                 "object_pose": floats(g.pose[middle]),
+                 "object": env.names[int(g.shape[middle])],
+                 "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
+                 "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
+        "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up;"
+                                             " any heading" if imu else "none",
+                       "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the"
+                               " angle left is below"
+                               " reward.delta_rot" if imu else "none: the policy turns without end",
+                       "history": "none" if imu else f"{task['history']} control steps, newest first; the first fills"
+                                                     " all",
+                       "critic": "not deployed"},
+    }  # fmt: skip
+
+
+class TurnMeasure:
+    """The rotation: turns readings into observations; keeps the goal, the history and the last angles.
+
+    goal [1, 4]: the orientation to reach, in the IMU's frame (None without one); goals: how many were reached. In
+    training a goal is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
+    """
+
+    def __init__(self, calibration: Calibration, manifest: dict[str, Any], period: float):
+        self.calibration, self.period, self.task = calibration, float(period), manifest["task_settings"]
+        self.needs = ORIENTATION if self.task["perception"] == "imu" else None
+        self.hand = HandKinematics(calibration.hand)
+        goal = self.task["goal"]
+        axis = torch.tensor([float(x) for x in goal["axis"]])
+        self.axis = axis / axis.norm()
+        self.turn = rotation.about(self.axis, torch.tensor(math.radians(float(goal["angle"]))))
+        low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
+        self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
+        self.frame = sum(row[1] for row in observations_rotate.rows(self.task, *self._sizes(), frames=1))
+        self.reset()
+
+    def _sizes(self) -> tuple[int, int, int]:
+        hand = self.calibration.hand
+        return len(hand.joints), len(hand.fingers), len(self.calibration.gain)
+
+    def reset(self) -> None:
+        """A new episode: the next orientation gives the first goal."""
+        self.goal: torch.Tensor | None = None
+        self.goals = 0
+        self._past: torch.Tensor | None = None
+        self._last: tuple[float, np.ndarray] | None = None
+        self._speed = np.zeros(len(self.calibration.hand.joints))
+
+    @torch.inference_mode()
+    def observe(
+        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation w x y
+        z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
+        s = self.signals(state, seen, target, action)
+        out = observations_rotate.build(s, self.task)
+        if self.task["perception"] == "proprioception":
+            self._past = out.view(1, -1, self.frame)
+        return out.numpy(), s.touch_force[0].numpy()
+
+    def signals(
+        self, state: HandState, seen: np.ndarray | None, target: np.ndarray, action: np.ndarray
+    ) -> observations_rotate.Signals:
+        """See `observe`; moves the goal on where it is reached."""
+        imu = self.task["perception"] == "imu"
+        q = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        if imu:
+            q = rotation.normalize(tensor(seen))
+            self._aim(q)
+        normal = self.calibration.normal_force(state.tactile)
+        tips, position, turned = self.hand(state.position)
+        force, centre = self.hand.touch(normal, position, turned, weighted=self.task["observe"]["force_weighted"])
+        fresh = not imu and self._past is None
+        past = (
+            torch.zeros(1, 0, 0)
+            if imu
+            else torch.zeros(1, int(self.task["history"]), self.frame)
+            if self._past is None
+            else self._past
+        )
+        sent = observations_rotate.sent(
+            tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), tensor(target), self._middle, self._half,
+            self.task["observe"].get("last_action", "step"))  # fmt: skip
+        return observations_rotate.Signals(
+            tensor(state.position), tensor(self._velocity(state)), q, q if self.goal is None else self.goal, sent,
+            tensor(force), tensor(centre), tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
+
+    def _aim(self, q: torch.Tensor) -> None:
+        """The first goal, or the next where this one is reached."""
+        # rotation.error(q, goal): the angle whose half has the cosine |<q, goal>|; tangent of the half, accurate near 0
+        reached = False
+        if self.goal is not None:
+            away = rotation.multiply(rotation.conjugate(q), self.goal)[0].tolist()
+            reached = 2 * math.atan2(math.hypot(*away[1:]), abs(away[0])) < float(self.task["reward"]["delta_rot"])
+        self.goals += reached
+        if self.goal is None or reached:
+            self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
+
+    def _velocity(self, state: HandState) -> np.ndarray:
+        """[J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        if state.velocity is not None and np.isfinite(state.velocity).all():
+            return np.asarray(state.velocity, float)
+        q = np.asarray(state.position, float)
+        if self._last is not None and state.time > self._last[0]:
+            self._speed = (q - self._last[1]) / (state.time - self._last[0])
+        self._last = state.time, q
+        return self._speed

@@ -1,0 +1,277 @@
+"""Tasks of declared terms on a real hand: the same methods that build the observation in simulation, computed from what
+a hand measures.
+
+An export runs every observation that the actor sees with signals in place of the simulation, and writes what it
+computes as a network (`observation.onnx`) into the bundle: a robot needs no code of the task. A method that asks for
+what no hand measures is refused by name. Noise, delay and dropout stay behind: a real hand has its own.
+"""
+
+from __future__ import annotations
+
+import types
+from typing import Any
+
+import numpy as np
+import torch
+
+from dexsim.calibration.file import Calibration
+from dexsim.deploy.driver import HandState
+from dexsim.deploy.kinematics import HandKinematics
+from dexsim.deploy.measure import POSE
+from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.tasks.task import STATE, Task
+from dexsim.tasks.terms import Memory
+
+OPTIONS = ("vision", "shape", "command")
+FRAME: dict[str, str] = {}
+ORDER: dict[str, str] = {}
+
+
+def signals(joints: int, fingers: int, pads: int) -> dict[str, tuple[int, ...]]:
+    """What a hand of so many joints, fingers and touch pads tells, by the name that a task has for it, and its shape.
+
+    q rad, qd rad/s, torque N.m (from currents), target rad and action (the last ones sent); touch_force N and
+    touch_centre m of the pads; tips m; age s since the policy began; object_pose (x y z m, w x y z), from something
+    that sees it; palm frame."""
+    return {
+        "q": (joints,), "qd": (joints,), "torque": (joints,), "target": (joints,), "action": (joints,),
+        "touch_force": (pads,), "touch_centre": (pads, 3), "tips": (fingers, 3), "age": (), "object_pose": (7,),
+    }  # fmt: skip
+
+
+class Measured:
+    """A task as its observations see it on a real hand: signals for what is measured, the task's own constants and
+    methods for all else; whatever a hand does not tell is refused. asked: the signals that were used."""
+
+    def __init__(self, task: Task, given: dict[str, torch.Tensor], term: str = ""):
+        self.__dict__.update(_task=task, _given=given, _term=term, asked={})
+
+    def __getattr__(self, name: str) -> Any:
+        task, given = self._task, self._given
+        if name in given:
+            self.asked[name] = None
+            return given[name]
+        if name == "commands":
+            return _Commands(self)
+        if name == "clean":
+            return False
+        if name == "num_envs":
+            return 1
+        own = getattr(type(task), name, None)
+        if isinstance(own, property) and own.fget is not None:
+            return own.fget(self)
+        if isinstance(own, types.FunctionType):
+            return types.MethodType(own, self)
+        if isinstance(own, Memory) or name in STATE or name in ("last", "_episode_length", "episode_length_buf"):
+            if name in ("dt", "device", "fingers", "pads", "joints", "hand", "task", "cfg", "num_actions"):
+                return getattr(task, name)
+            raise UserError(
+                f"observation {self._term}: asks for {name}, which a real hand does not tell; a hand tells"
+                f" {', '.join(given)}, and what the policy is told (@command). Let only the critic see it"
+                " (only=\"critic\"), or build it from those"
+            )
+        return getattr(task, name)
+
+
+class _Commands:
+    def __init__(self, owner: Measured):
+        self._owner = owner
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        return getattr(self._owner, f"command {name}")
+
+
+class Observation(torch.nn.Module):
+    """The values of all rows that the actor sees [1, D], from signals in the order of `names`."""
+
+    def __init__(self, task: Task, names: list[str] | None = None):
+        super().__init__()
+        self.task = task
+        self.rows = [r for r in task._sensed if task.task["observations"][r.term.name]["actor"]]
+        shapes = signals(len(task.hand.joints), task.fingers, task.pads)
+        self.shapes = shapes | {f"command {k}": (v.shape[1],) for k, v in task.commands.items()}
+        self.names = names or self._asked()
+
+    def _asked(self) -> list[str]:
+        """Signals that the rows use, found by computing them once."""
+        zeros = {k: torch.zeros(1, *shape) for k, shape in self.shapes.items()}
+        zeros["object_pose"][:, 3] = 1.0
+        asked: dict[str, None] = {}
+        for row in self.rows:
+            view = Measured(self.task, zeros, row.term.name)
+            self._value(row, view)
+            asked |= view.asked
+        told = [k for k, x in self.task.task["commands"].items() if x["actor"]]
+        return [*asked, *(f"command {k}" for k in told if f"command {k}" not in asked)]
+
+    def _value(self, row: Any, view: Measured) -> torch.Tensor:
+        value = row.term.method(view, **row.params)
+        return (value[:, None] if value.dim() == 1 else value.flatten(1)).float()
+
+    def forward(self, *given: torch.Tensor) -> torch.Tensor:
+        """See the class."""
+        by_name = dict(zip(self.names, given, strict=True))
+        out = [self._value(row, Measured(self.task, by_name, row.term.name)) for row in self.rows]
+        told = [k for k, x in self.task.task["commands"].items() if x["actor"]]
+        return torch.cat([*out, *(by_name[f"command {k}"] for k in told)], 1)
+
+    def of_env(self, world: int = 0) -> dict[str, torch.Tensor]:
+        """The signals as the simulation has them, without noise."""
+        env = self.task
+        now = {name: getattr(env, name) for name in self.shapes if not name.startswith("command ")}
+        now |= {f"command {k}": v for k, v in env.commands.items()}
+        return {name: now[name][world : world + 1].clone().float() for name in self.names}
+
+
+def check(m: Any, source: object, again: str) -> None:
+    """UserError for a manifest that lacks what a task of terms needs."""
+    if m.terms is None:
+        raise UserError(f"{source}: task={m.task} is none of this dexsim's, and the manifest has no terms; {again}")
+    wide = sum(r.width * r.frames for r in m.terms.rows) + sum(len(v) for v in m.terms.commands.values())
+    if wide * m.terms.history != m.policy.observation_size:
+        raise UserError(f"{source}: terms give {wide * m.terms.history} numbers, policy.observation_size is"
+                        f" {m.policy.observation_size}; {again}")  # fmt: skip
+
+
+def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str]]:
+    """Rows of the observation: as the bundle states them, since its network builds them."""
+    return [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
+
+
+def parts(env: Task) -> dict[str, Any]:
+    """The parts of a manifest that are a task's own, but for the network's digest."""
+    from dexsim.deploy.manifests import floats
+
+    of = Observation(env)
+    rows = []
+    for row in of.rows:
+        wide = row.width * row.frames * env.task["history"]
+        rows.append((row.term.name, wide, row.unit or "1", row.term.text, "none"))
+    told = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
+    rows += [(k, v.shape[1] * env.task["history"], "1", "told", "none") for k, v in told.items()]
+    width = env.sampler.width.clone()
+    env.sampler.width.fill_(0.0)  # the middle of every range
+    env.reset_all()
+    env.sampler.width.copy_(width)
+    out = {
+        "rows": rows, "initial_pose": floats(env.q[0]), "rates": {}, "normalization": {},
+        "terms": {
+            "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
+            "rows": [{"name": r.term.name, "width": r.width, "frames": r.frames} for r in of.rows],
+            "history": int(env.task["history"]),
+            "commands": {k: floats(v[0]) for k, v in told.items()},
+        },
+        "perception": {"object_pose": "something that sees where the object is and how it is turned, palm frame"
+                       if "object_pose" in of.names else "none", "critic": "not deployed"},
+    }  # fmt: skip
+    if env._grasps is not None:
+        g = env._grasps
+        middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
+        out["initial_pose"] = floats(g.hand[middle])
+        out["grip"] = {
+            "hand": floats(g.hand[middle]), "target": floats(g.target[middle]), "object_pose": floats(g.pose[middle]),
+            "object": g.names[int(g.shape[middle])], "object_edge_m": round(float(g.edge[middle]), 6),
+        }  # fmt: skip
+    return out
+
+
+def measure(bundle: Any, calibration: Calibration) -> TermsMeasure:
+    """What the loop calls."""
+    from dexsim.deploy import bundle as bundles
+
+    terms = bundle.manifest["terms"]
+    session = bundles.network(bundle.path / bundles.TERMS, terms["sha256"])
+    return TermsMeasure(bundle.manifest, calibration, session)
+
+
+class TermsMeasure:
+    """Turns readings into observations; keeps the last readings of rows with several frames, and the last angles."""
+
+    def __init__(self, manifest: dict[str, Any], calibration: Calibration, session: Any):
+        self.calibration, self.session, self.terms = calibration, session, manifest["terms"]
+        self.period = float(manifest["rates"]["policy_period_s"])
+        self.tau_max = np.array(manifest["normalization"]["tau_max"])
+        self.hand = HandKinematics(calibration.hand)
+        hand = calibration.hand
+        known = signals(len(hand.joints), len(hand.fingers), len(calibration.gain))
+        self.names = list(self.terms["signals"])
+        self.shapes = {name: known.get(name, (self.terms["signals"][name],)) for name in self.names}
+        self.needs = POSE if "object_pose" in self.names else None
+        self.commands = {k: np.array(v, np.float32) for k, v in self.terms["commands"].items()}
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: no past."""
+        self._frames: list[np.ndarray] = []
+        self._past: np.ndarray | None = None
+        self._last: tuple[float, np.ndarray] | None = None
+        self._speed = np.zeros(len(self.calibration.hand.joints))
+        self._steps = 0
+
+    def observe(
+        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where the
+        policy needs it. command: of a task with one command of one number, that."""
+        c = self.calibration
+        tips, position, turned = self.hand(state.position)
+        force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
+        told = self.commands
+        if len(told) == 1 and next(iter(told.values())).size == 1:
+            told = dict.fromkeys(told, np.array([command], np.float32))
+        now = {
+            "q": state.position, "qd": self._velocity(state), "target": target,
+            "torque": c.torque_norm(np.asarray(state.current, float) * 1e-3) * self.tau_max,
+            "action": np.clip(np.nan_to_num(action), -1.0, 1.0), "touch_force": force, "touch_centre": centre,
+            "tips": tips, "age": self._steps * self.period, "object_pose": seen,
+        } | {f"command {k}": v for k, v in told.items()}  # fmt: skip
+        self._steps += 1
+        return self.built({name: np.asarray(now[name], np.float32) for name in self.names}), force
+
+    def built(self, given: dict[str, np.ndarray]) -> np.ndarray:
+        """The observation [1, D] of signals; moves the past on."""
+        feed = {_input(k): given[k].reshape(1, *self.shapes[k]).astype(np.float32) for k in self.names}
+        flat = self.session.run(["rows"], feed)[0][0]
+        fresh, rows, at = not self._frames, [], 0
+        for k, row in enumerate(self.terms["rows"]):
+            value = flat[at : at + row["width"]]
+            at += row["width"]
+            if fresh:
+                self._frames.append(np.tile(value, (row["frames"], 1)))
+            else:
+                self._frames[k] = np.concatenate([value[None], self._frames[k][:-1]])
+            rows.append(self._frames[k].ravel())
+        whole = np.concatenate([*rows, flat[at:]])
+        if self._past is None:
+            self._past = np.tile(whole, (self.terms["history"], 1))
+        else:
+            self._past = np.concatenate([whole[None], self._past[:-1]])
+        return self._past.reshape(1, -1).astype(np.float32)
+
+    def _velocity(self, state: HandState) -> np.ndarray:
+        """[J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        if state.velocity is not None and np.isfinite(state.velocity).all():
+            return np.asarray(state.velocity, float)
+        q = np.asarray(state.position, float)
+        if self._last is not None and state.time > self._last[0]:
+            self._speed = (q - self._last[1]) / (state.time - self._last[0])
+        self._last = state.time, q
+        return self._speed
+
+
+def _input(name: str) -> str:
+    """A signal's name in the network."""
+    return name.replace(" ", "_")
+
+
+def write(env: Task, path: Any, opset: int) -> Observation:
+    """Write the network from signals to rows; returns it."""
+    of = Observation(env).eval()
+    given = tuple(of.of_env().values())
+    torch.onnx.export(of, given, str(path), dynamo=False, opset_version=opset,
+                      input_names=[_input(k) for k in of.names], output_names=["rows"])  # fmt: skip
+    return of
+
+
+__all__ = ["OPTIONS", "TermsMeasure", "check", "measure", "parts", "signals", "table", "write"]
