@@ -20,7 +20,8 @@ from dexsim.deploy import loop as deploy_loop
 from dexsim.deploy.driver import PASSIVE, HandState, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import Loop, LoopSettings
-from dexsim.deploy.measure import TurnMeasure, for_bundle
+from dexsim.deploy.measure import for_bundle
+from dexsim.deploy.of_rotate import TurnMeasure
 from dexsim.deploy.recorder import GOAL, TURNED
 from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.simulated_hand import SimulatedXHand
@@ -141,7 +142,7 @@ def test_a_recorded_episode_gives_the_same_observations_and_actions(made, episod
 
 
 def turner(made) -> TurnMeasure:
-    return for_bundle(bundle.load(made[0]).manifest, Calibration.default())
+    return for_bundle(bundle.load(made[0]), Calibration.default())
 
 
 def state(t: float, q=0.3, velocity=None) -> HandState:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -73,7 +75,7 @@ def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
         at += width
     manifest = {"task": "grasp", "observation": table, "normalization": {"force_max_N": 10.0},
                 "rates": {"policy_period_s": 0.02}}  # fmt: skip
-    measure = for_bundle(manifest, Calibration.default())
+    measure = for_bundle(SimpleNamespace(manifest=manifest), Calibration.default())
     tactile = np.zeros((5, 120, 3), np.int16)
     tactile[1, 7, 2] = 10
     state = HandState(0.0, 0, np.zeros(12), np.zeros(12), tactile=tactile)

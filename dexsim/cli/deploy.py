@@ -9,7 +9,11 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+<<<<<<< HEAD
 from dexsim import system, typed
+=======
+from dexsim import door, system
+>>>>>>> 021ef2b (What installed packages bring: effects and drivers by entry points, as tasks are)
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
@@ -20,7 +24,7 @@ clear of a real hand, and try driver=sim first. On a machine that does other wor
 
 settings (key=default):
   bundle=             folder of dexsim export
-  driver=sim          sim, or xhand (the vendor's package)
+  driver=sim          sim, xhand (the vendor's package), what an installed package brings, or module:Class
   port=auto           driver=xhand: auto asks every serial port for the hand; a port (/dev/ttyACM1), ethercat or
                       ethercat:INTERFACE; fake: the simulated hand behind a fake of the vendor's package, with faults
                       as in fake:crc=0.005,board=2 (dexsim/deploy/fake_xhand.py)
@@ -165,7 +169,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
         place = FixedPlace(at)
     fake = given.get("port", "").split(":")[0] == "fake"
     if kind not in ("sim", "xhand"):
-        raise UserError(f"driver={kind}: must be sim or xhand")
+        return _own(kind, given, b, calibration, place)
     if kind == "xhand" and b.hand.name != "xhand":
         raise UserError(
             f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
@@ -208,6 +212,20 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
         simulated = SimulatedXHand(config, calibration, seed=seed, camera=vision == "camera",
                                    shape=given.get("shape"), grip=grip, hang=hang)  # fmt: skip
     return simulated, place or simulated
+
+
+def _own(kind: str, given: dict[str, str], b: Any, calibration: Any, place: Any) -> tuple[Any, Any]:
+    """A driver that an installed package brings (an entry point of the group `dexsim.drivers`), or that is named in
+    full: called with hand=, port= (None where none is given) and calibration=; and what sees the object."""
+    brought = door.installed("dexsim.drivers")
+    if kind not in brought and not door.is_named(kind):
+        raise UserError(f"driver={kind}: must be {', '.join(('sim', 'xhand', *brought))}, or module:Class of your own")
+    make = door.load(brought[kind].value if kind in brought else kind, f"driver={kind}")
+    driver = make(hand=b.hand, port=given.get("port"), calibration=calibration)
+    lacks = [x for x in ("open", "read", "send", "relax", "close") if not callable(getattr(driver, x, None))]
+    if lacks:
+        raise UserError(f"driver={kind}: has no {', '.join(lacks)}; see dexsim.deploy.driver.HandDriver")
+    return driver, place or (_imu(given, b) if "imu" in given else driver)
 
 
 def _imu(given: dict[str, str], b: Any) -> Any:

@@ -11,16 +11,16 @@ class is loaded only if dexsim or an installed package provides it, or the user 
 from __future__ import annotations
 
 import difflib
-import importlib
 import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dexsim import door
 from dexsim.console import program
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from dexsim.tasks.env import HandEnv
 
 GROUP = "dexsim.tasks"
-CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""A class as the user names one."""
-
 _named: dict[str, type[HandEnv] | None] = {}
 """Classes that the user named in this process: typed on the command line (None until it is loaded), or given as an
 object."""
@@ -59,7 +56,7 @@ def built_in(folder: Path = CONFIGS / "task") -> dict[str, str]:
 
 def installed() -> dict[str, EntryPoint]:
     """The tasks of other installed packages by name: their entry points in the group `dexsim.tasks`."""
-    return {point.name: point for point in entry_points(group=GROUP)}
+    return door.installed(GROUP)
 
 
 def entries() -> Iterator[Entry]:
@@ -72,7 +69,7 @@ def entries() -> Iterator[Entry]:
 
 def is_class(choice: str) -> bool:
     """Whether a choice of task is spelled "module:Class"."""
-    return bool(CLASS.fullmatch(choice))
+    return door.is_named(choice)
 
 
 def name_class(where: str, made: type[HandEnv] | None = None) -> str:
@@ -135,42 +132,10 @@ def typing(where: str) -> str:
 def _imported(where: str, about: str) -> type[HandEnv]:
     from dexsim.tasks.env import HandEnv
 
-    module, _, name = where.partition(":")
-    here = str(Path.cwd())
-    if here not in sys.path and "" not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        loaded = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name and (module == error.name or module.startswith(f"{error.name}.")):
-            raise UserError(
-                f"{about}: there is no module {error.name}, neither installed nor in {here}; run this in the folder"
-                " that holds it, or install its package"
-            ) from None
-        raise UserError(f"{about}: {module} needs the module {error.name}, which is not installed") from None
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"{about}: {module} fails as it is imported: {_failure(error)}") from error
-    made = getattr(loaded, name, None)
-    if made is None:
-        tasks = [k for k, v in vars(loaded).items() if isinstance(v, type) and issubclass(v, HandEnv)]
-        own = [k for k in tasks if getattr(loaded, k).__module__ == module]
-        raise UserError(f"{about}: {module} has no {name}; the tasks in it: {', '.join(own) or 'none'}")
+    made = door.load(where, about)
     if not (isinstance(made, type) and issubclass(made, HandEnv)):
-        raise UserError(f"{about}: {name} is no task: derive it from dexsim.tasks.Task")
+        raise UserError(f"{about}: {where.partition(':')[2]} is no task: derive it from dexsim.tasks.Task")
     return made
-
-
-def _failure(error: Exception) -> str:
-    """An error and the line of the file in which it arose, in one line."""
-    line = getattr(error, "lineno", None)
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    line = line or (trace.tb_lineno if trace is not None else 0)
-    file = getattr(error, "filename", None) or (trace.tb_frame.f_code.co_filename if trace is not None else "")
-    return f"{type(error).__name__}: {error} ({Path(str(file)).name}, line {line})"
 
 
 def of_config(cfg: dict[str, Any]) -> str:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from dexsim import door
+from dexsim.errors import UserError
 from dexsim.gap.effects import Effect, TouchEffect, Variant, body, drive, friction, signals, touch, transmission
 from dexsim.gap.rules import JUDGE
 
@@ -73,7 +75,20 @@ def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[
         for c in vars(family).values()
         if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
     ]
-    return in_order(found, first)
+    return in_order([*found, *_brought(kind)], first)
+
+
+def _brought(kind: type[Entry]) -> list[Entry]:
+    """Those of installed packages: entry points of the group `dexsim.effects`. Raises UserError for one that is no
+    effect."""
+    out = []
+    for name, point in door.installed("dexsim.effects").items():
+        made = door.load(point.value, f"effect {name} (entry point of dexsim.effects)")
+        if not (isinstance(made, type) and issubclass(made, Effect | TouchEffect)):
+            raise UserError(f"effect {name}: {point.value} is no effect: derive it from Effect or TouchEffect")
+        if issubclass(made, kind):
+            out.append(made())
+    return out
 
 
 def in_order(found: Sequence[Entry], first: Sequence[str]) -> tuple[Entry, ...]:
