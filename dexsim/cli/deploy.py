@@ -9,11 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-<<<<<<< HEAD
-from dexsim import system, typed
-=======
-from dexsim import door, system
->>>>>>> 021ef2b (What installed packages bring: effects and drivers by entry points, as tasks are)
+from dexsim import door, system, typed
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
