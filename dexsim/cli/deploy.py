@@ -13,6 +13,7 @@ from dexsim import door, system, typed
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
+       dexsim deploy check [key=value ...]      the first hour with a hand, step by step (dexsim deploy check --help)
 
 Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C, SIGTERM and SIGHUP relax at once. Stand
 clear of a real hand, and try driver=sim first. On a machine that does other work too, run it with real-time priority
@@ -58,6 +59,10 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
+    if argv[0] == "check":
+        from dexsim.cli import first_hour
+
+        return first_hour.main(argv[1:])
     given, changes = _settings(argv)
     import torch
 

@@ -42,8 +42,9 @@ class Faults:
     refused with the code `refuse`; unplug_s: the cable is out for two seconds, and the port's number is another then;
     outlier: share of round trips of 111 ms; opens: how often opening fails first; limp: what makes the hand limp
     (passive: mode 0, torque: a torque limit of 0, never); sdk: version, 0.10.3 has unsigned currents; side, serial;
-    jitter rad of the encoders; seed; log: a file to which a line is added for each command that the hand has taken, its
-    time (monotonic, s), mode and largest torque limit (mA)."""
+    press: the taxel that is felt when somebody presses a finger, -1: none; jitter rad of the encoders; seed; log: a
+    file to which a line is added for each command that the hand has taken, its time (monotonic, s), mode and largest
+    torque limit (mA)."""
 
     crc: float = 0.0
     torn: float = 0.0
@@ -62,6 +63,7 @@ class Faults:
     sdk: str = "1.5.2"
     side: str = "R"
     serial: str = "FAKE0001"
+    press: int = -1
     jitter: float = ENCODER_JITTER
     seed: int = 0
     log: str = ""
@@ -84,18 +86,19 @@ class Faults:
 
 
 class LaggingHand:
-    """Twelve joints that follow their targets with a lag, and draw current as they do; nothing is touched."""
+    """Twelve joints that follow their targets with a lag [s], where their current limit is over `least` mA, and draw
+    current as they do; nothing is touched. start: rad; push: rad that somebody holds them away from their targets."""
 
-    def __init__(self, start: float = 0.05, lag: float = 0.04, push: float = 0.0):
+    def __init__(self, start: float = 0.05, lag: float = 0.04, push: float = 0.0, least: float = 0.0):
         self.q, self.time = np.full(JOINTS, start), 0.0
         self.q[3] = min(start, 0.15)  # the index's abduction has no more
         self.target = self.q.copy()
-        self.stiff = self.limit = 0.0
-        self.lag, self.push = lag, np.full(JOINTS, push)  # rad that somebody holds joints away from their targets
+        self.stiff, self.limit, self.least = 0.0, np.zeros(JOINTS), least
+        self.lag, self.push = lag, np.full(JOINTS, push)
 
     def command(self, c: HandCommand) -> None:
         """Takes effect now."""
-        self.target, self.stiff, self.limit = np.array(c.position, float), float(c.kp), float(np.max(c.tor_max))
+        self.target, self.stiff, self.limit = np.array(c.position, float), float(c.kp), np.array(c.tor_max, float)
 
     def relax(self) -> None:
         """The motors are off."""
@@ -104,8 +107,8 @@ class LaggingHand:
     def advance(self, t: float) -> None:
         """Up to time t [s]."""
         step, self.time = max(t - self.time, 0.0), t
-        if self.stiff > 0 and self.limit > 0:
-            self.q = self.q + (self.target - self.q) * (1 - np.exp(-step / self.lag))
+        driven = (self.stiff > 0) & (self.limit > self.least)
+        self.q = self.q + driven * (self.target - self.q) * (1 - np.exp(-step / self.lag))
 
     def state(self, now: float) -> HandState:
         """As the SDK would give it."""
@@ -124,7 +127,7 @@ class FakeXHand:
             self.hand.advance(k * TRIP)  # compiles what is left
         self.zero = clock.now()
         self._slip = -self.hand.time
-        self.opened = 0
+        self.opened, self.pressed = 0, (-1, 0.0)
         self.trips: list[tuple[float, tuple]] = []  # when a command went over the wire, and what
         self.HandCommand_t, self.FingerCommand_t = _HandCommand, _FingerCommand
 
@@ -142,8 +145,10 @@ class FakeXHand:
         return out
 
     def handle(self, what: int) -> None:
-        """The object is held out (1) or let go (2), in the simulated world."""
-        if hasattr(self.hand, "present"):
+        """The object is held out (1) or let go (2), in the simulated world; somebody presses finger k (3 + k)."""
+        if what > 2:
+            self.pressed = what - 3, self.clock.now()
+        elif hasattr(self.hand, "present"):
             (self.hand.present if what == 1 else self.hand.release)()
 
     @property
@@ -356,7 +361,10 @@ class _Control:
             if fake.time >= f.silent_s or (k == f.board and fake.time >= f.board_s) or broken:
                 frame.sensor_data[k] = self._cache.sensor_data[k]
                 continue
-            touch = s.tactile[k] if k < len(s.tactile) else np.zeros(3)
+            touch = s.tactile[k] if k < len(s.tactile) else np.zeros((TAXELS, 3))
+            if f.press >= 0 and self._fake.pressed[0] == k and fake.clock.now() < self._fake.pressed[1] + 0.5:
+                touch = touch.copy()
+                touch[f.press] = 0, 0, 60
             if touch.any():
                 rows = np.clip(touch, [-128, -128, 0], [127, 127, 255]).astype(int).tolist()
                 total = np.clip(touch.sum(0), [-128, -128, 0], [127, 127, 255]).astype(int).tolist()

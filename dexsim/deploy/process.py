@@ -60,7 +60,7 @@ class Body(Protocol):
         """The object [9]: place [3] m, its time [s], orientation [4] w x y z, its time [s]; NaN where none."""
 
     def handle(self, what: int) -> None:
-        """The object is held out (1), or let go (2)."""
+        """The object is held out (1), or let go (2); finger k is pressed (3 + k)."""
 
     def close(self) -> None:
         """Disconnect."""
@@ -192,6 +192,11 @@ class BusDriver:
     def started(self) -> None:
         """The policy begins: the object is let go."""
         self._handle(2)
+
+    def press(self, finger: int) -> None:
+        """A fingertip is pressed, where somebody simulates that."""
+        self._handle(3 + finger)
+        self.relax()
 
     def close(self) -> None:
         """Let go, wait until it is known whether the hand is limp, disconnect. Where the process had died, a new one

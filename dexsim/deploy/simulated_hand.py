@@ -400,7 +400,7 @@ class SimulatedBody:
         return out
 
     def handle(self, what: int) -> None:
-        (self.hand.present if what == 1 else self.hand.release)()
+        {1: self.hand.present, 2: self.hand.release}.get(what, lambda: None)()
 
     def close(self) -> None:
         pass

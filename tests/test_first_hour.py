@@ -1,0 +1,129 @@
+"""`dexsim deploy check`: each step says what the hand behind the fake is like, and a fault lets go of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+
+from dexsim.cli import first_hour
+from dexsim.cli.main import main
+from dexsim.deploy.driver import PASSIVE, VirtualClock
+from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
+from dexsim.deploy.vendor import VendorXHand
+from dexsim.errors import UserError
+from dexsim.hand import load_hand
+from dexsim.recording.reader import read
+
+JOINTS = "thumb_bend_joint,index_joint1"
+STEPS = ["connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "lowest"]
+
+
+def walk(out, hand=LaggingHand, steps=STEPS, **faults):
+    """(status, check.json, the fake, what was said)."""
+    clock, said = VirtualClock(5.0), []
+    package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0, "press": 0} | faults))
+    driver = VendorXHand("auto", clock, package, side="right")
+    given = first_hour.KEYS | {"yes": "true", "joints": JOINTS, "port": "fake"}
+    status = first_hour.walk(driver, load_hand("xhand"), clock, steps, given, out, said.append)
+    return status, json.loads((out / "check.json").read_text()), driver.body._sdk, "\n".join(said)
+
+
+class Sticky(LaggingHand):
+    """Needs a current to move at all, follows late, and turns one joint the wrong way if asked."""
+
+    def __init__(self, need=0.0, wrong=False, dead=0.0):
+        super().__init__(least=need)
+        self.wrong, self.dead, self.past = wrong, dead, []
+
+    def command(self, c):
+        self.past.append((self.time, c))
+        due = [c for t, c in self.past if t <= self.time - self.dead + 1e-9]
+        if due:
+            super().command(due[-1])
+        if self.wrong:
+            self.target[4] = 1.34 - self.target[4]
+
+
+def test_all_steps_of_a_good_hand(tmp_path):
+    status, found, fake, said = walk(tmp_path)
+    assert status == 0 and not found["stopped"] and "the hand is let go: " in said
+    steps = found["steps"]
+    assert {n: s["verdict"] for n, s in steps.items()} == dict.fromkeys(STEPS, "good") | {"limp": "look"}
+    assert steps["connection"]["figures"]["serial"] == "FAKE0001"
+    assert 100 < steps["cycles"]["figures"]["rate_Hz"] < 106
+    assert steps["cycles"]["figures"]["jitter_rad"] == pytest.approx(0.0014, rel=0.2)
+    assert steps["taxels"]["figures"]["ring"]["guess"] == "as in our layout"
+    assert all(q[3].max() <= 300 for _, q in fake.trips), "no step goes beyond excite_current="
+    low, high = load_hand("xhand").limits.T
+    sent = np.stack([q[2] for _, q in fake.trips if q[0] != PASSIVE])
+    assert (sent >= low - 1e-6).all() and (sent <= high + 1e-6).all() and fake.trips[-1][1][0] == PASSIVE
+    page = (tmp_path / "report.html").read_text()
+    assert "Cycle times" in page and "data:image/png" in page and "look</span> Does letting go" in page
+    assert len(read(tmp_path / "check.mcap", audit=False).states.position) > 2000
+
+
+def test_what_is_planted_is_found(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    _, late, *_ = walk(tmp_path / "a", partial(Sticky, dead=0.05), ["latency"])
+    _, soon, *_ = walk(tmp_path / "b", Sticky, ["latency"])
+    median = lambda d: np.median(sum(d["steps"]["latency"]["figures"]["ms"].values(), []))  # noqa: E731
+    assert median(late) - median(soon) == pytest.approx(50, abs=12) and median(soon) < 30
+
+
+@pytest.mark.parametrize(
+    ("hand", "steps", "faults", "says"),
+    [
+        (partial(Sticky, need=155.0), ["signs", "lowest"], {}, "needed more than current=: thumb_bend_joint 200 mA"),
+        (partial(Sticky, wrong=True), ["signs"], {}, "index_joint1 went the wrong way"),
+        (partial(Sticky, need=1000.0), ["signs"], {}, "thumb_bend_joint went 0.00 of"),
+        (LaggingHand, ["zero"], {"board": 3}, "boards that say nothing: ring"),
+        (LaggingHand, ["taxels"], {"press": 9}, "columns are mirrored"),
+        (LaggingHand, ["taxels"], {"press": -1}, "nobody pressed it"),
+        (partial(LaggingHand, start=0.4, push=-0.06), ["limp"], {"limp": "never"}, "still resists"),
+    ],
+)
+def test_each_step_says_what_is_wrong(tmp_path, hand, steps, faults, says):
+    _, _, _, said = walk(tmp_path, hand, steps, **faults)
+    assert says in said
+
+
+def test_the_lowest_current_is_the_one_that_moves_it(tmp_path):
+    _, found, *_ = walk(tmp_path, partial(Sticky, need=155.0), ["signs", "lowest"])
+    assert found["steps"]["lowest"]["figures"]["mA"] == {"thumb_bend_joint": 160.0, "index_joint1": 160.0}
+
+
+@pytest.mark.parametrize("fault", [{"refuse_s": 3.0}, {"freeze_s": 3.0}, {"silent_s": 3.0}])
+def test_a_fault_in_a_step_lets_go_and_keeps_the_report(tmp_path, fault):
+    status, found, fake, said = walk(tmp_path, **fault)
+    assert status == 1 and found["stopped"] and "let go:" in said and (tmp_path / "report.html").is_file()
+    assert not any(q[3].any() for t, q in fake.trips if t > 3.2)
+
+
+def test_the_command_line_is_checked_before_anything_moves(tmp_path, capsys):
+    for argument, says in (("steps=all", "steps=all"), ("current=2", "current=2"), ("joints=x", "joints=x"),
+                           ("port=fake:x=1", "'x' must be one of"), ("yes=1", "yes=1"), ("z=1", "'z=1'")):  # fmt: skip
+        args = [] if argument.startswith("port") else ["port=fake"]
+        assert main(["deploy", "check", *args, "yes=true", f"out={tmp_path / 'o'}", argument]) == 2, argument
+        err = capsys.readouterr().err
+        assert says in err and err.count("\n") == 1
+    with pytest.raises(UserError, match="must be xhand or sim"):
+        first_hour.make_driver(first_hour.KEYS | {"driver": "x"}, load_hand("xhand"))
+
+
+@pytest.mark.slow
+def test_the_whole_hour_on_the_fake_with_the_simulated_hand(tmp_path):
+    """In real time, the hand in its own process, with the excitation, its audit and its diagnosis."""
+    done = subprocess.run(
+        [sys.executable, "-m", "dexsim", "deploy", "check", "port=fake:press=0", "yes=true", f"out={tmp_path / 'o'}",
+         "joints=index_joint1,index_joint2", "excite_current=1500", "kinds=steps", "limit=60"],
+        capture_output=True, text=True, timeout=800,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    names = {p.name for p in (tmp_path / "o").iterdir()}
+    assert names >= {"report.html", "check.json", "check.mcap", "excite.mcap", "servo.yaml", "audit.txt"}
