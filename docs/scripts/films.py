@@ -1,6 +1,6 @@
 """Makes the films and pictures of the documentation from the included policies, on a CPU.
 
-    python docs/scripts/films.py grasp | rotate | fingertips | three [out=docs/media]
+    python docs/scripts/films.py grasp | rotate | fingertips | touch | gap [out=docs/media]
 
 Each is played with seeds that nobody chose by how they look, on C MuJoCo, and cut to what happens. Needs OpenGL for
 offscreen rendering (EGL or OSMesa).
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import imageio_ffmpeg  # noqa: E402
+from PIL import Image  # noqa: E402
 
 import dexsim  # noqa: E402
 from dexsim.view.video import Clip, render  # noqa: E402
@@ -106,7 +108,8 @@ def commanded(env: Any, t: float) -> None:
 
 
 def grasp(out: Path, seconds: float = 6.4) -> None:
-    """Six objects are caught; the command changes; each is pushed twice."""
+    """Show six objects that are caught, pressed as commanded, and pushed twice each."""
+
     def steer(env: Any, t: float) -> None:
         env.pushes = False
         commanded(env, t)
@@ -116,7 +119,7 @@ def grasp(out: Path, seconds: float = 6.4) -> None:
 
 
 def rotate(out: Path, seconds: float = 4.0) -> None:
-    """A cube with six colours is turned on the palm, in two worlds."""
+    """Show a cube with six colours that is turned on the palm, in two worlds."""
     env, clips = played("rotate", [], 2, seconds)
     for clip in clips:
         clip.colours = True
@@ -124,14 +127,70 @@ def rotate(out: Path, seconds: float = 4.0) -> None:
 
 
 def fingertips(out: Path, seconds: float = 6.0) -> None:
-    """A cube is turned between fingertips, in two worlds."""
+    """Show a cube that is turned between fingertips, in two worlds."""
     env, clips = played("rotate_fingertips", [], 2, seconds)
     for clip in clips:
         clip.colours = True
     film(clips, env, out / "rotate_fingertips.mp4", 8.0, ABOVE, (960, 1080))
 
 
-FILMS = {"grasp": grasp, "rotate": rotate, "fingertips": fingertips}
+def touch(out: Path) -> None:
+    """Draw a fingertip that presses on an object, which is glass here, with the taxels that feel it lit."""
+    env, clips = played("grasp", ["task.objects.train=[sphere]", "task.objects.emphasis={}"], 1, 3.0, commanded)
+    clip = clips[0]
+    body = clip.model.body("object").id
+    clip.model.geom_rgba[clip.model.geom_bodyid == body, 3] = 0.25
+    for name in ("qpos", "force", "command", "push", "taxels"):
+        setattr(clip, name, getattr(clip, name)[-2:])
+    camera = {"lookat": [0.085, 0.0, 0.045], "distance": 0.17, "azimuth": 215.0, "elevation": -35.0}
+    film = out / ".touch.mp4"
+    render([clip], film, 0.05, env.hand.finger_names, 1.2 * env.f_max, (1280, 720), camera)
+    still(film, 0, out / "touch.png")
+    film.unlink()
+
+
+def still(film: Path, frame: int, path: Path) -> None:
+    """Write one frame of a film as a picture."""
+    reader = imageio_ffmpeg.read_frames(str(film))
+    width, height = next(reader)["size"]
+    for k, data in enumerate(reader):
+        if k == frame:
+            Image.fromarray(np.frombuffer(data, np.uint8).reshape(height, width, 3)).save(path, optimize=True)
+            return
+
+
+def gap(out: Path) -> None:
+    """Plot the demo's recorded angle beside the simulation as believed, and beside the one with what was found."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        paths, model, servo, _ = dexsim.demo_recordings(folder / "demo")
+        dexsim.diagnose(paths, model, servo, out=folder / "found", next_recording=False)
+        recording = dexsim.read_recording(paths[-1])
+        made = [dexsim.replay_recording(recording, model, s) for s in (servo, folder / "found" / "servo.yaml")]
+    fig, axes = plt.subplots(2, 2, figsize=(10, 4.2), sharex=True, sharey="row", height_ratios=(2, 1))
+    t, q = recording.states.position.t, recording.states.position.value[:, 0]
+    for column, (run, title) in enumerate(zip(made, ("as believed", "with the delay that was found"), strict=True)):
+        simulated = np.interp(t, run.states.position.t, run.states.position.value[:, 0])
+        axes[0, column].plot(t, q, color="#888888", lw=3, label="recorded")
+        axes[0, column].plot(t, simulated, color="#1f6fb4", lw=1.2, label="simulated")
+        axes[0, column].set_title(title)
+        axes[1, column].plot(t, 1e3 * (simulated - q), color="#c0392b", lw=1)
+        axes[1, column].set_xlabel("s")
+    axes[0, 0].set_ylim(-0.5, 0.7)
+    axes[0, 0].legend(loc="upper center", ncol=2)
+    axes[0, 0].set_ylabel("angle, rad")
+    axes[1, 0].set_ylabel("error, mrad")
+    axes[0, 0].set_xlim(t[0] + 1.0, t[0] + 4.0)
+    fig.tight_layout()
+    fig.savefig(out / "gap.png", dpi=110)
+
+
+FILMS = {"grasp": grasp, "rotate": rotate, "fingertips": fingertips, "touch": touch, "gap": gap}
 
 
 def main(argv: list[str]) -> int:

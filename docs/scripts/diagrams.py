@@ -1,0 +1,103 @@
+"""Draws the block diagrams of the concept pages as SVG: python docs/scripts/diagrams.py [out=docs/media]."""
+
+from __future__ import annotations
+
+import html
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+WIDE, TALL, GAP = 150, 58, 34  # pixels: of a box, and between boxes
+INK, FILL, LINE = "#1c2733", "#e6f1f3", "#35808d"
+STYLE = f"font-family:sans-serif;font-size:13px;fill:{INK}"
+
+Box = tuple[int, int, str]  # column, row, text with lines separated by |
+
+
+def svg(boxes: dict[str, Box], arrows: Sequence[tuple[str, str]], title: str) -> str:
+    """Return a diagram: boxes by name on a grid, arrows (from, to) along rows or columns."""
+    columns, rows = (1 + max(b[k] for b in boxes.values()) for k in (0, 1))
+    width, height = columns * (WIDE + GAP) + GAP, rows * (TALL + GAP) + GAP
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">',
+        f"<title>{html.escape(title)}</title>",
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+        '<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        f'<path d="M0,0 L8,4 L0,8 z" fill="{LINE}"/></marker></defs>',
+    ]
+
+    def corner(name: str) -> tuple[int, int]:
+        column, row, _ = boxes[name]
+        return GAP + column * (WIDE + GAP), GAP + row * (TALL + GAP)
+
+    for a, b in arrows:
+        (x0, y0), (x1, y1) = corner(a), corner(b)
+        if y0 == y1:
+            middle = y0 + TALL // 2
+            path = f"M{x0 + WIDE},{middle} L{x1},{middle}" if x1 > x0 else f"M{x0},{middle} L{x1 + WIDE},{middle}"
+        else:
+            middle = x0 + WIDE // 2
+            path = f"M{middle},{y0 + TALL} L{middle},{y1}" if y1 > y0 else f"M{middle},{y0} L{middle},{y1 + TALL}"
+        out.append(f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.8" marker-end="url(#a)"/>')
+    for name, (_, _, text) in boxes.items():
+        x, y = corner(name)
+        out.append(
+            f'<rect x="{x}" y="{y}" width="{WIDE}" height="{TALL}" rx="7" fill="{FILL}" stroke="{LINE}"'
+            ' stroke-width="1.5"/>'
+        )
+        lines = text.split("|")
+        for k, line in enumerate(lines):
+            at = y + TALL // 2 + 5 + 15 * k - 15 * (len(lines) - 1) // 2
+            weight = ";font-weight:bold" if k == 0 else ";font-size:11px"
+            out.append(
+                f'<text x="{x + WIDE // 2}" y="{at}" text-anchor="middle" style="{STYLE}{weight}">'
+                f"{html.escape(line)}</text>"
+            )
+    return "\n".join([*out, "</svg>"]) + "\n"
+
+
+def servo() -> str:
+    """Return the block diagram of the servo."""
+    boxes = {
+        "target": (0, 0, "target|joint angle"),
+        "delay": (1, 0, "delay|delay"),
+        "loop": (2, 0, "control loop|kp, kd, deadband"),
+        "motor": (3, 0, "motor|torque_limit,|no_load_speed, sag"),
+        "lag": (4, 0, "lag|lag"),
+        "gear": (4, 1, "gear|efficiency, ripple,|friction"),
+        "joint": (3, 1, "joint|backlash, softness,|MuJoCo"),
+        "encoder": (2, 1, "encoder|scale, offset"),
+    }
+    order = ("target", "delay", "loop", "motor", "lag", "gear", "joint", "encoder", "loop")
+    arrows = list(zip(order, order[1:], strict=False))
+    return svg(boxes, arrows, "The servo")
+
+
+def task() -> str:
+    """Return the data flow of a control step."""
+    boxes = {
+        "observe": (0, 0, "observations|joints, touch, command"),
+        "policy": (1, 0, "policy|PPO, 12 actions"),
+        "targets": (2, 0, "joint targets"),
+        "servo": (3, 0, "servo|params[world, joint,|column]"),
+        "physics": (4, 0, "physics|MuJoCo, K steps"),
+        "touch": (4, 1, "touch|600 taxels"),
+        "rewards": (3, 1, "rewards, ends|a named term each"),
+        "reset": (0, 1, "reset|new object, drives"),
+    }
+    order = ("observe", "policy", "targets", "servo", "physics", "touch", "rewards", "reset", "observe")
+    arrows = list(zip(order, order[1:], strict=False))
+    return svg(boxes, arrows, "Data flow of a control step")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Write the diagrams; return the exit status."""
+    out = Path(argv[0].removeprefix("out=")) if argv else ROOT / "docs" / "media"
+    for name, text in (("servo", servo()), ("task", task())):
+        (out / f"{name}.svg").write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
