@@ -124,12 +124,6 @@ def _write_note(folder: Path, known: dict[str, str], pending: dict[str, Any] | N
         part.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Writes a text file beside and renames it."""
-    with files.beside(path) as part:
-        part.write_text(text, encoding="utf-8")
-
-
 def _refuse(folder: Path, path: Path, setting: str) -> None:
     if not (path.exists() or path.is_symlink()):
         return

@@ -190,46 +190,6 @@ def tilted(size: Any, q: Any):
     # the loop's own torque holds against it: what gravity and friction are at the true pose is little
     torque=-2.0 * 0.12 * np.sin(2.0), left=1.0, high=0.3, more="misreads = True",
 )  # fmt: skip
-BELT = Added(  # an encoder with a memory
-    "slack_belt", "has an encoder on a slack belt", "belt", "rad",
-    '0.05, "play of its belt", feature="belt", encoder=True, remembers=("behind",)',
-    '''BELT, BEHIND = INDEX["belt"], MEMORY["behind"]
-
-
-@wp.func
-def on_belt(play: Any, before: Any, q: Any):
-    """Position [rad] of a disk on a belt with a play [rad], from `before`, with the joint at q [rad]."""
-    half = type(q)(0.5) * play
-    return wp.clamp(before, q - half, q + half)
-
-
-''',
-    "@cache\ndef encoder_error(",
-    (
-        ("        return wp.vector(first, error, slope)", '''        if wp.static("belt" in features):
-            if not fresh:
-                error += on_belt(of[BELT], memory[BEHIND], q) - q
-'''),
-        ("        return memory\n\n    return remember", '''        if wp.static("belt" in features):
-            before = q
-            if not fresh:
-                before = memory[BEHIND]
-            memory[BEHIND] = on_belt(of[BELT], before, q)
-'''),
-    ),
-    (
-        ("    return shown, slope\n", '''    if "belt" in features:
-        half = 0.5 * p["belt"]
-        disk = xp.minimum(xp.maximum(step.memory["behind"], q - half), q + half)
-        shown = shown + xp.where(xp.asarray(step.fresh), q, disk) - q
-'''),
-        ("    return step\n", '''    if "belt" in features:
-        before = np.where(step.fresh, q, step.memory["behind"])
-        step.memory["behind"] = np.clip(before, q - 0.5 * p["belt"], q + 0.5 * p["belt"])
-'''),
-    ),
-    "signals", "((0.03,), (0.1,))", ANYWHERE, 0.12, left=1.1, high=0.5, more="misreads = True",
-)  # fmt: skip
 LOOP = Added(  # of its error
     "soft_dead_zone", "hardly acts on small errors", "dead_zone", "rad", '0.05, "of errors", feature="dead_zone"',
     '''DEAD_ZONE = INDEX["dead_zone"]
@@ -339,34 +299,6 @@ def weary(share: Any, worked: Any):
     "drive", "((0.3,), (1.0,), (3.0,))", CHANGES, 4.0,
     torque=2.0 * 0.1 * (1.0 / 5.0 - 1.0), high=10.0, left=0.8,
 )  # fmt: skip
-LEAKY = Added(  # what the power stage gives of what is asked, with a memory
-    "leaky_amplifier", "gives less of what is asked for long", "leak", "1",
-    '0.3, "share lost of what is asked for long", feature="leak", remembers=("long",)',
-    '''LEAK, LONG = INDEX["leak"], MEMORY["long"]
-
-
-@wp.func
-def leaky(share: Any, long: Any):
-    """Torque [N.m] lost by an amplifier that was asked for `long` [N.m] in the mean of the last 0.05 s."""
-    return share * long
-
-
-''',
-    "@cache\ndef amplifier(",
-    (("        return wp.vector(now, then, share), memory", '''        if wp.static("leak" in features):
-            if fresh:
-                memory[LONG] = asked
-            memory[LONG] = memory[LONG] + lag_share(type(dt)(0.05), dt) * (asked - memory[LONG])
-            now -= leaky(of[LEAK], memory[LONG])
-            then -= leaky(of[LEAK], memory[LONG])
-'''),),
-    (("    return now, end, share\n", '''    if "leak" in features:
-        before = np.where(step.fresh, asked, step.memory["long"])
-        step.memory["long"] = before + step.dt / (0.05 + step.dt) * (asked - before)
-        now, end = now - p["leak"] * step.memory["long"], end - p["leak"] * step.memory["long"]
-'''),),
-    "drive", "((0.1,), (0.3,), (0.6,))", CHANGES, 0.4, torque=-0.4,
-)  # fmt: skip
 TENDON = Added(  # by another joint
     "soft_tendon", "is dragged by a tendon that gives", "tendon", "1/rad", '0.3, "drag", feature="rare"',
     '''TENDON = INDEX["tendon"]
@@ -409,7 +341,7 @@ def weak_cell(size: Any, others: Any):
 '''),),
     "drive", "((0.1,), (0.3,))", ANYWHERE, 0.3, alone=False,
 )  # fmt: skip
-ALL = (TORQUE, FRICTION, LOPSIDED, ENCODER, BELT, LOOP, SMOOTHED, DELAY, WEARY, LEAKY, TENDON, CELL)
+ALL = (TORQUE, FRICTION, LOPSIDED, ENCODER, LOOP, SMOOTHED, DELAY, WEARY, TENDON, CELL)
 
 TRIED = """
 import json, sys
@@ -465,30 +397,6 @@ print(json.dumps({"hidden": hidden, "left": left, "drawn": [float(drawn.min()), 
 """
 
 
-READ = """
-import json
-import numpy as np, torch, warp as wp
-from test_servo import StubEngine
-from dexsim.actuator import Servo
-from dexsim.actuator.table import ServoTable
-from dexsim.recording.tap import copy_kernel, tap
-
-engine = StubEngine(1, 3, wp.float64)
-servo = Servo(engine, ["j0", "j1", "j2"], ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "belt": 0.1}}}))
-engine.t.qpos[:, 7:10], engine.t.qvel[:, 6:9] = 0.3, 1.0
-servo.state[:, :, servo.slots["behind"]] = torch.tensor([0.5, 0.3, 0.1], dtype=servo.state.dtype)
-first = servo.position()[0].tolist()  # nothing is remembered yet
-servo.state[:, :, servo.slots["fresh"]] = 0.0
-rows = wp.zeros((1, 1, 10), dtype=wp.float64)
-index = lambda *x: wp.array(x, dtype=int)
-copy, kind = copy_kernel(wp.float64, servo.features)
-wp.launch(copy, dim=(1, 7), inputs=[index(0), tap(kind, engine, servo, [7, 8, 9], [6, 7, 8], 0), index(0), rows])
-shown = servo.position()
-print(json.dumps([shown[0].tolist(), servo.velocity()[0].tolist(), rows.numpy()[0, 0, 1:7].tolist(),
-                  servo.unmeasured(shown)[0].tolist(), first]))
-"""
-
-
 @pytest.fixture(scope="module")
 def grown(tmp_path_factory) -> Path:
     """Return a folder with a copy of the package that has all of them."""
@@ -530,17 +438,6 @@ def test_every_kind_of_law_is_added_in_the_places_that_the_docs_name():
 def test_kernel_and_reference_agree_on_what_was_added(grown):
     compared = told(grown, "-m", "pytest", "-q", "-p", "no:xdist", "test_servo.py", "-k", "agrees and all_features")
     assert "4 passed" in compared  # both drives, in either precision
-
-
-@pytest.mark.slow
-def test_what_an_encoder_remembers_is_read_by_all_who_read_it(grown):
-    """The servo's position and speed, and a recorded row, of a joint whose encoder's belt is slack; its inverse."""
-    (grown / "read.py").write_text(READ, encoding="utf-8")
-    answer = told(grown, "read.py").strip().splitlines()[-1]
-    shown, speed, row, there, first = json.loads(answer)
-    assert shown == pytest.approx([0.3 + 0.05, 0.3, 0.3 - 0.05]) and first == pytest.approx([0.3] * 3)
-    assert row == pytest.approx([*shown, *speed]) and speed == pytest.approx([1.0] * 3)
-    assert there == pytest.approx([0.3] * 3)
 
 
 @pytest.mark.slow

@@ -207,6 +207,20 @@ def test_generated_tables_that_pages_ask_for_exist():
     assert sorted(asked) == sorted(REFERENCE.PAGES)
 
 
+def test_list_of_pages_for_assistants_is_that_of_the_menu():
+    text = (DOCS / "llms.txt").read_text(encoding="utf-8")
+    assert text == REFERENCE.llms(), "python docs/scripts/reference.py llms > docs/llms.txt"
+    assert [p for p in re.findall(r"\]\(([^)]+)\)", text) if not (DOCS / p).is_file()] == []
+
+
+def test_summary_names_everything_that_is_public():
+    import dexsim
+
+    text = REFERENCE.summary()
+    assert [n for n in dexsim.__all__ if f"`dexsim.{n}" not in text] == []
+    assert [c for c in COMMANDS if f"- `dexsim {c}`: " not in text] == []
+
+
 def test_pages_that_the_code_names_exist():
     named = {
         (p, m)

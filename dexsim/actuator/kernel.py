@@ -51,7 +51,6 @@ import warp as wp
 from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY
 from dexsim.actuator.laws import (
     LEAST_ROTOR,
-    amplifier,
     arrived,
     command_delay,
     difference,
@@ -59,7 +58,6 @@ from dexsim.actuator.laws import (
     dry_friction,
     encoder_error,
     encoder_line,
-    encoder_memory,
     feed_forward,
     friction_acts,
     heard_speed,
@@ -205,8 +203,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     # of the state, those that some law of this kernel keeps
     remembered = [MEMORY[name] for c in COLUMNS if c.feature in features for name in c.remembers]
     Drives, vec3, Memory = drives(real), wp.types.vector(length=3, dtype=real), wp.types.vector(len(MEMORY), real)
-    encoder, remember, late = encoder_error(features), encoder_memory(features), command_delay(features)
-    hears, lost, motor, given = heard_speed(features), lost_error(features), warm_motor(features), amplifier(features)
+    encoder, late = encoder_error(features), command_delay(features)
+    hears, lost, motor = heard_speed(features), lost_error(features), warm_motor(features)
     drags, leaves = dragged_target(features), supply_left(features)
     parasitic, dry, acts = parasitic_torque(features), dry_friction(features), friction_acts(features)
 
@@ -286,13 +284,12 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 turning = r.v
         s = Sensed()
         s.scale = d.params[w, j, SCALE]
-        kept = remember(d.params[w, j], turned, memory, fresh, dt)
-        error = encoder(d.params[w, j], turned, kept, False)
+        error = encoder(d.params[w, j], turned, memory, False)
         s.q = encoder_line(turned, s.scale, d.params[w, j, OFFSET])
         s.q += error[0] + error[1]
         s.scale += error[2]
         s.rate = s.scale * turning
-        heard, kept = hears(d.params[w, j], turning, kept, fresh, dt)
+        heard, kept = hears(d.params[w, j], turning, memory, fresh, dt)
         s.v = s.scale * heard[0]
         s.v_end = s.scale * heard[1]
         s.share = heard[2]
@@ -445,11 +442,6 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             u, then = control(dt, queue, x0, fresh, s, memory, limits[0], limits[1], d, w, j)
             kept = then
             t = drive_torque(dt, u, r.v, x, limits[0], limits[1], steep, inertia, m)
-        gives, kept = given(d.params[w, j], t.now, t.end, kept, fresh, dt)
-        t.now = gives[0]
-        t.end = gives[1]
-        t.slope = gives[2] * t.slope
-        t.on_drive = gives[2] * t.on_drive
         if d.state[w, j, ENABLED] == real(0.0):
             t.now = real(0.0)
             t.end = real(0.0)

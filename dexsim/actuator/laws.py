@@ -4,13 +4,12 @@ same laws in NumPy, written apart, as their check.
 
 Where several laws make up one quantity they are put together here, for both kernels, in the order of the signal:
 `encoder_error`, `command_delay`, `dragged_target`, `heard_speed`, `lost_error`, `warm_motor`, `supply_left`,
-`amplifier`, `dry_friction`, `friction_acts`, `parasitic_torque`. `of` is there a drive's row of the table, in the order
+`dry_friction`, `friction_acts`, `parasitic_torque`. `of` is there a drive's row of the table, in the order
 of `columns.py`.
 
-Laws with memory: all of them are given what their drive remembers and hand it on; what an encoder remembers is written
-by `encoder_memory` and read by `encoder_error`. memory: a vector, `columns.MEMORY` has the place of each number; fresh:
-nothing is remembered yet (the first step after a reset), a law begins from rest and sets what it will remember; dt: of
-the step [s]. Each number is written by one law, once a step."""
+Laws with memory: all of them are given what their drive remembers and hand it on. memory: a vector, `columns.MEMORY`
+has the place of each number; fresh: nothing is remembered yet (the first step after a reset), a law begins from rest
+and sets what it will remember; dt: of the step [s]. Each number is written by one law, once a step."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
@@ -72,8 +71,8 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
 
     A further such law is a function of this file and a term of `error` and `slope` here, and in
     `reference.measured_position`; its columns are marked `encoder`. Training, search, recordings and whoever asks what
-    a position is from what is shown take the encoder from these two, at any time: one with a memory reads it here and
-    writes it in `encoder_memory`."""
+    a position is from what is shown take the encoder from these two, at any time: none of our encoders
+    remembers."""
 
     @wp.func
     def error(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool):
@@ -91,22 +90,6 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
         return wp.vector(first, error, slope)
 
     return error
-
-
-@cache
-def encoder_memory(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function that brings what an encoder remembers to a step's begin, before it is read there:
-    once a step, for a kernel with these of `columns.FEATURES`. None of our encoders remembers.
-
-    A further encoder's error with a memory (teeth with a play, an output that settles) has its law for that here, and
-    in `reference.encoder_memory`; what it shows by it, in `encoder_error`."""
-
-    @wp.func
-    def remember(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool, dt: Any):
-        """memory at position q [rad] of what the encoder turns with."""
-        return memory
-
-    return remember
 
 
 # -- delay and lag -----------------------------------------------------------------------------------------------------
@@ -255,28 +238,6 @@ def warm_motor(features: frozenset[str] = frozenset()) -> Any:
         return wp.vector(tau0, no_load, efficiency, rubs), memory
 
     return motor
-
-
-@cache
-def amplifier(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of what the power stage gives of the torque that is asked of it, before the current's
-    lag (column `lag`), for a kernel with these of `columns.FEATURES`. Ours gives all of it.
-
-    A further such law (a dead band of the current, a torque that can only change so fast, steps of a converter) is a
-    function of this file and one more step from what is asked to what is given here, and in `reference.amplifier`:
-    training, search and what a diagnosis hands on take it from these two."""
-
-    @wp.func
-    def given(of: wp.array(dtype=Any), asked: Any, end: Any, memory: Any, fresh: bool, dt: Any):
-        """Return ((now, end, share), memory): torque [N.m] given where `asked` is asked now, and at the end of a
-        step of dt [s], where `end` would be at unchanged speed; share of a change of what is asked that passes in
-        the step."""
-        now = asked
-        then = end
-        share = type(end)(1.0)
-        return wp.vector(now, then, share), memory
-
-    return given
 
 
 @wp.func

@@ -19,8 +19,7 @@ Numbers = float | np.ndarray
 
 @dataclass
 class Step:
-    """What a law with memory is given beside what it acts on; it writes what it will remember (but for
-    `measured_position`, which reads what `encoder_memory` has written).
+    """What a law with memory is given beside what it acts on; it writes what it will remember.
 
     dt: of the step [s]; fresh [...]: nothing is remembered yet; memory: numbers [...] by their names in
     `columns.MEMORY`."""
@@ -73,20 +72,11 @@ def measured_position(
     return shown, slope
 
 
-def encoder_memory(p: Mapping[str, Numbers], q: Numbers, features: Collection[str], step: Step) -> Step:
-    """Return the step with what an encoder remembers brought to where it is at q [...] rad of what it turns with:
-    all of `laws.encoder_memory`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count."""
-    return step
-
-
 def shown_position(
     p: Mapping[str, Numbers], q: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers]:
     """Return `measured_position` of an encoder that has come to q [...] rad in this step: as a law for `over_time`."""
-    step = encoder_memory(p, q, features, step or Step())
-    at: tuple[Numbers, Numbers] = measured_position(p, q, features, np, replace(step, fresh=False))
+    at: tuple[Numbers, Numbers] = measured_position(p, q, features, np, replace(step or Step(), fresh=False))
     return at
 
 
@@ -235,22 +225,6 @@ def warm_motor(
         else:
             efficiency = efficiency * torque_factor
     return tau0, no_load, efficiency, rubs
-
-
-def amplifier(
-    p: Mapping[str, Numbers],
-    asked: Numbers,
-    end: Numbers,
-    features: Collection[str] = FEATURES,
-    step: Step | None = None,
-) -> tuple[Numbers, Numbers, Numbers]:
-    """Return (torque [...] N.m that the power stage gives where `asked` is asked of it, at the end of a step where
-    `end` is asked then, share of a change that passes): of all steps of `laws.amplifier`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
-    step = step or Step()
-    now, share = asked, np.ones(())
-    return now, end, share
 
 
 def torque_along(
@@ -506,10 +480,8 @@ def servo(
             on_drive = np.where(np.abs(pd) > limit, np.maximum(slope * size / np.abs(pd), line), 0.0)
             damping = np.where(np.abs(pd) > limit, on_drive, slope)
 
-    gives_now, gives_then, passes = amplifier(p, motor_now, motor, features, step)
-    given = gives_now, gives_then, passes * damping, passes * on_drive
     on = np.asarray(enabled) != 0.0
-    motor_now, motor, damping, on_drive = (np.where(on, x, 0.0) for x in given)
+    motor_now, motor, damping, on_drive = (np.where(on, x, 0.0) for x in (motor_now, motor, damping, on_drive))
 
     blend = dt / (p["lag"] + dt)
     motor_now = last + blend * (motor_now - last)

@@ -359,7 +359,6 @@ def _addresses(
         if name not in known:
             hint = did_you_mean(name, known)
             raise UserError(f"servo: joint '{name}' is not in the model.{hint} Its joints: {', '.join(known)}")
-        joint = mjm.joint(name)
         joint = mjm.joint(name).id
         if int(mjm.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
             raise UserError(f"servo: joint '{name}' is neither a hinge nor a slide; a servo drives those only.")

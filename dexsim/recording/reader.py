@@ -718,13 +718,6 @@ class _TableReading(_Reading):
             out = [((len(x),), x) for x in rows]
         return self._in_order(ours, t, out)
 
-    def _tactile_shape(self, dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
-        """[fingers, taxels, 3]: as the message says, else the hand's."""
-        if len(dims) == 3 and int(np.prod(dims)) == len(values):
-            return values.reshape(dims)
-        fingers = len(self.hand.fingers)
-        return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
-
     def _their_joints(
         self, stated: dict[str, str], commands: Sequence, states: Sequence, joints: Sequence[str] | None
     ) -> list[str]:

@@ -54,7 +54,7 @@ def played(
             rows["command"].append((env.command * env.f_max).cpu().numpy().copy())
             rows["push"].append(env.engine.t.xfrc_applied[:, env.objects.body, :3].cpu().numpy().copy())
     arrays = {k: np.stack(v, 1) for k, v in rows.items() if v}
-    names = [env.scene.variants[int(v)].shape.name for v in env.objects.variant]
+    names = [env.objects.scene.variants[int(v)].shape.name for v in env.objects.variant]
     clips = [
         Clip(
             models[w], arrays["qpos"][w],
@@ -142,7 +142,7 @@ def touch(out: Path) -> None:
     clip.model.geom_rgba[clip.model.geom_bodyid == body, 3] = 0.25
     for name in ("qpos", "force", "command", "push", "taxels"):
         setattr(clip, name, getattr(clip, name)[-2:])
-    camera = {"lookat": [0.085, 0.0, 0.045], "distance": 0.17, "azimuth": 215.0, "elevation": -35.0}
+    camera = {"lookat": [0.065, 0.0, 0.06], "distance": 0.23, "azimuth": 200.0, "elevation": -38.0}
     film = out / ".touch.mp4"
     render([clip], film, 0.05, env.hand.finger_names, 1.2 * env.f_max, (1280, 720), camera)
     still(film, 0, out / "touch.png")

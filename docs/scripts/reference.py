@@ -1,6 +1,6 @@
 """Reference pages written from the code and the config files, so that they cannot go stale.
 
-    python docs/scripts/reference.py settings | columns | effects | rules | audit | metadata | commands
+    python docs/scripts/reference.py settings | columns | effects | rules | audit | metadata | commands | summary | llms
 
 prints one as Markdown; `hooks.py` puts them into the site where a page says `<!-- GENERATED: name -->`.
 """
@@ -8,6 +8,7 @@ prints one as Markdown; `hooks.py` puts them into the site where a page says `<!
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import re
 import sys
@@ -209,7 +210,59 @@ def commands() -> str:
     return "\n".join(out)
 
 
+def _first_sentence(text: str) -> str:
+    """Return the first sentence of a docstring, on one line."""
+    return re.split(r"(?<=\.)\s", " ".join(text.split("\n\n")[0].split()), maxsplit=1)[0]
+
+
+def summary() -> str:
+    """Return the public API and the commands on one page: signatures, and one sentence each."""
+    import dexsim
+    from dexsim.cli.main import COMMANDS
+
+    out = ["## Python", ""]
+    for name in dexsim.__all__:
+        thing = getattr(dexsim, name)
+        shape = ""
+        if inspect.isfunction(thing):
+            shape = re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(inspect.signature(thing))).replace("dexsim.", "")
+        said = "the version" if isinstance(thing, str) else _first_sentence(inspect.getdoc(thing) or "")
+        out.append(f"- `dexsim.{name}{shape}`: {said}")
+    out += ["", "## Commands", ""]
+    out += [f"- `dexsim {name}`: {command.about.rstrip('.')}." for name, command in COMMANDS.items()]
+    return "\n".join(out) + "\n"
+
+
+def llms() -> str:
+    """Return llms.txt: what dexsim is, and every page of the documentation with its title, from the site's menu."""
+
+    def pages(node: object, above: str = "") -> Iterable[tuple[str, str]]:
+        for item in node if isinstance(node, list) else []:
+            for title, below in item.items() if isinstance(item, dict) else ((above, item),):
+                yield from [(f"{title}", below)] if isinstance(below, str) else pages(below, title)
+
+    class Loader(yaml.SafeLoader):
+        """Reads mkdocs.yml, whose Python tags mean nothing here."""
+
+    menu = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)["nav"]
+    out = [
+        "# dexsim",
+        "",
+        "> Train dexterous-hand policies in simulation (MuJoCo-Warp on a GPU, C MuJoCo on a CPU), feel what the real"
+        " hand feels, and find what the simulator left out of recordings of a real machine.",
+        "",
+        "Every setting is key=value on the command line; the commands are dexsim train, play, diagnose, excite, audit,"
+        " export, deploy, calibrate, import-hand. The same from Python: import dexsim.",
+        "",
+        "## Documentation",
+        "",
+        *(f"- [{title}]({path})" for title, path in pages(menu)),
+    ]
+    return "\n".join(out) + "\n"
+
+
 PAGES = {
+    "summary": summary,
     "settings": settings,
     "columns": columns,
     "effects": effects,
@@ -222,10 +275,11 @@ PAGES = {
 
 def main(argv: Sequence[str]) -> int:
     """Print one page; returns the exit status."""
-    if len(argv) != 1 or argv[0] not in PAGES:
+    made = {**PAGES, "llms": llms}
+    if len(argv) != 1 or argv[0] not in made:
         print(__doc__)
         return 2
-    print(PAGES[argv[0]]())
+    print(made[argv[0]](), end="")
     return 0
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
 from dexsim.actuator.reference import (
-    amplifier,
     command_delay,
     dragged_target,
     dry_friction,
@@ -343,7 +342,6 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     for _ in range(2):
         tau0, no_load, efficiency, rubs = now = over_time(able, columns, t, motor)
         motor = torque_along(asked, v, tau0, no_load, plant.voltage, supply)
-        motor, _, _ = over_time(amplifier, columns, t, motor, motor)
         if p("lag") > 0:
             motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
         if not any(map(np.ndim, now)):  # else what it can give follows from what it gave, known from now on

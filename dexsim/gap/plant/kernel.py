@@ -20,7 +20,6 @@ from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
     LEAST_ROTOR,
-    amplifier,
     arrived,
     command_delay,
     difference,
@@ -29,7 +28,6 @@ from dexsim.actuator.laws import (
     duty_torque,
     encoder_error,
     encoder_line,
-    encoder_memory,
     feed_forward,
     friction_acts,
     gear_load_friction,
@@ -58,14 +56,12 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
 encoder = encoder_error(frozenset(SERVO_FEATURES))
-remember = encoder_memory(frozenset(SERVO_FEATURES))
 late = command_delay(frozenset(SERVO_FEATURES))
 hears = heard_speed(frozenset(SERVO_FEATURES), skips=True)
 lost = lost_error(frozenset(SERVO_FEATURES))
 drags = dragged_target(frozenset(SERVO_FEATURES))
 motor = warm_motor(frozenset(SERVO_FEATURES))
 leaves = supply_left(frozenset(SERVO_FEATURES))
-given = amplifier(frozenset(SERVO_FEATURES))
 acts = friction_acts(frozenset(SERVO_FEATURES))
 dry = dry_friction(frozenset(SERVO_FEATURES), gone=25.0)  # of exp(-25) a search sees nothing, and exp() is dear
 ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
@@ -701,7 +697,6 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         if p.loop_motor:
             v_l = v_drive
     fresh = x.fresh != zero
-    x.memory = remember(c.params[h], q_l, x.memory, fresh, dt)
     seen = shown(c.params[h], q_l, x, p)
     shows = seen[1]
     heard, kept = hears(c.params[h], v_l, x.memory, fresh, dt)
@@ -774,11 +769,6 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         x.older = p.kp * p.age * shows * v_l
         if p.voltage:
             x.older = n.tau0 * n.supply * x.older
-    gives, kept = given(c.params[h], t.now, t.end, kept, fresh, dt)
-    t.now = gives[0]
-    t.end = gives[1]
-    t.on_loop = gives[2] * t.on_loop
-    t.on_drive = gives[2] * t.on_drive
     t = opened(t, v_drive, p, n)
     if not n.enabled:
         x.integral = zero

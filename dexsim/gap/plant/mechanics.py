@@ -11,7 +11,6 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.lines import on_lines
 
@@ -40,26 +39,6 @@ class JointConstants:
     own_mass: float = 0.0  # of the joint's own link, kg
     centre: np.ndarray | None = None  # [3] m: that link's centre of mass in the link's frame
     places: np.ndarray | None = None  # [2, 3] in the link's frame: out from the hinge, and along the way it turns there
-
-
-def load_model(path: str) -> mujoco.MjModel:
-    """The compiled model of an MJCF or URDF file; UserError with MuJoCo's reason where it does not compile."""
-    from pathlib import Path
-
-    if not Path(path).is_file():
-        raise UserError(f"model '{path}' does not exist; model=PATH must name an MJCF or URDF file.")
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"model '{path}' does not compile: {reason}. Fix the file; `simulate` shows it.") from None
-
-
-def movable(model: mujoco.MjModel) -> list[str]:
-    """Names of the model's hinge and slide joints."""
-    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    names = [(model.joint(i).name, int(model.jnt_type[i])) for i in range(model.njnt)]
-    return [name for name, kind in names if name and kind in kinds]
 
 
 def leaf_of(model: mujoco.MjModel, body: int) -> int:
