@@ -133,7 +133,7 @@ def replayed(
 
 
 def best_of(m, runs, case, trials):
-    """What is written of the only joint, of fitted hypotheses by name; run 1 is held out."""
+    """Return what is written of the only joint, of fitted hypotheses by name; run 1 is held out."""
     windows = case.plant.windows(None, [1])
     states = lambda r: States(Series(r.t, r.q), None, None)  # noqa: E731
     recordings = {r.name: SimpleNamespace(joints=r.joints, states=states(r)) for r in runs}

@@ -11,6 +11,7 @@ from browser import CHROMIUM, Page
 from benchmarks import press_rig
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.read import gathered
 from dexsim.gap.report.files import grouped
 
 PROBE = """(() => {
@@ -165,3 +166,16 @@ def test_what_recordings_say_is_text_and_no_markup():
 
     text = page(Diagnosis(empty(), "a <b>sentence</b> & more", ["<script>alert(1)</script>"]))
     assert "<script" not in text and "&lt;script&gt;" in text and "a &lt;b&gt;sentence&lt;/b&gt; &amp; more" in text
+
+
+def test_one_fault_of_many_signals_is_one_card():
+    def one(j, kind):
+        where = {"joints": [j], "taxels": [], "topics": []}
+        return {"effect": "bad_channel", "confidence": 0.9, "when": [], "regime": f"{kind}: {j} is", "where": where}
+
+    lag = {"effect": "lag", "confidence": 0.9, "regime": "", "when": [], "where": {"joints": ["a"]}}
+    given = [one("a", "sign"), lag, one("b", "sign"), one("a", "stale"), *(one(j, "sign") for j in "cde")]
+    out = gathered(given)
+    assert [f["effect"] for f in out] == ["bad_channel", "lag", "bad_channel"]
+    assert out[0]["regime"] == "sign: a is (the same in 5 signals, of a, b, c and 2 more)"
+    assert out[2]["regime"] == "stale: a is" and given[0]["regime"] == "sign: a is"

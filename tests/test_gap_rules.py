@@ -566,6 +566,15 @@ def test_moments_that_nothing_follows_do_not_speak():
     assert silent(4, 9.0, 0.0) and not silent(5, 9.0, 0.0)  # not a few moments
 
 
+def test_a_size_that_fits_without_a_condition_do_not_repeat_is_a_hint():
+    p = param("coefficient", "viscous_friction", "set", 0.0, 9.0)
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.0}))
+    said = lambda *sizes: confidence.not_repeated([p], np.array(sizes)[:, None], case)  # noqa: E731
+    assert said(1.0, 0.21) == "" != said(1.0, 0.19) and said(1.0) == ""
+    both = param("mass", "payload", "add", -9.0, 9.0)
+    assert "do not agree on its mass: -0.5 to 1" in confidence.not_repeated([both], np.array([[1.0], [-0.5]]), case)
+
+
 def test_intervals_grow_with_what_is_left():
     p = param("time_constant", "lag", "set", -1e3, 1e3)
     fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0, np.zeros(1))

@@ -49,7 +49,7 @@ class Piece:
 
 
 def piece(m: Mechanism, r: Recording, joint: str, start: float = 0.0, end: float = np.inf) -> Piece:
-    """One joint of a recording between two times [s]."""
+    """Return one joint of a recording between two times [s]."""
     m = of_recording(m, r)
     model = m.spec.compile()
     data = mujoco.MjData(model)
@@ -105,8 +105,8 @@ def piece(m: Mechanism, r: Recording, joint: str, start: float = 0.0, end: float
 
 
 def simulate(x: np.ndarray, pieces: Sequence[Piece], voltage: bool, friction: float) -> list[np.ndarray]:
-    """Positions [H, S] of each piece run free, for figures x [H, 9] as `NAMES` (factors on what is believed; what is
-    added). friction: the model's own in the joint [N.m]."""
+    """Return positions [H, S] of each piece run free, for figures x [H, 9] as `NAMES` (factors on what is believed;
+    what is added). friction: the model's own in the joint [N.m]."""
     H, P = len(x), len(pieces)
     n = max(len(p.grid) for p in pieces)
     pad = lambda y: np.pad(y, (0, n - len(y)), mode="edge")  # noqa: E731
@@ -129,17 +129,17 @@ def simulate(x: np.ndarray, pieces: Sequence[Piece], voltage: bool, friction: fl
     tau, out = np.zeros((H, P)), np.empty((n, H, P))
     for i in range(n):
         out[i] = q
-        asked = kp * (target[:, :, i] - q) - kd * v
+        wanted = kp * (target[:, :, i] - q) - kd * v
         if voltage:
-            new = limit * (supply * np.clip(asked, -1.0, 1.0) - v / no_load)
+            new = limit * (supply * np.clip(wanted, -1.0, 1.0) - v / no_load)
         else:
-            room = np.where(np.isfinite(no_load) & (no_load < 1e8), np.clip(1 - np.sign(asked) * v / no_load, 0, 1), 1)
-            new = np.clip(asked, -limit * room, limit * room)
+            room = np.where(np.isfinite(no_load) & (no_load < 1e8), np.clip(1 - np.sign(wanted) * v / no_load, 0, 1), 1)
+            new = np.clip(wanted, -limit * room, limit * room)
         tau = new + keep * (tau - new)
         inertia = np.maximum(M[:, i] + g("inertia"), 1e-9)
         pull = tau * on[:, i] - bias[:, i] - slope[:, i] * (q - at[:, i]) + g("offset")
         # what damps is stiff: implicitly
-        damp = viscous + np.where(np.abs(asked) < (1.0 if voltage else limit), (limit if voltage else 1.0) * kd, 0.0)
+        damp = viscous + np.where(np.abs(wanted) < (1.0 if voltage else limit), (limit if voltage else 1.0) * kd, 0.0)
         damp = damp * (keep < 0.5) + viscous * (keep >= 0.5)
         free = v + STEP * (pull - viscous * v) / (inertia + STEP * damp)
         stop = STEP * coulomb / (inertia + STEP * damp)
@@ -153,9 +153,9 @@ def simulate(x: np.ndarray, pieces: Sequence[Piece], voltage: bool, friction: fl
 def fit(
     m: Mechanism, joint: str, train: Sequence[tuple[Recording, float, float]], test: Sequence, seed: int = 0
 ) -> dict:
-    """Figures of one joint fitted to parts (recording, start s, end s) and what they leave of others, rms [rad or m],
+    """Return figures of one joint fitted to parts (recording, start s, end s) and the error of others, rms [rad or m],
     beside what is believed (without friction that nobody knows)."""
-    pieces, kept = ([piece(m, *([r, joint, a, b])) for r, a, b in parts] for parts in (train, test))
+    pieces, judging = ([piece(m, *([r, joint, a, b])) for r, a, b in parts] for parts in (train, test))
     table: ServoTable = m.table
     voltage, model = table.drive == "voltage", m.spec.compile()
     friction = float(model.dof_frictionloss[model.joint(joint).dofadr[0]])
@@ -178,7 +178,7 @@ def fit(
     scale = np.array([1.0, high_kd / 10 + 1e-9, 1.0, each, each / speed, 0.01, 0.01, inertia, 0.1 * torque])
 
     def missed(x: np.ndarray, given: Sequence[Piece]) -> np.ndarray:
-        """[H, m]"""
+        """Return residuals [H, m]."""
         return np.concatenate(
             [p.q - q for p, q in zip(given, simulate(np.atleast_2d(x), given, voltage, friction), strict=True)], 1
         )
@@ -202,7 +202,7 @@ def fit(
         )  # fmt: skip
         best = found if best is None or found.cost < best.cost else best
     assert best is not None  # of several starts
-    rms = lambda x: float(np.sqrt(np.mean(missed(x, kept) ** 2)))  # noqa: E731
+    rms = lambda x: float(np.sqrt(np.mean(missed(x, judging) ** 2)))  # noqa: E731
     return {
         "believed": rms(believed),
         "error": rms(best.x),

@@ -39,7 +39,7 @@ AGREE, WORSE = 0.10, 1.05  # the two criteria
 
 @dataclass
 class Part:
-    """What one process does. judged: joints that are judged (None: all that are driven)."""
+    """Holds the work of one process. judged: joints that are judged (None: all that are driven)."""
 
     name: str
     recordings: list[Path]
@@ -51,18 +51,18 @@ class Part:
 
 
 def igris(data: Path, out: Path, name: str) -> list[Part]:
-    """Eight joints with either split of the segments, or two of them."""
+    """Return eight joints with either split of the segments, or two of them."""
     from benchmarks.real.convert_igris import JOINTS, PAIR, SPLITS, convert
 
     made = convert(data / "igris", out / f"recordings_{name}")
     held = SPLITS[name == "igris_other"]
-    kept = [made.recordings[k] for k in held]
-    rest = [p for p in made.recordings if p not in kept]
-    return [Part(name, rest, kept, made.model, made.servo, PAIR if name == "igris_pair" else JOINTS)]
+    judging = [made.recordings[k] for k in held]
+    rest = [p for p in made.recordings if p not in judging]
+    return [Part(name, rest, judging, made.model, made.servo, PAIR if name == "igris_pair" else JOINTS)]
 
 
 def sage(data: Path, out: Path, name: str) -> list[Part]:
-    """Six joints of an arm, each alone; ten of thirty motions held out."""
+    """Return six joints of an arm, each alone; ten of thirty motions held out."""
     from benchmarks.real.convert_sage import JOINTS, convert
 
     made = convert(data, out / f"recordings_{name}")
@@ -70,32 +70,32 @@ def sage(data: Path, out: Path, name: str) -> list[Part]:
 
 
 def ergocub(data: Path, out: Path, name: str) -> list[Part]:
-    """The runs of each finger together, every third held out."""
+    """Return the runs of each finger together, every third held out."""
     from benchmarks.real.convert_ergocub import FINGERS, convert, held_out
 
     made, parts = convert(data, out / f"recordings_{name}"), []
     for which, runs in FINGERS.items():
-        kept = held_out(which)
-        if kept:
-            clips, judged = ([p for r in runs if (r in kept) is held for p in made.runs[r]] for held in (False, True))
-            parts.append(Part(f"ergocub_{which}", clips, judged, made.model, made.servo))
+        judging = held_out(which)
+        if judging:
+            clips, held = ([p for r in runs if (r in judging) is x for p in made.runs[r]] for x in (False, True))
+            parts.append(Part(f"ergocub_{which}", clips, held, made.model, made.servo))
     return parts
 
 
 def bam(data: Path, out: Path, name: str) -> list[Part]:
-    """One of four gains held out."""
+    """Return one of four gains held out, each."""
     from benchmarks.real.convert_bam import convert
 
     made, parts = convert(data, out / f"recordings_{name}"), []
     for gain in sorted(set(made.gains.values())):
-        kept = [p for p in made.recordings if made.gains[p.name] == gain]
-        rest = [p for p in made.recordings if p not in kept]
-        parts.append(Part(f"bam_{gain}", rest, kept, made.model, made.servo))
+        judging = [p for p in made.recordings if made.gains[p.name] == gain]
+        rest = [p for p in made.recordings if p not in judging]
+        parts.append(Part(f"bam_{gain}", rest, judging, made.model, made.servo))
     return parts
 
 
 def panda(data: Path, out: Path, name: str) -> list[Part]:
-    """One trajectory, its last quarter held out."""
+    """Return one trajectory, its last quarter held out."""
     from benchmarks.real.convert_panda import convert
 
     made = convert(data, out / f"recordings_{name}")
@@ -109,7 +109,7 @@ MAKE: dict[str, Callable[[Path, Path, str], list[Part]]] = {
 
 
 def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
-    """One part: diagnosed, written and replayed."""
+    """Diagnose one part, write its files and replay them."""
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
 
@@ -139,11 +139,11 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
     played = play(part, folder, files, parts) if parts else {}
     for joint, v in d.joints.items():
         w = d.written
-        left = {} if w is None else w.errors[joint]
+        errors_of = {} if w is None else w.errors[joint]
         rows[joint] = {
-            "believed": left.get("believed"),
-            "plain": left.get("plain"),
-            "candidates": left,
+            "believed": errors_of.get("believed"),
+            "plain": errors_of.get("plain"),
+            "candidates": errors_of,
             "written": None if w is None else w.chosen[joint],
             "by_search": {"before": v["before"], "after": v["after"]},
             "reported": None if reported is None else reported["joints"].get(joint),
@@ -169,7 +169,7 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
 
 
 def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """By joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
+    """Return by joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
     from dexsim.cli import recorded
     from dexsim.paths import CONFIGS
     from dexsim.recording import read
@@ -191,7 +191,7 @@ def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[
 
 
 def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """Our own least squares of one joint of a part. parts: what was held out."""
+    """Fit our own least squares to one joint of a part. held: what was held out."""
     from benchmarks.real import baseline
     from dexsim.recording import mechanism, read
     from dexsim.sim.quiet import quiet_warp
@@ -213,7 +213,7 @@ def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, 
 
 
 def judged(row: dict[str, Any]) -> dict[str, bool | None]:
-    """The two criteria of a joint; None where it cannot be said."""
+    """Return the two criteria of a joint; None where neither can be said."""
     replayed, reported, plain, believed = (row.get(k) for k in ("replayed", "reported", "plain", "believed"))
     if replayed is None or reported is None:
         return {"as_reported": None, "no_worse": None}
@@ -224,8 +224,8 @@ def judged(row: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
-def shown(results: Sequence[dict[str, Any]]) -> str:
-    """The table."""
+def text_of(results: Sequence[dict[str, Any]]) -> str:
+    """Return the table."""
     rows, errors = [], ("believed", "by hand", "plain", "reported", "replayed")
     mrad = lambda x: "-" if x is None else f"{1e3 * x:.3g}"  # noqa: E731
     word = {True: "pass", False: "FAIL", None: "-"}
@@ -284,7 +284,7 @@ def main(argv: list[str]) -> int:
         for row in r["joints"].values():
             row |= {"passed": judged(row)}
     (out / "written.json").write_text(json.dumps(ordered, default=float), encoding="utf-8")
-    print("\n" + shown(ordered))
+    print("\n" + text_of(ordered))
     return 0
 
 

@@ -36,7 +36,7 @@ USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE, units.QUAN
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
-    """The settings of a replay: {"replay": path, "model", "servo": path or None, "hand": a
+    """Return the settings of a replay: {"replay": path, "model", "servo": path or None, "hand": a
     Hand or None, "out", "video", "timestep", "hold", "start", "end", "object":
     a `led_object.Stated` or None, "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments

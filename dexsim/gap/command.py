@@ -319,13 +319,14 @@ def verdict(d: Diagnosis) -> str:
     """The verdict in at most ten lines."""
     from dexsim.console.tables import number
     from dexsim.gap.judge.conclude import place
+    from dexsim.gap.read import gathered
     from dexsim.gap.search import baseline
 
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]
     if plain := baseline.text(data["baseline"], "mm" if data["held_out"]["error"].endswith("_m") else "mrad"):
         lines.append(f"  {plain}")
-    for f in data["findings"][: 4 - bool(plain)]:
+    for f in gathered(data["findings"])[: 4 - bool(plain)]:
         where = place(f, d.mechanism)
         sizes = ", ".join(
             f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}"

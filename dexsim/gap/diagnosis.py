@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,6 +51,14 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
     w = Inquiry(s, say, progress, s.time_limit or TimeLimit(s.limit))
+    with warnings.catch_warnings():  # a guess far off overflows, and loses: nobody need know
+        warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"dexsim\.gap|numpy")
+        return _diagnosed(w)
+
+
+def _diagnosed(w: Inquiry) -> Diagnosis:
+    """Take an inquiry through its steps."""
+    s, progress = w.settings, w.progress
     read_files(w)
     to_runs(w)
     touch = Touch(w.readable, w.m, w.held_names, s.seed, s.allowed, progress, w.limit)

@@ -258,6 +258,12 @@ class JudgeRules:
         "cases of another plant)",
         "test_a_name_earns_its_confidence_by_what_it_removes",
     )
+    repeated: float = _rule(
+        0.2,
+        "of the largest of an effect's sizes in fits without one condition each: the least must be as large",
+        "a size that a fifth of the evidence changes five-fold is not one size",
+        "test_a_size_that_fits_without_a_condition_do_not_repeat_is_a_hint",
+    )
     most_left_out: float = _rule(
         0.2,
         "share of what was held out that may say nothing of an effect: more of it is not a few moments",

@@ -227,15 +227,15 @@ def for_recording(
     servo: str | Path | dict | None = None,
     hand: Hand | None = None,
 ) -> Mechanism:
-    """The mechanism that a recording was made with (`of_recording`), from a model and a servo file."""
+    """Return the mechanism that a recording was made with (`of_recording`), from a model and a servo file."""
     return of_recording(mechanism(model, servo, None, recording.gravity, hand), recording)
 
 
 def of_recording(m: Mechanism, recording: Recording) -> Mechanism:
-    """The mechanism as a recording was made with it: its gravity, its `servo` over the believed table, its joints
-    driven (the model's others stay where they are, driven to their initial position). What was fitted to recordings
-    (`fitted` of the table) goes before what a recording says of its drive, but for columns in which those differed:
-    of them its factor is on the recording's own."""
+    """Return the mechanism as a recording was made with it: its gravity, its `servo` over the believed table, its
+    joints driven (the model's others stay where they are, driven to their initial position). What was fitted to
+    recordings (`fitted` of the table) goes before what a recording says of its drive, but for columns in which those
+    differed: of them its factor is on the recording's own."""
     spec = m.spec.copy()
     spec.option.gravity = [float(g) for g in recording.gravity]
     out = Mechanism(spec, m.joints, m.table, m.robot, m.hand, m.part_of)
@@ -248,21 +248,21 @@ def of_recording(m: Mechanism, recording: Recording) -> Mechanism:
     if recording.meta.get("servo"):
         over = yaml_text.parse(recording.meta["servo"], f"servo of {recording.path}")
         own, fitted = m.table.to_dict(), m.table.fitted or {}
-        asked = {j: dict(columns or {}) for j, columns in (over.get("joints") or {}).items()}
+        stated = {j: dict(columns or {}) for j, columns in (over.get("joints") or {}).items()}
         for joint, factors in fitted.items():
-            stated = asked.get(ALL, {}) | asked.get(joint, {})
-            asked[joint] = {c: x for c, x in stated.items() if c in factors or c not in own["joints"].get(joint, {})}
-        over["joints"] = asked
+            said = stated.get(ALL, {}) | stated.get(joint, {})
+            stated[joint] = {c: x for c, x in said.items() if c in factors or c not in own["joints"].get(joint, {})}
+        over["joints"] = stated
         out.table = ServoTable.from_dict(merged(own, over), source=f"servo of {recording.path}")
         for joint, column, factor in [(j, c, f) for j, x in fitted.items() for c, f in x.items()]:
-            if column in asked[joint]:
+            if column in stated[joint]:
                 out.table.set(joint, column, factor * (out.table.value(joint, column).value or 0.0))
     return out
 
 
 def held_joints(m: Mechanism, joints: Sequence[str]) -> list[str]:
-    """Those of recorded `joints` that no servo drives, or that were not among those that the servo's file was fitted
-    to: a free run of the others is only judged where these move as they did."""
+    """Return those of recorded `joints` that no servo drives, or that were not among those that the servo's file was
+    fitted to: a free run of the others is only judged where these move as they did."""
     table = m.table
     driven = lambda j: j in table.entries or ALL in table.entries  # noqa: E731
     return [j for j in joints if not driven(j) or (table.fitted is not None and j not in table.fitted)]
@@ -510,8 +510,8 @@ def replay(
 def begun(
     recording: Recording, m: Mechanism, start: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
-    """(position [J] of the mechanism's joints at the first reading from `start` s on, NaN where there is none, their
-    speed [J] then, of the recorded joints the path from there: times from `start`, position, speed, acceleration
+    """Return (position [J] of the mechanism's joints at the first reading from `start` s on, NaN where there is none,
+    their speed [J] then, of the recorded joints the path from there: times from `start`, position, speed, acceleration
     [n])."""
     initial, velocity, paths = np.full(len(m.joints), np.nan), np.zeros(len(m.joints)), {}
     for j, joint in enumerate(recording.joints):
@@ -529,12 +529,12 @@ def begun(
 
 
 def followed(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Position, speed and acceleration [S, J] of a recorded motion x [S, J] at t [S] s, fast motion not cut."""
+    """Return position, speed and acceleration [S, J] of a recorded motion x [S, J] at t [S] s, fast motion not cut."""
     return local_polynomial(t, x, degree=QUICK)
 
 
 def _seen(series: Series, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and values of one column where it was recorded."""
+    """Return times and values of one column where it was recorded."""
     if not len(series):
         return np.zeros(0), np.zeros(0)
     x = np.asarray(series.value, float).reshape(len(series), -1)[:, j]
@@ -543,7 +543,7 @@ def _seen(series: Series, j: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _recorded_columns(recording: Recording, m: Mechanism, place: list[int], start: float) -> dict[str, Series]:
-    """Servo columns that a recording tells of: the supply, as a share of the table's, and temperatures above the
+    """Return servo columns that a recording gives: the supply, as a share of the table's, and temperatures above the
     reference, where a column of the table depends on them."""
     out, table = {}, m.table
     supply, heat = recording.supply_voltage, recording.temperature
@@ -570,7 +570,7 @@ class Led:
         return list(self.paths)
 
     def at(self, t: np.ndarray, offset: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Position, speed and acceleration [T, J] of the joints at times t [T] s; offset, scale [J]: of their
+        """Return position, speed and acceleration [T, J] of the joints at times t [T] s; offset, scale [J]: of their
         encoders. Position and speed belong together: a cubic between readings; beyond them a joint rests."""
         out = []
         for times, q, v, a in self.paths.values():

@@ -33,7 +33,7 @@ class LocalPolynomial:
         self._normal += 1e-9 * np.eye(degree + 1)
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value [S, J] of x [S, J], and its derivatives by s and s^2."""
+        """Return value [S, J] of x [S, J], and its derivatives by s and s^2."""
         if len(self.t) < 5:
             zero = np.zeros_like(x)
             return x.copy(), zero, zero
@@ -43,5 +43,5 @@ class LocalPolynomial:
 
 
 def local_polynomial(t: np.ndarray, x: np.ndarray, width: float = 0.03, degree: int = 2) -> tuple[np.ndarray, ...]:
-    """`LocalPolynomial` of x [S, J] at t [S] s."""
+    """Return `LocalPolynomial` of x [S, J] at t [S] s."""
     return LocalPolynomial(t, width, degree)(x)

@@ -303,6 +303,10 @@ class Effect:
         """Whether it is a torque that follows the pose and changes slowly along it."""
         return False
 
+    def impossible(self, values: dict[str, float], case: Case) -> str:
+        """Say why it cannot be of this size; empty where it can."""
+        return ""
+
     def doubts(self, case: Case, runs: Sequence[int]) -> list[str]:
         """Reasons of its own to doubt it, from the recordings that were used."""
         return []

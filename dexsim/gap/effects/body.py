@@ -66,6 +66,7 @@ def add_armature(spec: mujoco.MjSpec, joint: str, inertia: float) -> str:
     )
 
 
+HEAVIEST = 3.0  # x the mass of all that a joint moves: a payload beyond it is something else
 LIGHTEST = 0.95  # of a link's believed mass: what may be taken away at most
 
 
@@ -151,6 +152,14 @@ class Payload(Effect):
 
     def of_pose(self, values: dict[str, float], case: Case) -> bool:
         return True
+
+    def impossible(self, values: dict[str, float], case: Case) -> str:
+        mass, carried = values.get("mass", 0.0), case.constants.carried
+        return (
+            f"{mass:.3g} kg more are no payload of a joint whose links weigh {carried:.3g} kg"
+            if mass > HEAVIEST * carried > 0
+            else ""
+        )
 
     def excludes(self, mine: Variant, other: Effect, theirs: Variant) -> bool:
         # the same turn, once of the encoder and once of gravity

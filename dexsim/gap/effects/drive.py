@@ -14,12 +14,15 @@ from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
 from dexsim.gap.rules import JUDGE, SEARCH
 
+ABOVE = (1.15, 1.5, 2.0, 2.5)  # x the believed limit that is tried where it is reached; the last is the bound
+REACHED = 0.02  # share of the samples in which the believed limit is reached
+
 
 class TorqueLimit(Effect):
-    """A stall torque, or a clamp of the current, below the believed one."""
+    """A stall torque, or a clamp of the current, other than the believed one; above it only where that is reached."""
 
     id = "torque_limit"
-    words = "gives less torque than believed when it saturates"
+    words = "gives less (or more) torque than believed when it saturates"
     shows = "at saturation"
     experiment = "large steps against a load"
     plain = ("torque_limit",)
@@ -31,10 +34,13 @@ class TorqueLimit(Effect):
         low = 0.05 * s.demand
         if top <= low or s.voltage:
             top = believed * 1.0
-        limit = param("torque", "torque_limit", "set", min(low, 0.5 * top), top, top, "N.m")
+        above = ABOVE if s.saturates > REACHED and top == believed else ()
+        top *= max((1.0, *above))
+        limit = param("torque", "torque_limit", "set", min(low, 0.5 * top), top, min(top, believed), "N.m")
         sizes = [f * min(s.demand, believed) for f in (0.95, 0.88, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)] + [
-            f * top for f in (0.9, 0.78, 0.65, 0.5, 0.35)
+            f * min(top, believed) for f in (0.9, 0.78, 0.65, 0.5, 0.35)
         ]
+        sizes += [f * believed for f in above[:-1]]
         starts = sorted({round(max(x, 1.05 * low), 12) for x in sizes if x < top}, reverse=True)
         return [Variant((limit,), tuple((x,) for x in starts))] if starts else []
 
@@ -44,6 +50,11 @@ class TorqueLimit(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"torque": fit.entry("torque", fit.force)}
+
+    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+        limit = finding["parameters"].get("torque", {"value": 0.0})["value"]
+        more = limit > believed.get("torque_limit", np.inf)
+        return self.words.replace("less (or more)", "more" if more else "less")
 
 
 def lost(s: Scales, m: dict[str, np.ndarray], limit: float, no_load_speed: float) -> np.ndarray:

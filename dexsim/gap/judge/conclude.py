@@ -176,7 +176,9 @@ def candidates(
         trials = {"refitted": (a.none, a.before)} | ({"found": (a.best, a.after)} if a.best.members else {})
         given = [Candidate(BELIEVED, rms(a.before) if plain is None else plain.error_before, _nothing)]
         for name, (trial, squares) in trials.items():
-            reason = baseline.forbidden(case, trial, a.kept.train)
+            sizes = values_of(trial)
+            reasons = [x.effect.impossible(sizes[x.id], case) for x in trial.members]
+            reason = next(filter(None, reasons), "") or baseline.forbidden(case, trial, a.kept.train)
             if rings and name == "found" and held_out.gain_interval(a.before, a.after, a.t)[1] < 0:
                 k, unit = 1e3, "mm" if case.scales.slide else "mrad"
                 reason = (
@@ -830,6 +832,7 @@ def words_of(f: dict, m: Mechanism | None) -> str:
         row = m.joints.index(joint)
         friction = float(np.ravel(m.spec.joint(joint).frictionloss)[0])
         believed = {"coulomb_friction": float(m.column("coulomb_friction")[row]) + friction}
+        believed["torque_limit"] = float(m.column("torque_limit")[row])
     return effect.said(f, believed)
 
 

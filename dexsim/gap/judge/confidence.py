@@ -88,6 +88,22 @@ def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case)
     return ""
 
 
+def not_repeated(params: Sequence, folds: np.ndarray, case: Case) -> str:
+    """Say why an effect is not the same in every split of the recordings: of fits without one condition each, `folds`
+    [F, P], one has a first size of the other sign, or far smaller than another; empty where they agree."""
+    for k, p in enumerate(params):
+        if p.key in SHAPES or len(folds) < 2:
+            continue
+        away = folds[:, k] - neutral_of(p, case)
+        if away.min() * away.max() < 0 or np.abs(away).min() < JUDGE.repeated * np.abs(away).max():
+            return (
+                f"fits without one condition each do not agree on its {p.key.replace('_', ' ')}: "
+                f"{folds[:, k].min():.3g} to {folds[:, k].max():.3g}"
+            )
+        break
+    return ""
+
+
 def left_over(after: float, before: float, noise: float) -> float:
     """Share of a squared error `before` that stays, above `JUDGE.within` x the noise."""
     base = (JUDGE.within * noise) ** 2

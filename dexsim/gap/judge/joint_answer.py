@@ -350,9 +350,17 @@ class JointAnswer:
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
         evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
-        if (nothing and as_reported) or small or (blurred and not borne_out):
+        if unlike := confidence.not_repeated(mm.variant.params, self._by_fold(mm), case):
+            evidence.reasons.append(unlike)
+        if (nothing and as_reported) or small or (blurred and not borne_out) or stopped or unlike:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         return evidence
+
+    def _by_fold(self, mm: Member) -> np.ndarray:
+        """Return what each fit without one condition makes of an effect's parameters [F, P]."""
+        index = [[p.key for p in self.best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
+        folds = [x[index] for x in self.outcome.best.folds if len(x) == len(self.best.fit.params)]
+        return np.array(folds).reshape(-1, len(index))
 
     def floor_beyond(self) -> float:
         """What repeats differ by beyond what was found [rad or m]; inf without repeats."""

@@ -37,6 +37,7 @@ class JointConstants:
     leaf: str = ""  # the last link after it
     leaf_mass: float = 0.0  # of that link, kg
     own_mass: float = 0.0  # of the joint's own link, kg
+    carried: float = 0.0  # of all links that the joint moves, kg
     centre: np.ndarray | None = None  # [3] m: that link's centre of mass in the link's frame
     places: np.ndarray | None = None  # [2, 3] in the link's frame: out from the hinge, and along the way it turns there
 
@@ -155,6 +156,7 @@ def _constants(
         leaf=model.body(int(leaf)).name,
         leaf_mass=float(model.body_mass[leaf]),
         own_mass=float(model.body_mass[body]),
+        carried=float(model.body_subtreemass[body]),
         centre=model.body_ipos[leaf].copy(),
         places=places,
     )

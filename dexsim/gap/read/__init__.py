@@ -3,6 +3,7 @@ plain arrays, in the order of the joints that are diagnosed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,28 @@ def wrong_signal(finding: dict[str, Any]) -> bool:
 
 COLUMNS = ("v", "torque", "temperature", "duty", "enabled", "read")
 """Of a run, what may be absent and has a column for each joint."""
+
+
+def gathered(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return findings with those of one kind of fault in several signals as one, at the place of the first."""
+    out: dict[Any, dict[str, Any]] = {}
+    for f in findings:
+        kind = f["regime"].partition(":")[0]
+        key = (kind, f.get("hint", False)) if wrong_signal(f) else id(f)
+        if key not in out:
+            out[key] = f | {"alike": [f]}
+            continue
+        one = out[key]
+        one["alike"] = [*one["alike"], f]
+        one["confidence"] = max(one["confidence"], f["confidence"])
+        one["when"] = [*one["when"], *f["when"]]
+        one["where"] = {k: list(dict.fromkeys([*x, *f["where"][k]])) for k, x in one["where"].items()}
+    for one in out.values():
+        if len(one["alike"]) > 1:
+            places = one["where"]["joints"] or one["where"]["topics"]
+            more = f" and {len(places) - 3} more" if len(places) > 3 else ""
+            one["regime"] += f" (the same in {len(one['alike'])} signals, of {', '.join(places[:3])}{more})"
+    return list(out.values())
 
 
 @dataclass

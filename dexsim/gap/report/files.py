@@ -25,7 +25,7 @@ from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.conclude import place, spoken, words_of
 from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
-from dexsim.gap.read import wrong_signal
+from dexsim.gap.read import gathered, wrong_signal
 from dexsim.gap.report import charts
 from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
@@ -294,7 +294,7 @@ class Findings(Section):
     template = "findings.html"
 
     def values(self) -> dict[str, Any] | None:
-        cards = [(f.get("hint", False), self._card(f)) for f in self.d.data["findings"]]
+        cards = [(f.get("hint", False), self._card(f)) for f in gathered(self.d.data["findings"])]
         sure, hints = ([card for hint, card in cards if hint is kind] for kind in (False, True))
         nearest = [] if sure else self._nearest()
         return {"sure": sure, "hints": hints, "nearest": nearest} if sure or hints or nearest else None
@@ -302,7 +302,7 @@ class Findings(Section):
     def _card(self, f: dict[str, Any]) -> dict[str, Any]:
         """One finding."""
         e, h = entry(f), f["held_out"]
-        where = place(f, self.d.mechanism)
+        where = place(f, self.d.mechanism) if len(f["where"]["joints"]) < 4 else f"{len(f['where']['joints'])} joints"
         unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
         doubtful = f["indistinguishable"] or f.get("hint")
         return {
