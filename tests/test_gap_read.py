@@ -13,7 +13,7 @@ from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import Run, channels, inputs
-from dexsim.gap.rules import SIGNAL
+from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording import read, write
 
 TWO = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/>
@@ -147,3 +147,63 @@ def test_correlation_is_numpy_s():
         a, b = rng.standard_normal((2, n))
         for y in (b, a + 0.1 * b, -3 * a):
             assert channels.correlation(a, y) == pytest.approx(np.corrcoef(a, y)[0, 1], rel=1e-12, abs=1e-12)
+
+
+def chirp(t, low=0.1, high=10.0, span=10.0):
+    """A sweep of constant size; t: s from its begin."""
+    turns = low * span / np.log(high / low) * ((high / low) ** (np.clip(t, 0, span) / span) - 1)
+    return 0.3 * np.sin(2 * np.pi * turns)
+
+
+def swept(name, lag, sign, begin, end):
+    """A joint that follows a part of a sweep, `lag` s late."""
+    t = np.arange(begin, end, 0.005)
+    q = sign * chirp(t - lag) / (1 + 0.05 * t)
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.0}}})
+    return Run(name, ("j",), t, chirp(t)[:, None], t.copy(), q[:, None], table, np.array([0, 0, -9.81]))
+
+
+FREE = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body><joint name='j' axis='0 1 0'/><geom size='.01'/></body></worldbody></mujoco>"
+)
+
+
+def signs(runs):
+    found, out, _ = channels.inspect(runs, FREE, {})
+    return [f["confidence"] for f in found if f["regime"].startswith("sign")], sorted(n for n, _ in out)
+
+
+def test_a_lag_beyond_a_quarter_period_is_no_other_sign():
+    """The parts of a sweep: at its end the joint lags by more than half a period, and its begin tells the sign."""
+    parts = [("a", 0.0, 4.0), ("b", 4.0, 8.0), ("c", 8.0, 9.2), ("d", 9.2, 10.0)]
+    assert signs([swept(n, 0.06, 1, a, b) for n, a, b in parts]) == ([], [])
+    confidence, out = signs([swept(n, 0.03, -1, a, b) for n, a, b in parts[:2]])
+    assert confidence and min(confidence) >= JUDGE.firm and out == ["a", "b"]
+
+
+def test_a_narrow_band_alone_is_doubted_and_stays():
+    confidence, out = signs([swept("d", 0.01, -1, 9.0, 10.0)])
+    assert out == [] and confidence == [JUDGE.hinted]
+
+
+def test_one_recording_of_another_sign_is_named_beside_what_contradicts_it():
+    runs = [swept("a", 0.03, 1, 0, 8), swept("b", 0.03, -1, 0, 8)]
+    found, out, _ = channels.inspect(runs, FREE, {})
+    assert [n for n, _ in out] == ["b"] and "not so in a" in found[0]["regime"]
+
+
+def stepped(late, others=0):
+    """Steps of a target that are logged `late` s after they were sent."""
+    t = np.arange(0, 12, 0.01)
+    sent = np.floor(t)
+    cmd = 0.4 * (sent % 2)
+    ago = np.maximum(t[:, None] - 0.01 - np.linspace(0, 0.15, 9), 0.0)
+    follow = 0.4 * (np.floor(ago) % 2).mean(1)
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.0}}})
+    return Run("a", ("j",), t + late, cmd[:, None], t, follow[:, None], table, np.array([0, 0, -9.81]))
+
+
+@pytest.mark.parametrize(("late", "named"), [(0.0, False), (0.02, False), (0.08, True)])
+def test_edges_that_are_logged_late_are_another_clock(late, named):
+    found, _, _ = channels.inspect([stepped(late)], FREE, {})
+    assert [f["regime"].startswith("clock_skew") for f in found] == ([True] if named else [])

@@ -92,7 +92,7 @@ def test_what_noise_is_usual_is_told_by_several_joints():
         rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
         q = 0.3 * np.sin(0.4 * t)[:, None] + 1e-3 * rng.normal(size=(2000, others + 1))
         q[:, -1] += 4e-3 * np.sqrt(2) * np.sin(2 * np.pi * 31.0 * t + 0.2)
-        run = SimpleNamespace(name="a", noises=None, t=t, q=q, torque=None)
+        run = SimpleNamespace(name="a", noises=None, t=t, q=q, torque=None, read=None, readings=lambda j: (t, q[:, j]))
         return usual_noise([run], others, 4e-3, np.ones(others + 1)) is not None
 
     assert [told(n) for n in (2, 3)] == [False, True]
@@ -112,7 +112,7 @@ def rattling(loud: float, swings: float, others: float = 0.3, torque: float | No
     q[:, 3] += more * np.sqrt(1 - swings) * rest
     q[:, 3] += more * np.sqrt(2 * swings) * np.sin(2 * np.pi * 31.0 * t + 0.2)
     scatter = None if torque is None else rng.normal(size=(2000, 4)) * [2e-3, 2e-3, 2e-3, 1e-3 * torque]
-    run = SimpleNamespace(name="a", noises=None, t=t, q=q, torque=scatter)
+    run = SimpleNamespace(name="a", noises=None, t=t, q=q, torque=scatter, read=None, readings=lambda j: (t, q[:, j]))
     return usual_noise([run], 3, loud * 1e-3, np.array([1.0, 1.0, 1.0, 0.5]))
 
 

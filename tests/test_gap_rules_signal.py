@@ -36,7 +36,7 @@ def wrong(r: Run, span: float = 1.0, lead: float = 0.0, sign: float = 0.0) -> st
     its target."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(channels, "_lead", lambda *_: lead)
-        patch.setattr(channels, "_sign", lambda *_: sign)
+        patch.setattr(channels, "_ways", lambda *_: (0.0, -sign))
         found = channels._wrong([r], r, 0, model(span))
     return "" if found is None else found.kind
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import threading
@@ -44,10 +45,11 @@ examples:
   python diagnose.py demo=true
 
 settings (key=default):
-  recordings=                 MCAP files, bag folders, or CSV and NPZ files with named columns: [a.mcap,b.csv,...] or
-                              a pattern 'runs/*.mcap'
-  held_out=                   recordings held out of the fit; without them a condition, or the last quarter of the
-                              time, is held out
+  recordings=                 MCAP files, bag folders, CSV and NPZ files with named columns, data sets (LeRobot, Zarr,
+                              HDF5; DATASET#0:40 are some of its episodes): [a.mcap,b.csv,...], or a pattern
+                              'runs/*.mcap'
+  held_out=                   recordings held out of the fit, or 'episodes[40:]' of them; they are taken out of
+                              recordings=. Without them a condition, or the last quarter of the time, is held out
   model=                      MuJoCo or URDF file, or the folder of a hand; hand= by default
   hand=xhand                  a hand that comes with dexsim, or a folder; beside model=, the hand whose fingertips and
                               touch pads that model carries
@@ -116,7 +118,7 @@ def parse(argv: list[str]) -> dict:
             )
         if key in ("recordings", "held_out", "effects", "joints"):
             text = text.strip()
-            items = text[1:-1].split(",") if text.startswith("[") and text.endswith("]") else [text]
+            items = re.split(r",(?![^\[]*\])", text[1:-1]) if text.startswith("[") and text.endswith("]") else [text]
             out[key] = [i.strip().strip("'\"") for i in items if i.strip()]
         elif key == "demo":
             out[key] = _hidden(text)
@@ -238,10 +240,11 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
                     f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}"
                 )
         allowed = set(given["effects"])
+    fitted, held_out = inputs.parted(given["recordings"], given.get("held_out"))
     return Settings(
-        inputs.files(given["recordings"], "recordings"),
+        fitted,
         out,
-        inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
+        held_out,
         given.get("model"),
         given.get("servo"),
         given.get("seed", 0),

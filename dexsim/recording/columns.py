@@ -48,13 +48,15 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
         "q_des",
         "q_cmd",
         "target_value",
+        "des_dof_pos",
+        "target_joint_pos",
         "commanded",
     ),
     "position": (
         "position", "pos", "angle", "measured", "measured_position", "measured_value", "present_position", "q",
-        "actual", "actual_position", "encoder", "qpos",
+        "actual", "actual_position", "encoder", "qpos", "dof_pos", "joint_pos", "state_joint_pos",
     ),
-    "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel"),
+    "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel", "dof_vel"),
     "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
     "temperature": ("temperature", "temp", "present_temperature"),
     "duty": ("duty", "pwm", "duty_cycle", "present_pwm"),
@@ -80,7 +82,8 @@ class Table:
 
     meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
     left out; unnamed: whether no column names the one joint; si: (quantity, joint) in SI units, by their own unit;
-    told: by quantity and joint, which lines tell of it (all where it is not there)."""
+    told: by quantity and joint, which lines tell of it (all where it is not there); arrays [T, ...]: of other
+    topics."""
 
     joints: list[str]
     time: dict[str, np.ndarray]
@@ -91,6 +94,7 @@ class Table:
     unnamed: bool = False
     si: set[tuple[str, str]] = field(default_factory=set)
     told: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
 
     def carried(self, quantity: str) -> np.ndarray | None:
         """[T, J] of which joints each of the quantity's samples tells; None: of all."""
@@ -142,8 +146,11 @@ def of_columns(
     roles = _roles(path, list(raw), named)
     raw, told = _numbers(path, raw, roles, findings, set(named.values()))
     roles = {c: r for c, r in roles.items() if c in raw}
-    if not any(r[0] == "time" and not r[1] for r in roles.values()):
+    if not any(r[0] == "time" for r in roles.values()):
         roles |= _some_clock(raw, roles, findings)
+    if not any(r[0] == "time" for r in roles.values()) and meta.get("rate"):
+        rate = float(schema.numbers(meta["rate"], 1, "rate", str(path))[0])
+        raw["time"], roles["time"] = np.arange(len(next(iter(raw.values())))) / rate, ("time", "", "s", "time")
     found: dict[str, dict[str, np.ndarray]] = {}
     joints: list[str] = []
     effort: set[str] = set()
@@ -392,7 +399,8 @@ def _clock(
     clocks = found.get("time", {})
     if not clocks:
         raise UserError(
-            f"recording {path}: no column of time; columns: {_list(columns)}. Say which it is with remap.time=COLUMN"
+            f"recording {path}: no column of time; columns: {_list(columns)}. Say which it is with remap.time=COLUMN, "
+            "or meta.rate=HZ"
         )
     if "" not in clocks and "position" in clocks:
         clocks[""] = clocks["position"]
@@ -555,7 +563,9 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
                 raise UserError(
                     f"recording {path}: '{key}' has {x.shape[1]} columns, but joint_names has {len(labels)}"
                 )
-            out |= {f"{key}.{label}": x[:, j].astype(float) for j, label in enumerate(labels)}
+            name, unit = _unit(key)
+            form = "{}.{} [" + unit + "]" if unit else "{}.{}"
+            out |= {form.format(name, label): x[:, j].astype(float) for j, label in enumerate(labels)}
     return out, []
 
 

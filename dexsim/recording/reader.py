@@ -14,7 +14,7 @@ from mcap.records import Schema as McapSchema
 from dexsim import guard
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
-from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
+from dexsim.recording import attached, columns, decode, metadata, names, readers, schema, timeline
 from dexsim.recording.container import BAGS, Container, open_container
 from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
@@ -42,8 +42,8 @@ def read(
     hand: Hand | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> Recording:
-    """The recording in an MCAP file, in a folder that `ros2 bag record` wrote, or in a CSV or NPZ file with
-    named columns (`columns.py`).
+    """The recording in an MCAP file, in a folder that `ros2 bag record` wrote, in a CSV or NPZ file with named columns
+    (`columns.py`), or in an episode of a data set (`readers.py`): "DATASET#3".
 
     Arguments:
         remap: our topic -> theirs ("/joint_states": "/xhand/state"), "#a.b" behind it for a sub-message; our joint name
@@ -61,7 +61,12 @@ def read(
     a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
     """
     path = Path(path).expanduser()
-    size = sum(p.stat().st_size for p in _files(path) if p.is_file())
+    base, _ = readers.address(path)
+    dataset = readers.reader_of(base) if base.exists() else None
+    if dataset is not None:
+        size = readers.ready(dataset, base)
+    else:
+        size = sum(p.stat().st_size for p in _files(path) if p.is_file())
     given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand, limits
     return guard.call(_read, *given, what=f"recording {path}", size=size)
 
@@ -76,9 +81,19 @@ def _read(
     limits: Mapping[str, tuple[float, float]] | None,
 ) -> Recording:
     meta, units = split(given)
-    if path.suffix.lower() in columns.SUFFIXES:
-        stated, units, findings = metadata.collect(path, {}, meta, units)
-        table = _TableReading(path, columns.read_table(path, remap, stated, units.get("time", "")), remap, hand)
+    base, part = readers.address(path)
+    dataset = readers.reader_of(base) if base.exists() else None
+    if dataset is not None or path.suffix.lower() in columns.SUFFIXES:
+        stated, units, findings = metadata.collect(base, {}, meta, units)
+        about, clock = stated, units.get("time", "")
+        if dataset is None:
+            found = columns.read_table(path, remap, about, clock)
+        else:
+            episode = readers.read_episode(base, dataset, part)
+            stated = episode.meta | stated
+            found = columns.of_columns(path, episode.columns, episode.findings, remap, about, clock)
+            found.arrays = episode.arrays
+        table = _TableReading(path, found, remap, hand)
         reading: _Reading = table
         stated = table.table.meta | stated
     else:
@@ -123,6 +138,7 @@ class _Reading:
     def __init__(self, path: Path, containers: list[Container], remap: dict[str, str], hand: Hand | None = None):
         self.path, self.hand = path, hand or load_hand()
         self.findings: list[Finding] = []
+        self.arrays: dict[str, np.ndarray] = {}
         self.si: set[tuple[str, str]] = set()  # (quantity, their joint) whose values are in SI already
         self.breaks: list[tuple[float, float]] = []
         self.streams: dict[str, list[_Stream]] = {}
@@ -358,7 +374,7 @@ class _Reading:
         place_of = {j: k for k, j in enumerate(ours)}
         column = np.array([place_of[mapping[n]] if n in mapping else -1 for n in theirs])
         has_effort = any(len(s.effort) for s in _unlike(states))
-        has_tactile = schema.TACTILE in self.sources
+        has_tactile = schema.TACTILE in self.sources or schema.TACTILE in self.arrays
         self.findings += metadata.complete(stated, has_effort, has_tactile)
         if "joint_names" not in stated:
             self.findings.append(
@@ -674,6 +690,7 @@ class _TableReading(_Reading):
             )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
         self.start_ns, self.config, self.sources, self.si = table.start_ns, None, {}, table.si
+        self.arrays = table.arrays
 
     def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
         size = np.abs(effort[np.isfinite(effort)])
@@ -681,6 +698,10 @@ class _TableReading(_Reading):
 
     def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, Sequence[Any]]:
         table, empty = self.table, np.zeros(0)
+        if ours in table.arrays:
+            x = table.arrays[ours]
+            t = table.time.get("position", table.time.get("command", empty))[: len(x)]
+            return self._in_order(ours, t, [(v.shape, v.ravel()) for v in x[: len(t)]])
         if ours == schema.STATES:
             have = [q for q in ("position", "velocity", "effort") if q in table.value]
             if "position" not in have:

@@ -44,6 +44,7 @@ KEYS: dict[str, str] = {
     "gravity": "in the model's world frame, e.g. 0 0 -9.81",
     "servo": "YAML over servo.yaml for this recording",
     "notes": "free text",
+    "rate": "Hz: of the samples of a file without times",
 }
 """Metadata keys and what each means; all values are text."""
 DEFAULTS: dict[str, str] = {
@@ -138,6 +139,7 @@ ALLOWED: dict[str, tuple[float, float]] = {
     "gravity": (-100.0, 100.0),
     "tactile_axis_sign": (-1.0, 1.0),
     "tactile_lsb": (1e-9, 1e3),
+    "rate": (1e-3, 1e6),
 }
 """What the numbers of a key may be: m/s2, sign, N a count. Gravity may be zero: of a joint that it does not load."""
 SEVERITIES = ("info", "warning", "error")

@@ -196,7 +196,7 @@ def _placed(path: Path) -> Iterator[Path]:
 
 def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]:
     """(time, order within a time, add function, its arguments) of every sample."""
-    c, s = r.commands, r.states
+    c, s = r.targets(), r.states
     for i, t in enumerate(c.t):
         yield t, 0, w.add_command, (t, c.value[i], _stamp(c, i))
     for i, t in enumerate(s.position.t):

@@ -25,12 +25,14 @@ from scipy import fft
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run
-from dexsim.gap.rules import SIGNAL
+from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Finding, Recording
 
 # kinds of the audit's errors after which a position or a target cannot be used
 SPOILS = ("joint_order", "wrap", "unit")
+LAGS = np.arange(0.0, 0.201, 0.02)  # s by which a joint may follow its target
+EDGE, EDGES = 0.3, 3  # s before and after an edge of a target that are looked at, and edges that tell
 PAUSE = 1.0  # s without a sample, over which no lag is measured
 STEP, BEFORE, AFTER = 0.005, 120, 80  # s of the grid on which a lag is measured, and steps of it on either side
 TURN = 180 / np.pi
@@ -109,6 +111,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     long = {joint: repeated_stretches(runs, joint, targets) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
     beat = {joint: common_rhythm(runs, joint) for joint in long}
+    ways = {joint: directions(runs, targets, joint) for joint in long}
 
     def add(
         kind: str, text: str, run: Run, joint: str, topics: list[str], spans: Spans, confidence: float | None = None
@@ -124,7 +127,8 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             if (run.name, joint) in out:
                 continue
             whole = [(run.t[0], run.t[-1])]
-            wrong = _wrong(runs, run, j, model, targets[i])
+            unlike = [r.name for r, w in zip(runs, ways[joint], strict=True) if w == 1]
+            wrong = _wrong(runs, run, j, model, targets[i], ways[joint][i], unlike)
             if wrong is not None:
                 add(wrong.kind, wrong.text, run, joint, wrong.topics, wrong.spans or whole, wrong.confidence)
                 out[run.name, joint] = f"{wrong.kind}: {wrong.text}"
@@ -144,6 +148,9 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             for text, spans in said:
                 add("stale", text, run, joint, [STATES], spans)
             stale |= _on_rows(run, j, repeated)
+            if {w for w in ways[joint] if w} == {-0.5} and ways[joint][i]:  # drops nothing
+                text = f"{joint} may follow the negative of its target: in a narrow band a lag looks like another sign"
+                add("sign", text, run, joint, [STATES, COMMANDS], whole, JUDGE.hinted)
         if run.read is None and not between.all():
             stale |= between
         if stale.any() and (~stale).sum() >= 20:
@@ -227,11 +234,19 @@ class _Wrong:
 
 
 def _wrong(
-    runs: list[Run], run: Run, j: int, model: mujoco.MjModel, targets: Targets | None = None
+    runs: list[Run],
+    run: Run,
+    j: int,
+    model: mujoco.MjModel,
+    targets: Targets | None = None,
+    way: float | None = None,
+    unlike: Sequence[str] = (),
 ) -> _Wrong | None:
     """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is. targets:
-    the run's, where they are found already."""
+    the run's, where they are found already; way: its direction there (`directions`); unlike: runs in which that is
+    another."""
     targets = targets or Targets(run)
+    way = directions([run], [targets], run.joints[j])[0] if way is None else way
     joint, q, cmd = run.joints[j], run.q[:, j], targets.before()[:, j]
     limits = _range(model, joint)
     if limits is not None and _degrees(q, cmd, limits):
@@ -256,18 +271,22 @@ def _wrong(
             f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
             [topic for _, topic, _ in far],
         )
-    if np.ptp(cmd) > 1e-3 and np.ptp(q) > SIGNAL.follows * np.ptp(cmd) and _sign(targets, q, j) < -SIGNAL.against:
-        return _Wrong(
-            "sign",
-            f"{joint} follows the negative of its target: another direction of its position or its commands",
-            [STATES, COMMANDS],
-        )
+    if way == -1:
+        text = f"{joint} follows the negative of its target: another direction of its position or its commands"
+        return _Wrong("sign", text + (f"; not so in {', '.join(unlike[:3])}" if unlike else ""), [STATES, COMMANDS])
     lead = _lead(run, j, targets)
-    if lead > SIGNAL.early:
+    if lead > SIGNAL.early and not _clocked(run, j, targets):
         return _Wrong(
             "clock_skew",
             f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
             "different clocks",
+            [COMMANDS, STATES],
+        )
+    early = _early_edges(run, j)
+    if early > max(SIGNAL.early, 1.5 * run.period):
+        return _Wrong(
+            "clock_skew",
+            f"{joint} moves {1e3 * early:.0f} ms before the edges of its target: these are logged late",
             [COMMANDS, STATES],
         )
     stop = _stops(runs, run, joint, cmd)
@@ -384,17 +403,33 @@ def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
     return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
 
 
-def _sign(targets: Targets, q: np.ndarray, j: int) -> float:
-    """Correlation of the position with its target of a little before, the most of a few delays in size."""
-    best = 0.0
-    if not q.std() > 0:
-        return best
-    for delay in (0.0, 0.03, 0.08, 0.15):
-        c = targets.before(delay)[:, j]
-        if c.std() > 0:
-            r = correlation(c, q)
-            best = r if abs(r) > abs(best) else best
-    return best
+def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
+    """(largest correlation of the position with its target of up to `LAGS` s before, and with the target's negative).
+    In a narrow band both are large: a lag of half a period looks like another sign."""
+    each = [0.0]
+    on = targets.run.t >= targets.run.cmd_t[0] + LAGS[-1]  # from where on all of them are known
+    if on.sum() > 10 and q[on].std() > 0:
+        at = [targets.before(delay)[on, j] for delay in LAGS]
+        each += [correlation(c, q[on]) for c in at if c.std() > 0]
+    return max(each), max(-x for x in each)
+
+
+def directions(runs: Sequence[Run], targets: Sequence[Targets], joint: str) -> list[float]:
+    """Of each run, 1 where the joint follows its target, -1 where it follows the target's negative, half of it where a
+    narrow band lets it seem so, 0 where it cannot tell or lacks the joint."""
+    out = []
+    for run, at in zip(runs, targets, strict=True):
+        way = 0.0
+        if joint in run.joints:
+            j = run.joints.index(joint)
+            q, cmd = run.q[:, j], at.before()[:, j]
+            if np.ptp(cmd) > 1e-3 and np.ptp(q) > SIGNAL.follows * np.ptp(cmd):
+                along, against = _ways(at, q, j)
+                most = max(along, against)
+                clear = min(along, against) < most - SIGNAL.beyond
+                way = np.sign(along - against) * (1.0 if clear else 0.5) if most > SIGNAL.against else 0.0
+        out.append(way)
+    return out
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -404,6 +439,37 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     products = np.dot(x, x.T) * np.true_divide(1, len(a) - 1)
     size = np.sqrt(np.diag(products))
     return float(np.clip(products[0, 1] / size[0] / size[1], -1, 1))
+
+
+def _clocked(run: Run, j: int, targets: Targets) -> bool:
+    """Whether other joints of the run, of whom most that can tell do not lead, show that its clocks belong together."""
+    others = [k for k in range(len(run.joints)) if k != j and directions([run], [targets], run.joints[k])[0] == 1]
+    leads = [_lead(run, k, targets) > SIGNAL.early for k in others]
+    return len(leads) > 1 and sum(leads) < 0.5 * len(leads)
+
+
+def _early_edges(run: Run, j: int) -> float:
+    """s by which the joint moves before the edges of its target, in the median of those before and after which both
+    stood still; 0 where there are few such, or most come first."""
+    t, q = run.readings(j)
+    c, at = run.cmd[:, j], run.cmd_t
+    jump = np.diff(c)
+    size = np.abs(jump)
+    edges = np.flatnonzero(size > max(0.1 * np.ptp(c), 0.02)) + 1
+    leads = []
+    for k in edges.tolist():
+        a, b = np.searchsorted(t, [at[k] - EDGE, at[k] + EDGE])
+        stood = np.abs(c[(at >= at[k] - EDGE) & (at < at[k])] - c[k - 1]).max(initial=0.0) < 0.02 * size[k - 1]
+        if not stood or b - a < 8 or not a:
+            continue
+        way = np.sign(jump[k - 1]) * (q[a:b] - np.median(q[a : a + max((b - a) // 5, 2)]))
+        still = np.abs(way[: max((b - a) // 5, 2)]).max()
+        moved = np.flatnonzero(way > max(3 * still, 0.03 * size[k - 1]))
+        if len(moved) and still < 0.02 * size[k - 1]:
+            leads.append(float(at[k] - t[a + moved[0]]))
+    if len(leads) < EDGES or np.mean(np.array(leads) > 0) < 0.75:
+        return 0.0
+    return max(float(np.median(leads)), 0.0)
 
 
 def _lead(run: Run, j: int, targets: Targets | None = None) -> float:

@@ -3,6 +3,7 @@ not in free air found."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run, channels
 from dexsim.gap.rules import SIGNAL
-from dexsim.recording import spikes
+from dexsim.recording import readers, spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import COMMANDS_FIX, DUTY, STATES, Recording, Series
 
@@ -373,18 +374,40 @@ def files(given: Any, key: str) -> list[Path]:
     out = []
     for item in items:
         path = Path(str(item)).expanduser()
-        if any(ch in str(item) for ch in "*?"):
-            found = sorted(path.parent.glob(path.name))
+        if any(ch in str(item) for ch in "*?") and not path.exists():
+            base, hash_, part = path.name.partition("#")
+            found = [p for p in sorted(path.parent.glob(base)) if not p.name.endswith(".yaml")]
             if not found:
                 raise UserError(f"{key}={item}: no file matches")
-            out += found
-        elif not path.exists():
+            out += [q for p in found for q in readers.expanded(p.with_name(p.name + hash_ + part))]
+        elif not readers.address(path)[0].exists():
             raise UserError(f"{key}: recording '{path}' does not exist")
         else:
-            out.append(path)
+            out += readers.expanded(path)
     if not out:
         raise UserError(f"{key}: say which, e.g. {key}='[a.mcap,b.mcap]'")
-    return out
+    return list(dict.fromkeys(out))
+
+
+def parted(recordings: Any, held_out: Any) -> tuple[list[Path], list[Path] | None]:
+    """(recordings that are fitted, those held out of the fit, None where nothing is said). held_out: as recordings, or
+    `episodes[40:]` of them; what is held out is taken out of the fit. Raises UserError where nothing is left."""
+    every = files(recordings, "recordings")
+    if not held_out:
+        return every, None
+    items = held_out if isinstance(held_out, (list, tuple)) else [held_out]
+    held: list[Path] = []
+    for item in items:
+        found = re.fullmatch(r"episodes\[(.*)\]", str(item).strip())
+        if found:
+            held += [every[k] for k in readers.numbers(found[1].strip(), len(every), f"held_out={item}")]
+        else:
+            held += files([item], "held_out")
+    away = {p.absolute() for p in held}
+    fitted = [p for p in every if p.absolute() not in away]
+    if not fitted:
+        raise UserError("held_out: it names all of the recordings; nothing is left to fit")
+    return fitted, list(dict.fromkeys(held))
 
 
 def self_touch(
