@@ -7,12 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dexsim.actuator.table import ServoTable
 from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import Judged, TouchResult, empty
 from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import JointAnswer
+from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.hypotheses import Outcome
 from dexsim.gap.search.search import SearchedJoint
@@ -448,3 +450,19 @@ def test_what_is_taken_back_does_not_reach_a_search():
     drives.searched, drives._answer = [SearchedJoint("case", "search", found)], lambda search, outcome: answer
     drives._take_back()
     assert drives.searched == [SearchedJoint("case", "search", answer.outcome)] and found.best == "three"
+
+
+def test_each_motion_has_the_floor_of_its_own_repeats():
+    """Ramps repeat to 2 mrad, steps to 190: pooled, a ramp that is missed by 20 would pass for noise."""
+    t, rng, runs = np.arange(0.0, 4.0, 0.01), np.random.default_rng(0), []
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0}}})
+    for name, size in (("ramp", 2e-3), ("step", 0.19)):
+        cmd = (t if name == "ramp" else np.sign(np.sin(t)))[:, None]
+        for k in range(2):
+            q = cmd + size * np.sqrt(2) * (k - 0.5) * np.ones_like(cmd) + 1e-5 * rng.normal(size=cmd.shape)
+            runs.append(Run(f"{name}{k}", ("j",), t, cmd, t, q, table, np.zeros(3)))
+    cases = [SimpleNamespace(joint="j", index=0, sigma=1e-4)]
+    pooled, own = held_out.floors(runs, cases)[0]["j"], held_out.by_motion(runs, cases)
+    assert pooled > 0.06 and [own[i]["j"] for i in range(4)] == pytest.approx([2e-3, 2e-3, 0.19, 0.19], rel=0.02)
+    quiet = {"floor": pooled, "before": 0.02, "before_low": 0.02, "after": 0.02, "structured": True, "quiet": True}
+    assert held_out.verdict([], **quiet) == "none" and held_out.verdict([], **quiet, loud=True) == "unknown"

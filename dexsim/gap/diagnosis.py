@@ -246,6 +246,7 @@ class Drives(Steps):
         self.parts = held_out.split(w.runs, w.held, group, self.cases)
         w.say(f"held out of the fit: {self.parts.how}")
         self.noise = Noise(*held_out.floor(w.runs, self.cases), held_out.floors(w.runs, self.cases)[0])
+        self.noise.motions = held_out.by_motion(w.runs, self.cases)
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
 
     def _within_the_limit(self) -> None:

@@ -115,14 +115,16 @@ class Judged:
     """What the verdict on joints goes by, as entries of `held_out`: errors of their motion, of the reading of their
     effort alone, and of their torque from the motion (what the recorded torque names); None where there is none.
     structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its
-    own floor without any; shown: the error of their motion away from what no fitted recording visits, and whether each
-    joint is followed to its floor there (None: all of it was fitted somewhere, or most of it nowhere)."""
+    own floor without any; loud: recordings that are surely missed by more than their own repeats differ by; shown:
+    the error of their motion away from what no fitted recording visits, and whether each joint is followed to its
+    floor there (None: all of it was fitted somewhere, or most of it nowhere)."""
 
     position: dict[str, Any]
     effort: dict[str, Any] | None = None
     torque: dict[str, Any] | None = None
     structured: bool = True
     quiet: bool = False
+    loud: tuple[str, ...] = ()
     shown: tuple[dict[str, Any], bool] | None = None
 
 

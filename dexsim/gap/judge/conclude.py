@@ -3,8 +3,9 @@ and model, what was not considered."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -35,11 +36,13 @@ from dexsim.recording.mechanism import Mechanism
 @dataclass
 class Noise:
     """The noise floor of the position error: over all joints [rad or m], where it comes from (repeats, split or
-    quantum), and of each joint; lowered: the joints whose floor is what repeats differ by beyond what was found."""
+    quantum), of each joint, and by run and joint where that motion was repeated; lowered: the joints whose floor is
+    what repeats differ by beyond what was found."""
 
     floor: float
     how: str
     joints: dict[str, float]
+    motions: dict[int, dict[str, float]] = field(default_factory=dict)
     lowered: tuple[str, ...] = ()
 
     def at_most(self, left: dict[str, float]) -> Noise:
@@ -50,7 +53,7 @@ class Noise:
             return self
         joints = self.joints | lower
         floor = float(np.sqrt(np.mean(np.square(list(joints.values())))))
-        return Noise(min(floor, self.floor), self.how, joints, tuple(lower))
+        return Noise(min(floor, self.floor), self.how, joints, self.motions, tuple(lower))
 
 
 def into_diagnosis(
@@ -102,6 +105,7 @@ def into_diagnosis(
         "position_rad": float(noise.floor),
         "how": noise.how,
         "joints": {k: float(v) for k, v in noise.joints.items()},
+        "recordings": {kept.runs[i].name: {k: float(v) for k, v in x.items()} for i, x in noise.motions.items()},
     }
     findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
     for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
@@ -131,6 +135,7 @@ def into_diagnosis(
     held_out.unneeded([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers), noise)
+    notes += d.judged.loud
 
 
 def _judged_by_ringing(d: Diagnosis, rings: dict[str, float]) -> None:
@@ -335,7 +340,24 @@ def _judged(
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    return Judged(position(all_of_it, how), effort, None, structured, quiet, shown)
+    return Judged(position(all_of_it, how), effort, None, structured, quiet, _loud(answers, kept, noise), shown)
+
+
+def _loud(answers: Sequence[JointAnswer], kept: Kept, noise: Noise) -> tuple[str, ...]:
+    """Return the recordings held out, joint by joint, that are surely missed by more than their own repeats differ
+    by, in words."""
+    said = []
+    for a in answers:
+        for i in kept.test:
+            on = a.case.plant.run_of[a.rows] == i
+            own = noise.motions.get(i, {}).get(a.case.joint, math.inf)
+            was, low, _ = held_out.rms_interval([a.before[on]], [a.t[on]])
+            if low > JUDGE.within * own:
+                said.append(
+                    f"{kept.runs[i].name}: {a.case.joint} is missed by {1e3 * was:.3g} mrad, by {1e3 * own:.2g} do "
+                    "repeats of it differ"
+                )
+    return tuple(said)
 
 
 def _error(
@@ -570,10 +592,11 @@ def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> 
         if any(map(held_out.lowers, named)):
             return "explained", by.effort
     p, of_motion = by.position, [f for f in findings if not _by_torque(f)]
-    word = held_out.verdict(of_motion, floor, p["before"], p["before_low"], p["after"], by.structured, by.quiet)
+    rest, loud = by.structured, bool(by.loud)
+    word = held_out.verdict(of_motion, floor, p["before"], p["before_low"], p["after"], rest, by.quiet, loud)
     if word == "unknown" and by.shown is not None:  # what no fitted recording shows cannot be known: it is not judged
         q, quiet = by.shown
-        told = held_out.verdict(of_motion, floor, q["before"], q["before_low"], q["after"], by.structured, quiet)
+        told = held_out.verdict(of_motion, floor, q["before"], q["before_low"], q["after"], rest, quiet, loud)
         if told != "unknown":
             word, p = told, q
     if word == "none":

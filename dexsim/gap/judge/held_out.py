@@ -229,6 +229,18 @@ def repeats(runs: list[Run]) -> list[tuple[Run, Run]]:
     return [(a, b) for i, a in enumerate(runs) for b in runs[i + 1 :] if a.name != b.name and same_commands(a, b)]
 
 
+def by_motion(runs: list[Run], cases: list[Case]) -> dict[int, dict[str, float]]:
+    """Return by run that was repeated the noise floor of each joint [rad or m] by its own repeats alone: ramps may
+    repeat to a hundredth of what saturated steps do."""
+    pairs, out = [(a, b) for a, b in repeats(runs) if len(_common(a, b))], {}
+    for i, run in enumerate(runs):
+        mine = [p for p in pairs if run is p[0] or run is p[1]]
+        if mine:
+            each = {c.joint: [tuple((x, x.t, x.q[:, c.index]) for x in p) for p in mine] for c in cases}
+            out[i] = {c.joint: max(_apart(each[c.joint]), c.sigma) for c in cases}
+    return out
+
+
 def floor_beyond(
     case: Case, runs: list[Run], params: list[Param], x: np.ndarray, fixed: Sequence[tuple[str, float]] = ()
 ) -> float:
@@ -342,14 +354,16 @@ def verdict(
     after: float,
     structured: bool,
     quiet: bool = False,
+    loud: bool = False,
 ) -> str:
     """The one word. findings: after `settle`; floor, before, after: of the error on what was held out; before_low: of
     its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether every joint is
-    followed to its own floor. Where the rest is followed to the floor a wrong signal is the answer: something was
+    followed to its own floor; loud: whether some recording is surely missed by more than its own repeats differ by.
+    Where the rest is followed to the floor a wrong signal is the answer: something was
     amiss, and it has a name. Names of which none surely lowers the error explain nothing."""
     named = firm(findings)
     if not any(map(lowers, named)):
-        if (
+        if not loud and (
             quiet
             or before <= JUDGE.within * floor
             or (before <= JUDGE.far * floor and (before_low <= JUDGE.within * floor or not structured))
