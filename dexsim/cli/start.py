@@ -54,8 +54,12 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     if given is None:
         return None
     request = settings.parse(given, config_dir)
-    source = _last(request, "resume")
-    data = _load(source) if source is not None else None
+    source, data = _last(request, "resume"), None
+    if source is not None:
+        from dexsim.learning.ranks import Ranks
+
+        with Ranks().leaders(source) as place:
+            data = _load(place)
     with _blamed(source if data is not None else None, request):
         if data is None:
             cfg = _from_files(config_dir, request)

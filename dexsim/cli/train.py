@@ -78,7 +78,7 @@ def _run(
         runner.restore(start.data, str(start.source))
         went = f"; {runner.resumed}" if runner.resumed else ""
         print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps{went}")
-    said = typing(str(cfg["task"].get("class")))
+    said = typing(str(cfg["task"]["class"])) if "class" in cfg["task"] else ""
     resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}{said}"
     ranks.on_loss(f"continue: {resume}")
     log = Log(runner, where, start) if ranks.leader else None
@@ -103,7 +103,7 @@ def _run(
 
 
 def _command(ranks: Ranks) -> str:
-    return program.name("train") if ranks.size == 1 else program.torchrun("train", ranks.here)
+    return program.name("train") if ranks.size == 1 else program.torchrun("train", ranks.here, ranks.machines)
 
 
 def _check_resume(start: Start) -> None:

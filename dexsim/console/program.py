@@ -29,9 +29,10 @@ def typed() -> str:
     return " ".join([head, *map(shlex.quote, given if _by_door() else given[1:])])
 
 
-def torchrun(job: str, processes: int) -> str:
-    """Return the command that starts a job in this many processes of this machine at once."""
-    return f"torchrun --nproc_per_node={processes} " + (
+def torchrun(job: str, processes: int, machines: int = 1) -> str:
+    """Return the command that starts a job in this many processes of each of several machines at once."""
+    nodes = f"--nnodes={machines} --rdzv_backend=c10d --rdzv_endpoint=HOST:29500 " if machines > 1 else ""
+    return f"torchrun {nodes}--nproc_per_node={processes} " + (
         f"{job}.py" if _by_door() and job in DOORS else f"-m dexsim {job}"
     )
 

@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
 import os
 import random
+import tempfile
 import traceback
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +28,7 @@ from dexsim.errors import UserError
 from dexsim.learning.lifeline import Lifeline
 
 SEED_STEP = 1_000_003  # between the seeds of neighbouring ranks: far more than anyone numbers runs
+COPY, PART = "dexsim/leaders", 16 << 20  # keys of the leader's file in torch's store; bytes of each of its parts
 COMPILE_LIMIT = datetime.timedelta(minutes=30)  # how long others wait for rank 0 of their node to compile kernels
 
 
@@ -51,6 +55,7 @@ class Ranks:
             )
         self.leader = self.rank == 0
         self._lifeline: Lifeline | None = None
+        self._store: Any = None
 
     def device(self, asked: str | None, cuda_devices: int) -> str | None:
         """Return the device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do
@@ -88,9 +93,9 @@ class Ranks:
             return
         if device.startswith("cuda"):
             torch.cuda.set_device(device)
-        backend = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo"
-        dist.init_process_group(backend, rank=self.rank, world_size=self.size, timeout=COMPILE_LIMIT)
-        self._lifeline = Lifeline(self.rank, self.size, dist.distributed_c10d._get_default_store())
+        backend, store = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo", self._meeting()
+        dist.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=COMPILE_LIMIT)
+        self._lifeline = Lifeline(self.rank, self.size, store)
         try:
             yield
         except KeyboardInterrupt:
@@ -107,6 +112,46 @@ class Ranks:
             )
             raise
         self.leave()
+
+    @property
+    def machines(self) -> int:
+        """How many machines take part."""
+        return max(self.size // max(self.here, 1), 1)
+
+    @contextlib.contextmanager
+    def leaders(self, path: str) -> Iterator[str]:
+        """Give a path of the leader's file: its own, which is also that of others whose file there is the same; for
+        those of another machine that have none, or another, a copy until the block ends."""
+        if self.machines == 1:
+            yield path
+            return
+        own, store = Path(path).expanduser(), self._meeting()
+        mark = hashlib.sha256(own.read_bytes()).hexdigest() if own.is_file() else "none"
+        if self.leader:
+            store.set(f"{COPY}/mark", mark)
+            if mark != "none" and any(store.get(f"{COPY}/{k}/mark").decode() != mark for k in range(1, self.size)):
+                with open(own, "rb") as file:
+                    parts = list(iter(lambda: file.read(PART), b""))
+                store.set(f"{COPY}/parts", str(len(parts)))
+                for k, part in enumerate(parts):
+                    store.set(f"{COPY}/part/{k}", part)
+        else:
+            store.set(f"{COPY}/{self.rank}/mark", mark)
+            if store.get(f"{COPY}/mark").decode() not in (mark, "none"):
+                with tempfile.TemporaryDirectory(prefix="dexsim_") as folder:
+                    copy = Path(folder, own.name)
+                    with open(copy, "wb") as file:
+                        for k in range(int(store.get(f"{COPY}/parts"))):
+                            file.write(store.get(f"{COPY}/part/{k}"))
+                    yield str(copy)
+                return
+        yield path
+
+    def _meeting(self) -> Any:
+        """torch's key-value store that all ranks share, before and after they have joined."""
+        if self._store is None:
+            self._store, _, _ = next(dist.rendezvous("env://", self.rank, self.size, timeout=COMPILE_LIMIT))
+        return self._store
 
     def leave(self) -> None:
         """Say good-bye and close the group: nothing is shared from here on. Called by all ranks."""
