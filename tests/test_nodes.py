@@ -15,7 +15,6 @@ import shell
 from benchmarks.machines import Nodes, sh
 from dexsim.learning import checkpoint
 from dexsim.learning.ranks import Ranks
-from dexsim.system import lives
 
 MAIN = rank_main.__file__
 QUICK = ("task=dummy", "device=cpu", "worlds=4", "final_episodes=0", "save_interval=1")
@@ -115,9 +114,8 @@ def test_a_pulled_cable_ends_both(nodes, configs):
     wait_for(nodes.folder / "node0" / "run" / "model_2.pt", nodes)
     nodes.cut(1)
     began = time.monotonic()
-    ranks = [int((nodes.folder / f"node{k}" / "report" / f"{k}.pid").read_text()) for k in (0, 1)]
     try:
-        while any(lives(pid) for pid in ranks):
+        while not all("is gone" in said(nodes, k) for k in (0, 1)):  # their last words
             assert time.monotonic() - began < 60, said(nodes, 0) + said(nodes, 1)
             time.sleep(0.2)
         assert started[0].wait(30)
