@@ -159,3 +159,18 @@ def test_the_plain_model_fits_no_friction_that_a_fall_forbids():
     assert friction.high <= room_for_friction(case, [0])[-1]
     trial = SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS])))
     assert "would hold the joint" in baseline.forbidden(case, trial, [0])
+
+
+def test_a_velocity_loop_is_a_setting(monkeypatch):
+    """Its damping acts on the error of the speed, in the file, the fit and what is written."""
+    loop = {"drive": "torque", "loop": "velocity", "loop_rate": 1000, "joints": {"*": {"kd": 0.2, "torque_limit": 2.0}}}
+    table = ServoTable.from_dict(loop)
+    assert table.value("joint", "speed_feedforward").value == 0.2 and table.nominal(["joint"])[0, INDEX["kp"]] == 0.0
+    assert ServoTable.from_dict(table.to_dict()).to_dict() == table.to_dict()
+    monkeypatch.setitem(globals(), "BELIEVED", loop)
+    true = {"kd": 0.31, "speed_feedforward": 0.31}
+    case = case_of(*(moved(None, seed=k, **true) for k in (0, 1)))
+    plain = baseline.judged(case, baseline.fitted(case, [0]), [1])
+    assert plain.value["kd"] == pytest.approx(0.31, rel=0.1) and plain.error < 0.2 * plain.error_before
+    baseline.write(plain, table, mujoco.MjSpec.from_string(PENDULUM))
+    assert table.value("joint", "speed_feedforward").value == table.value("joint", "kd").value

@@ -10,6 +10,7 @@
     loop_encoder: joint            # joint or motor
     position_encoder: joint        # joint or motor
     supply_voltage: 24.0           # V
+    loop: position                 # or velocity: kd acts on the error of the speed (kp 0 where it is not stated)
     fitted: {index_bend_joint: {}} # joints that `diagnose` fitted: see below
 
 A value is a number, a range [low, high], a number with its range, or `unknown`; an absent column is ideal (neutral).
@@ -36,6 +37,7 @@ from dexsim.errors import UserError
 
 Drive = Literal["torque", "voltage"]
 Side = Literal["joint", "motor"]
+Loop = Literal["position", "velocity"]
 DRIVES, SIDES = get_args(Drive), get_args(Side)
 KEYS = (
     "drive",
@@ -47,6 +49,7 @@ KEYS = (
     "position_encoder",
     "supply_voltage",
     "fitted",
+    "loop",
 )
 ALL = "*"
 
@@ -67,6 +70,7 @@ class Content(msgspec.Struct):
     position_encoder: Side | dict[str, Side] | None = None
     supply_voltage: typed.Positive | None = None
     fitted: dict[str, dict[str, float]] | None = None
+    loop: Loop | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +142,7 @@ class ServoTable:
     position_encoder: str | dict = "joint"
     supply_voltage: float | None = None  # V
     fitted: dict[str, dict[str, float]] | None = None  # joints that were fitted to recordings; None: nothing was
+    loop: str | None = None
     source: str = "servo"  # named in errors
 
     # -- reading and writing ------------------------------------------------------------
@@ -174,6 +179,8 @@ class ServoTable:
                     hint = did_you_mean(name, NAMES)
                     raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
                 entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
+            if top.loop == "velocity" and "kd" in columns:
+                entries[str(joint)].setdefault("speed_feedforward", entries[str(joint)]["kd"])
         return cls(
             top.drive,
             entries,
@@ -184,6 +191,7 @@ class ServoTable:
             top.position_encoder or "joint",
             top.supply_voltage,
             top.fitted,
+            top.loop,
             source,
         )
 

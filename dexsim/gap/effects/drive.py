@@ -315,7 +315,7 @@ class GainMismatch(Effect):
         params = [param("kp_factor", "kp", "factor", 0.25, 4.0, 1.0)]
         starts: list[tuple[float, ...]] = [(0.6,), (0.8,), (0.91,), (1.1,), (1.3,), (1.7,)]
         if s.nominal["kd"] > 0:
-            params.append(param("kd_factor", "kd", "factor", 0.1, 6.0, 1.0))
+            params.append(param("kd_factor", s.damping, "factor", 0.1, 6.0, 1.0))
             starts = [*((x[0], 1.0) for x in starts), (1.0, 0.5), (1.0, 0.8), (1.0, 1.25), (1.0, 1.8), (1.0, 3.0)]
         return [Variant(tuple(params), tuple(starts))]
 

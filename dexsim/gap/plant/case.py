@@ -472,6 +472,7 @@ def _case(
         own_inertia=float(np.median(series("own_inertia"))),
         leaf_mass=constants.leaf_mass,
         own_mass=constants.own_mass,
+        velocity_loop=runs[0].servo.loop == "velocity",
         apart=plant.loop == "motor" and plant.position == "joint",
     )
     table = runs[0].servo

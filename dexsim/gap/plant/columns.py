@@ -173,7 +173,13 @@ class Scales:
     own_inertia: float = 0.0
     leaf_mass: float = 0.0  # kg: of the last link, and of the joint's own
     own_mass: float = 0.0
+    velocity_loop: bool = False  # its damping acts on the error of the speed
     apart: bool = False  # the loop reads the motor's encoder, and what is reported is the joint's
+
+    @property
+    def damping(self) -> tuple[str, ...]:
+        """Return the columns that the loop's damping is in."""
+        return ("kd", "speed_feedforward") if self.velocity_loop else ("kd",)
 
     @property
     def effort_zero(self) -> float:

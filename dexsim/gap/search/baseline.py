@@ -96,7 +96,8 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
         if 0 < value < 1e8:
             low, high = case.ranges.get(name, (0.0, 0.0))
             low, high = (low / WIDER, WIDER * high) if high > low else (wide[0] * value, wide[1] * value)
-            out.append(Param(name, (name,), "factor", min(low / value, 1.0), max(high / value, 1.0), 1.0))
+            columns = s.damping if name == "kd" else (name,)
+            out.append(Param(name, columns, "factor", min(low / value, 1.0), max(high / value, 1.0), 1.0))
 
     def most(name: str, high: float) -> None:
         value = min(s.nominal[name], high)
@@ -254,6 +255,8 @@ def write(plain: Baseline, table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
     for name, x in (plain.beside | plain.value | {"standin_constant": plain.value.get("offset", 0.0)}).items():
         if name in SERVO and (x or name != "standin_constant"):
             table.set(plain.joint, name, round(x, 9))
+    if table.loop == "velocity" and "kd" in plain.value:
+        table.set(plain.joint, "speed_feedforward", round(plain.value["kd"], 9))
     if plain.factor and table.fitted is not None:
         table.fitted.setdefault(plain.joint, {}).update({n: round(x, 9) for n, x in plain.factor.items()})
     added = plain.value.get("inertia", 0.0)

@@ -165,10 +165,10 @@ def refitted(case: Case) -> list[Param]:
     return [*out, *_timing(case, taken), *_of_the_drive(case, taken), *_of_the_body(case), *_of_the_sensors(case)]
 
 
-def _within(key: str, column: str) -> Param:
+def _within(key: str, *columns: str) -> Param:
     """A factor on what is believed, within its tolerance."""
     off = BELIEF.tolerance
-    return Param(key, (column,), "factor", 1 - off, 1 + off, 1.0, nuisance=True, sd=0.5 * off)
+    return Param(key, columns, "factor", 1 - off, 1 + off, 1.0, nuisance=True, sd=0.5 * off)
 
 
 def _figures(case: Case) -> list[Param]:
@@ -183,11 +183,12 @@ def _figures(case: Case) -> list[Param]:
         elif name in case.ranges:
             low, high = case.ranges[name]
             if name in ("kp", "kd") or (value > 0 and name in ("torque_limit", "no_load_speed")):
-                out.append(Param(name, (name,), "factor", low / value, high / value, 1.0, nuisance=True))
+                columns = s.damping if name == "kd" else (name,)
+                out.append(Param(name, columns, "factor", low / value, high / value, 1.0, nuisance=True))
             else:
                 out.append(Param(name, (name,), "set", low, high, value, nuisance=True))
         elif name in MEASURED and 0 < value < 1e8:
-            out.append(_within(name, name))
+            out.append(_within(name, *(s.damping if name == "kd" else (name,))))
     return out
 
 
