@@ -114,10 +114,12 @@ def export(
         path = part / bundle.POLICY
         with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
             warnings.simplefilter("ignore")
-            torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False,
-                              opset_version=OPSET,
-                              input_names=["observation"], output_names=["action"],
-                              dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
+            keeps = _state(model)
+            batch = {"observation": {0: "batch"}, "action": {0: "batch"}} if not keeps else None
+            given = (torch.zeros(1, env.obs["actor"].shape[1]), *(torch.zeros(n, 1, m) for n, m in keeps.values()))
+            torch.onnx.export(model, given, str(path), dynamo=False, opset_version=OPSET,
+                              input_names=["observation", *(f"{k}_in" for k in keeps)],
+                              output_names=["action", *(f"{k}_out" for k in keeps)], dynamic_axes=batch)  # fmt: skip
             of = measure.of(env.task["name"])
             if hasattr(of, "write"):
                 of.write(env, part / bundle.TERMS, OPSET)
@@ -125,6 +127,8 @@ def export(
         np.savez_compressed(part / bundle.GOLDEN, **rows)
         measured = Calibration.default(env.effort.double().numpy(), env.hand) if measured is None else measured
         m = manifest(env, data, measured, path, len(rows["observation"]))
+        if keeps:
+            m["policy"]["state"] = {k: list(shape) for k, shape in keeps.items()}
         if not env.hand.comes_along:
             _copy_hand(env.hand, part / bundle.HAND)
         (part / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
@@ -135,6 +139,30 @@ def export(
     print(f"policy   {checkpoints.provenance(data)}")
     print(f"bundle   {out}")
     return out
+
+
+def _state(model: Any) -> dict[str, tuple[int, int]]:
+    """What a recurrent network carries from step to step, by name: layers and size; empty for any other."""
+    if not getattr(model, "is_recurrent", False):
+        return {}
+    return dict.fromkeys(("h", "c") if model.rnn_type == "lstm" else ("h",), (model.num_layers, model.hidden_size))
+
+
+def _actions(model: Any, rows: Any, begins: list[bool]) -> Any:
+    """Actions [n, A] of observations [n, D]; a recurrent network's in order, its state zero where an episode begins."""
+    import torch
+
+    keeps = _state(model)
+    if not keeps:
+        return model(rows)
+    out, state = [], ()
+    for row, fresh in zip(rows, begins, strict=True):
+        if fresh:
+            state = tuple(torch.zeros(n, 1, m) for n, m in keeps.values())
+        action, *new = model(row[None], *state)
+        state = tuple(x for x in new if x is not None)
+        out.append(action)
+    return torch.cat(out)
 
 
 MOST_HAND = 256 << 20
@@ -176,9 +204,8 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     observations = of.SIGNALS
     seen: list[Any] = []  # the `Signals` of the task
     build = observations.build
-    kept: dict[str, list] = {
-        k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))
-    }
+    names = ("observation", "q", "before", "target", "begins", *(f"signal_{n}" for n in observations.Signals._fields))
+    kept: dict[str, list] = {k: [] for k in names}
 
     def watch(signals: Any, settings: Any) -> Any:
         seen.append(type(signals)(*(x.clone() for x in signals)))  # some are the task's own memory
@@ -189,13 +216,17 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     try:
         with torch.no_grad():
             env.reset_all()
+            begins = True
             for _ in range(steps):
                 obs = env.get_observations()
                 signals, q, before = seen[-1], env.q.clone(), env.target.clone()
                 env.step(policy(obs))
                 if bool(env.done[0]):
+                    begins = True
                     continue  # the target is the new episode's
                 kept["observation"].append(obs["actor"][0])
+                kept["begins"].append(torch.tensor(begins))
+                begins = False
                 for name, value in zip(signals._fields, signals, strict=True):
                     kept[f"signal_{name}"].append(value[0].clone())
                 for name, value in (("q", q[0]), ("before", before[0]), ("target", env.target[0].clone())):
@@ -214,7 +245,8 @@ def _with_random(kept: dict[str, list], model: Any, steps: int, seed: int) -> di
     spread = episode.mean(0) + 3 * episode.std(0).clamp(min=0.05) * torch.randn(steps, episode.shape[1], generator=rng)
     with torch.no_grad():
         everything = torch.cat([episode, spread])
-        action = model(everything)
+        begins = [bool(x) for x in kept["begins"]] + [True] * steps
+        action = _actions(model, everything, begins)
     out = {k: torch.stack(v).numpy() for k, v in kept.items() if k != "observation"}
     return out | {"observation": everything.numpy(), "action": action.numpy()}
 
@@ -331,11 +363,13 @@ def check(path: str | Path) -> bool:
     rule = ActionRule.from_manifest(m["action"])
     try:
         built = _rebuilt(of, b, rows) - observation[:n]
+        begins = [*rows["begins"], *[True] * (len(observation) - n)] if "begins" in rows else [True] * len(observation)
+        single = _in_order(b, observation, begins)
+        whole = single if b.recurrent else b.act(observation)
         targets = np.stack(
-            [rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)]
+            [rule.target(a, t, q) for a, t, q in zip(whole[:n], rows["before"], rows["q"], strict=True)]
         )
-        single = np.concatenate([b.act(row[None]) for row in observation])
-        whole, aimed = b.act(observation), targets - rows["target"]
+        aimed = targets - rows["target"]
         single - expected, whole - expected
     except KeyError as error:
         raise UserError(f"{file}: lacks {error}; export the bundle again") from None
@@ -363,6 +397,18 @@ def check(path: str | Path) -> bool:
             file=sys.stderr,
         )
     return good
+
+
+def _in_order(b: Any, observation: Any, begins: list[bool]) -> Any:
+    """Actions [n, A] of observations [n, D], one after another; begins: where an episode does."""
+    import numpy as np
+
+    out = []
+    for row, fresh in zip(observation, begins, strict=True):
+        if fresh:
+            b.begin()
+        out.append(b.act(row[None]))
+    return np.concatenate(out)
 
 
 def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:

@@ -35,6 +35,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "cli excite export import_object",
         "import_hand",  # lets objects fall as `task=grasp` does, by the settings that the command line reads
         "api",
+        "gym",
     )
 )
 """Parts of dexsim from the ground up. A part imports itself and lower floors only."""

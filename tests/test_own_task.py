@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -335,6 +337,26 @@ def test_touch_is_clean_for_the_critic():
     assert (obs["critic"][:, at : at + 5] != obs["actor"][:, 5:10]).any()
 
 
+# -- gymnasium
+@pytest.mark.slow
+def test_gymnasium_makes_tasks_by_name():
+    import gymnasium
+
+    import dexsim.gym  # noqa: F401  (registers)
+
+    given = {"device": "cpu", "settings": ["preset=none"]}
+    one = gymnasium.make("dexsim/Grasp-v0", render_mode="rgb_array", **given)
+    first, _ = one.reset(seed=1)
+    obs, paid, over, cut, _ = one.step(one.action_space.sample())
+    assert first.shape == obs.shape == one.observation_space.shape and isinstance(paid, float) and not (over or cut)
+    picture = one.render()
+    assert picture.shape == (480, 640, 3) and picture.std() > 5
+    batch = gymnasium.make("dexsim/Grasp-v0", num_envs=3, **given)
+    assert batch.reset()[0].shape == (3, *obs.shape)
+    many = gymnasium.make_vec("dexsim/Grasp-v0", num_envs=3, **given)
+    assert many.reset()[0].shape == (3, *obs.shape) and many.render()[0].shape == (480, 640, 3)
+
+
 # -- scenes
 def test_a_scene_without_an_object():
     class Alone(Flat):
@@ -460,3 +482,25 @@ def test_the_tasks_of_before_bit_for_bit(name, steps):
     if first != GOLDEN[name]["first"]:
         pytest.skip("another processor, whose last bits differ")
     assert found == GOLDEN[name]["hashes"][: len(found)]
+
+
+# -- the page
+@pytest.mark.slow
+def test_the_tutorials_code_trains_plays_and_exports(tmp_path):
+    """Its code, out of the page into an empty folder, by the commands of the page."""
+    page = (ROOT / "docs" / "tutorials" / "own_task.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(from dexsim.tasks import Task, done.*?)```", page, re.S)[1]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 40
+    (tmp_path / "catch_it.py").write_text(code)
+
+    def run(*words):
+        command_ = [sys.executable, "-m", "dexsim", *words, "task=catch_it:CatchIt"]
+        env = os.environ | {"PYTHONPATH": str(ROOT)}
+        done_ = subprocess.run(command_, cwd=tmp_path, capture_output=True, text=True, env=env)
+        assert done_.returncode == 0, done_.stdout[-2000:] + done_.stderr[-2000:]
+        return done_.stdout
+
+    run("train", "worlds=4", "iterations=2", "device=cpu", "final_episodes=0", "out=run")
+    said = run("play", "checkpoint=run/policy.pt", "episodes=4", "device=cpu", "video=false", "out=play")
+    assert "height_at_the_end" in said and (tmp_path / "play" / "metrics.json").is_file()
+    assert "largest difference 0 over" in run("export", "checkpoint=run/policy.pt", "out=bundle")

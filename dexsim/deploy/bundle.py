@@ -36,9 +36,23 @@ class Bundle:
     session: Any
     hand: Hand
 
+    def __post_init__(self) -> None:
+        self._carried: dict[str, np.ndarray] = {}
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether the policy remembers from step to step."""
+        return bool(self.manifest["policy"].get("state"))
+
+    def begin(self) -> None:
+        """An episode begins: a recurrent policy forgets."""
+        self._carried = {}
+
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions [N, A] of observations [N, D], float32."""
-        return _act(self.session, self.manifest["policy"], observation)
+        """Actions [N, A] of observations [N, D], float32; of a recurrent policy N is 1, and the next follows this."""
+        p = self.manifest["policy"]
+        action, self._carried = _act(self.session, p, observation, self._carried or _blank(p))
+        return action
 
     @property
     def config(self) -> dict[str, Any]:
@@ -156,15 +170,25 @@ def _tensors(message: Any) -> Iterator[Any]:
             yield from _tensors(inner)
 
 
-def _act(session: Any, p: dict[str, Any], observation: np.ndarray) -> np.ndarray:
-    return session.run([p["output"]], {p["input"]: np.asarray(observation, np.float32)})[0]
+def _blank(p: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What a recurrent policy carries as an episode begins."""
+    return {k: np.zeros((layers, 1, size), np.float32) for k, (layers, size) in (p.get("state") or {}).items()}
+
+
+def _act(
+    session: Any, p: dict[str, Any], observation: np.ndarray, carried: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Actions, and what is carried on."""
+    given = {p["input"]: np.asarray(observation, np.float32)} | {f"{k}_in": v for k, v in carried.items()}
+    action, *new = session.run([p["output"], *(f"{k}_out" for k in carried)], given)
+    return action, dict(zip(carried, new, strict=True))
 
 
 def _tried(data: bytes, policy: Path, p: dict[str, Any]) -> None:
     """The network answers an observation of zeros with one finite action a joint."""
     loaded = session(data, policy)
     try:
-        out = np.asarray(_act(loaded, p, np.zeros((1, p["observation_size"]), np.float32)))
+        out = np.asarray(_act(loaded, p, np.zeros((1, p["observation_size"]), np.float32), _blank(p))[0])
     except Exception as error:  # onnxruntime's
         raise UserError(
             f"{policy}: does not take the observations that {MANIFEST} states: {str(error).splitlines()[0][:160]}"

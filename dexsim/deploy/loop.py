@@ -571,6 +571,7 @@ class Loop:
     def _begin_run(self, now: float) -> None:
         self.phase, self._began = RUN, now
         self.measure.reset()
+        self.bundle.begin()
         self._unseen, self._nonsense = None, Lasting()
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)

@@ -18,16 +18,19 @@ Joints = Annotated[list[Real], msgspec.Meta(min_length=1, max_length=256)]
 JointsAbove = Annotated[list[Positive], msgspec.Meta(min_length=1, max_length=256)]
 Several = Annotated[list[Real], msgspec.Meta(max_length=4096)]
 Any_ = dict[str, Any]
+Layers = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
 
 
 class Network(msgspec.Struct):
-    """The file's digest, names and sizes of its input and output."""
+    """The file's digest, names and sizes of its input and output; state: of a recurrent one, what it carries from step
+    to step by name (inputs NAME_in, outputs NAME_out), layers and size of each."""
 
     sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
     input: str
     output: str
     observation_size: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
     action_size: Annotated[int, msgspec.Meta(ge=1, le=256)]
+    state: dict[str, tuple[Layers, Layers]] = {}
 
 
 class Row(msgspec.Struct):

@@ -1,7 +1,7 @@
 """A dexsim environment as a ``gymnasium.vector.VectorEnv``: the same object, other conventions.
 
-    from dexsim.tasks import make_env
-    envs = GymVectorEnv(make_env(cfg, n_worlds=64, device="cpu", seed=1, engine="auto"))
+    envs = gymnasium.make_vec("dexsim/Grasp-v0", num_envs=64)      # any task, by its name; or
+    envs = GymVectorEnv(dexsim.make_env(task=Lift, worlds=64))
     obs, info = envs.reset(seed=1)
     obs, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
 """
@@ -34,12 +34,16 @@ class GymVectorEnv(VectorEnv):
         as_torch: return and take torch tensors on the environment's device instead of NumPy arrays.
     """
 
-    def __init__(self, env: Any, group: str = "actor", as_torch: bool = False) -> None:
+    def __init__(
+        self, env: Any, group: str = "actor", as_torch: bool = False, render_mode: str | None = "rgb_array"
+    ) -> None:
         first = env.get_observations()
         if group not in first.keys():
             raise UserError(f"group={group}: this environment has the observation groups {', '.join(first.keys())}")
         self.env, self.num_envs, self._group, self._torch = env, int(env.num_envs), group, as_torch
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": [], "render_fps": round(1 / env.dt)}
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"],
+                         "render_fps": round(1 / env.dt)}  # fmt: skip
+        self.render_mode = render_mode
         env.keep_final_obs = True
         size = first[group].shape[-1]
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
@@ -74,6 +78,12 @@ class GymVectorEnv(VectorEnv):
                 info["final_obs"] = self._out(extras["final_obs"][self._group])
             info["_final_obs"] = self._out(done)
         return self._out(obs[self._group]), self._out(reward), self._out(done & ~truncated), self._out(truncated), info
+
+    def render(self, worlds: int = 4) -> tuple[np.ndarray, ...] | None:
+        """Pictures [H, W, 3] uint8 of the first worlds, without a display; None with render_mode=None."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.env.render(k) for k in range(min(worlds, self.num_envs)))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environment, too (called by ``close``)."""

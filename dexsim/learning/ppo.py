@@ -12,7 +12,6 @@ from typing import Any
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # rsl-rl imports GitPython, which fails where git is not installed
 
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
@@ -73,7 +72,7 @@ def scale_first_actions(actor: torch.nn.Module, factor: object) -> None:
         last.bias.mul_(factor)
 
 
-def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> MLPModel:
+def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> Any:
     """Return the trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:
@@ -98,7 +97,32 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
                 f"{path}: its policy's actions are not finite in this environment; its weights are out of range, use an"
                 " earlier checkpoint of its run folder"
             )
-    return actor
+    return by_episode(actor, env)
+
+
+def by_episode(actor: Any, env: Any) -> Any:
+    """The actor itself; a recurrent one so that its state begins anew where an episode of ``env`` does."""
+    return ByEpisode(actor, env) if actor.is_recurrent else actor
+
+
+class ByEpisode:
+    """A recurrent actor of an environment: observations TensorDict -> actions [N, A]. Its state is zero at the first
+    step of each episode, whoever plays it; all else is the actor's."""
+
+    def __init__(self, actor: Any, env: Any):
+        self.actor, self._env = actor, env
+        actor.reset()
+
+    def __call__(self, obs: TensorDict) -> torch.Tensor:
+        state, fresh = self.actor.get_hidden_state(), self._env.episode_length_buf == 0
+        if state is not None:
+            parts = state if isinstance(state, tuple) else (state,)
+            parts = tuple(torch.where(fresh[None, :, None], 0.0, part) for part in parts)
+            self.actor.reset(None, parts if isinstance(state, tuple) else parts[0])
+        return self.actor(obs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.actor, name)
 
 
 def plain_policy(name: str, env: Any, seed: int) -> Policy:

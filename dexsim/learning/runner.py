@@ -14,7 +14,7 @@ from typing import Any
 
 from dexsim.learning import checkpoint, names, weights_and_biases
 from dexsim.learning.meter import Meter
-from dexsim.learning.ppo import agent_config, agent_errors, scale_first_actions
+from dexsim.learning.ppo import agent_config, agent_errors, by_episode, scale_first_actions
 from dexsim.learning.ranks import Ranks, seed_all
 from dexsim.tasks import worlds
 
@@ -340,4 +340,4 @@ class Runner(OnPolicyRunner):
     def policy(self) -> Any:
         """Return the actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
         self.alg.eval_mode()
-        return self.alg.get_policy()
+        return by_episode(self.alg.get_policy(), self.env)

@@ -167,6 +167,7 @@ class HandEnv(VecEnv):
         if self.reality is not None:
             self.reality.change_model(spec)
         self._drawn: mujoco.MjModel | None = None
+        self._frames: tuple[Any, dict[int, mujoco.MjModel]] | None = None
         self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
         for geom in list(spec.geoms):
             if not geom.contype and not geom.conaffinity:
@@ -726,6 +727,21 @@ class HandEnv(VecEnv):
                 getattr(model, name)[g] = value
             model.geom_group[g] = 0
         return model
+
+    def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+        """A picture [H, W, 3] uint8 of one world as it is now, without a display; size: width, height. Raises
+        UserError where no OpenGL opens."""
+        from dexsim.view.frames import Frames
+
+        if self._frames is None or self._frames[0].size != size:
+            self._frames = Frames(size, self.camera), {}
+        frames, models = self._frames
+        model = models.get(world)
+        fresh = int(self._episode_length[world]) <= 1  # an episode's object may be another
+        if model is None or fresh:
+            models.clear()
+            model = models[world] = self.drawn_model(world)
+        return frames(model, self.engine.t.qpos[world].double().cpu().numpy())
 
     def close(self) -> None:
         """Give back memory and threads at once; afterwards nothing but `close` may be called.

@@ -1,5 +1,4 @@
 """Lift objects from a table with a hand on a base of six servos, and hold them up against pushes."""
-
 from __future__ import annotations
 
 import torch
@@ -24,10 +23,8 @@ class Lift(Task):
             "baked_scales": [1.0, 1.15],
         },
         "presets": {
-            "cuda": {
-                "worlds": 8192, "iterations": 2500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
-                "agent": {"num_steps_per_env": 16, "algorithm": {"gamma": 0.99, "entropy_coef": 0.002}},
-            },
+            "cuda": {"worlds": 8192, "iterations": 2500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+                     "agent": {"num_steps_per_env": 16, "algorithm": {"entropy_coef": 0.002}}},
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
         },
     }  # fmt: skip

@@ -1,0 +1,66 @@
+"""Renders pictures of a world in this process, without a display: EGL, else OSMesa, whichever opens."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim import system
+from dexsim.view.render import CAMERA, backdrop
+from dexsim.view.video import NoRenderer
+
+
+class Frames:
+    """Renders worlds of one scene. size: width, height; camera: what differs from the usual view (`render.CAMERA`)."""
+
+    def __init__(self, size: tuple[int, int] = (640, 480), camera: dict[str, Any] | None = None):
+        self.size, self._view = size, CAMERA | (camera or {})  # type: ignore[operator]
+        self._behind = backdrop(size[1], size[0])
+        self._renderer: Any = None
+        self._model: Any = None
+
+    def __call__(self, model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+        """The picture [H, W, 3] uint8 of a model at qpos [nq]. Raises NoRenderer."""
+        if self._model is not model:
+            self.close()
+            model.vis.global_.offwidth, model.vis.global_.offheight = self.size
+            model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
+            model.vis.map.znear = 0.02
+            self._renderer, self._model = _renderer(model, *self.size), model
+            self._data, self._camera = mujoco.MjData(model), mujoco.MjvCamera()
+            self._camera.lookat[:], self._camera.distance = self._view["lookat"], self._view["distance"]
+            self._camera.azimuth, self._camera.elevation = self._view["azimuth"], self._view["elevation"]
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        picture = self._renderer.render()
+        return np.where(picture.any(axis=2, keepdims=True), picture, self._behind)
+
+    def close(self) -> None:
+        """Give back the context."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = self._model = None
+
+
+def _renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
+    """MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is imported, and
+    chooses a window where nothing is said, so the choice is made here."""
+    contexts = importlib.import_module("mujoco.rendering.classic.gl_context")
+    reasons = []
+    for backend in system.renderers():
+        os.environ |= {k: v for k, v in system.renderer_environment(backend).items() if k not in os.environ}
+        try:
+            if backend in system.RENDERERS["linux"]:
+                own: Any = importlib.import_module(f"mujoco.{backend}")
+                contexts.GLContext = own.GLContext  # type: ignore[attr-defined]
+            return mujoco.Renderer(model, height, width)
+        except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
+            reasons.append(f"{backend}: {(str(error).splitlines() or [type(error).__name__])[0]}")
+    raise NoRenderer(
+        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {system.INSTALL}"
+    )
