@@ -261,6 +261,7 @@ def _of_the_sensors(case: Case) -> list[Param]:
     return out
 
 
+SLOWER = 2.5  # the last parts of a search take longest: of its time this power of its share is over
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate
 SHARE, MOST = 0.16, 2.0  # of recordings that are longer as much is simulated, up to so many times the budget
@@ -350,7 +351,7 @@ class JointHypotheses:
         """Tells that about this share of the work that was left is done: how many effects there are to look for is not
         known before."""
         self._part += (1 - self._part) * share
-        self.tell(self._part)
+        self.tell(self._part**SLOWER)
 
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
         """Block of each residual [m]: half-second stretches of one window."""
