@@ -43,7 +43,7 @@ def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str) 
     else:
         text = f"{faults},seed={seed}"
         hand = faked(b.config, c, text, seed, False, shape, grip, 1.0, clock=None if way == "process" else clock)
-    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, **slack), clock)
+    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5, **slack), clock)
     try:
         report = loop.run()
         place = hand.place(clock.now())[0]

@@ -36,12 +36,10 @@ def b(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """One hand model for all loops here, and no collection of torch's whole heap before each."""
-    from dexsim.deploy import loop, measure
+    """No collection of torch's whole heap before each loop."""
+    from dexsim.deploy import loop
 
     with pytest.MonkeyPatch.context() as patch:
-        model = measure.HandKinematics()
-        patch.setattr(measure, "HandKinematics", lambda hand: model)
         patch.setattr(loop.gc, "collect", lambda: 0)
         yield
 

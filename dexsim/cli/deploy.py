@@ -21,11 +21,15 @@ clear of a real hand, and try driver=sim first. On a machine that does other wor
 
 settings (key=default):
   bundle=             folder of dexsim export
-  driver=sim          sim, xhand (the vendor's package), what an installed package brings, or module:Class
+  driver=sim          sim, xhand (the vendor's package), ros2, what an installed package brings, or module:Class
   port=auto           driver=xhand: auto asks every serial port for the hand; a port (/dev/ttyACM1), ethercat or
                       ethercat:INTERFACE; fake: the simulated hand behind a fake of the vendor's package, with faults
                       as in fake:crc=0.005,board=2 (dexsim/deploy/fake_xhand.py)
   serial=             driver=xhand: the hand with this serial number, of several
+  ros2=               driver=ros2: topics of states and commands (default: /joint_states,/joint_commands), both
+                      sensor_msgs/JointState; a command's effort is the current limit [mA], 0 lets go
+  ros2_message=       joint_state, or xhand: the messages of the vendor's ROS driver (needs rclpy)
+  ros2_effort=1       mA a unit of the states' effort
   seconds=10          of the policy, after homing
   command=0.5         grasp: commanded force, 0..1 of F_max
   calibration=        calibration.yaml instead of the bundle's
@@ -50,7 +54,8 @@ safety (key=default):
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
-OWN = ("bundle", "driver", "port", "serial", "calibration", "record", "vision", "place", "imu", "shape", "seed", "task")
+OWN = ("bundle", "driver", "port", "serial", "ros2", "ros2_message", "ros2_effort", "calibration", "record", "vision",
+       "place", "imu", "shape", "seed", "task")  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> int:
@@ -83,6 +88,8 @@ def main(argv: Sequence[str]) -> int:
         calibration = Calibration.load(given["calibration"], base, b.hand)
     else:
         calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
+    if given.get("port", "").startswith("fake"):
+        changes.setdefault("seen", 0.3)  # the fake's world is seen over its bus: after its pauses and outliers
     settings = LoopSettings(**changes)
     settings.check()
     if "command" in changes and "command" not in of(b.manifest["task"]).OPTIONS:
@@ -169,29 +176,34 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
             raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
         place = FixedPlace(at)
     fake = given.get("port", "").split(":")[0] == "fake"
-    if kind not in ("sim", "xhand"):
+    if kind not in ("sim", "xhand", "ros2"):
         return _own(kind, given, b, calibration, place)
     if kind == "xhand" and b.hand.name != "xhand":
         raise UserError(
             f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
             " hand (dexsim/deploy/driver.py)"
         )
-    wrong: list[str] = [k for k in ("port", "serial") if kind == "sim" and k in given]
-    wrong += [k for k in ("vision", "shape", "seed") if kind == "xhand" and not fake and k in given]
+    wrong: list[str] = [k for k in ("port", "serial") if kind != "xhand" and k in given]
+    wrong += [k for k in ("ros2", "ros2_message", "ros2_effort") if kind != "ros2" and k in given]
+    wrong += [k for k in ("vision", "shape", "seed") if kind != "sim" and not fake and k in given]
     wrong += [k for k in ("imu",) if (kind == "sim" or fake) and k in given]
     if wrong:
         raise UserError(f"{wrong[0]}={given[wrong[0]]}: driver={kind} does not use it{' with port=fake' * fake}")
-    if kind == "xhand" and not fake:
-        from dexsim.deploy.vendor import VendorXHand
-
+    if kind == "ros2" or (kind == "xhand" and not fake):
         needs = of(task).measure(b, calibration).needs
         if needs == PLACE and place is None:
             raise UserError(
-                'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your'
-                " own HeightSource (dexsim.deploy.vision)"
+                f'driver={kind}: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with'
+                " your own HeightSource (dexsim.deploy.vision)"
             )
-        side = b.hand.handedness
-        driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
+        driver: Any = None
+        if kind == "ros2":
+            driver = _ros2(given, b.hand)
+        else:
+            from dexsim.deploy.vendor import VendorXHand
+
+            side = b.hand.handedness
+            driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
         return driver, _imu(given, b) if needs == ORIENTATION else place
     vision = given.get("vision", "truth")
     if vision not in ("truth", "camera"):
@@ -220,13 +232,26 @@ def _own(kind: str, given: dict[str, str], b: Any, calibration: Any, place: Any)
     full: called with hand=, port= (None where none is given) and calibration=; and what sees the object."""
     brought = door.installed("dexsim.drivers")
     if kind not in brought and not door.is_named(kind):
-        raise UserError(f"driver={kind}: must be {', '.join(('sim', 'xhand', *brought))}, or module:Class of your own")
+        known = ", ".join(("sim", "xhand", "ros2", *brought))
+        raise UserError(f"driver={kind}: must be {known}, or module:Class of your own")
     make = door.load(brought[kind].value if kind in brought else kind, f"driver={kind}")
     driver = make(hand=b.hand, port=given.get("port"), calibration=calibration)
     lacks = [x for x in ("open", "read", "send", "relax", "close") if not callable(getattr(driver, x, None))]
     if lacks:
         raise UserError(f"driver={kind}: has no {', '.join(lacks)}; see dexsim.deploy.driver.HandDriver")
     return driver, place or (_imu(given, b) if "imu" in given else driver)
+
+
+def _ros2(given: dict[str, str], hand: Any) -> Any:
+    from dexsim.deploy.ros2 import COMMAND, MESSAGES, STATE, Ros2Hand
+
+    state, _, command = given.get("ros2", "").partition(",")
+    message, effort = given.get("ros2_message", MESSAGES[0]), typed.real(given.get("ros2_effort", "1"))
+    if message not in MESSAGES:
+        raise UserError(f"ros2_message={message}: must be one of {', '.join(MESSAGES)}")
+    if not 0 < abs(effort) < 1e6:
+        raise UserError(f"ros2_effort={given['ros2_effort']}: must be a number of mA, within 1e6 and not 0")
+    return Ros2Hand(hand, state or STATE, command or COMMAND, message=message, effort=effort)
 
 
 def _imu(given: dict[str, str], b: Any) -> Any:

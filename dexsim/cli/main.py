@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
+    "record": Command("dexsim.cli.record:main", "record a robot over ROS 2"),
     "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
     "convert": Command("dexsim.recording.convert:main", "write a log (CSV, NPZ, a bag) as a recording"),
     "import-hand": Command("dexsim.import_hand.command:main", "make a hand of a robot's URDF or MJCF file"),

@@ -160,6 +160,8 @@ class FakeXHand:
         """The hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
         if t - self._slip - self.hand.time > 0.25:
             self._slip = t - self.hand.time - TRIP
+        while self.hand.time < t - self._slip - TRIP:  # what looks at the object does so all the while
+            self.hand.advance(self.hand.time + TRIP)
         self.hand.advance(t - self._slip)
         return self.hand.state(t + self.zero)
 

@@ -40,6 +40,8 @@ _HEAD = 8  # numbers at the start of a command: number, era, mode, kp, ki, kd, w
 class Body(Protocol):
     """A hand behind its bus. due [s]: when the next cycle begins, or a slow hand's next state is there."""
 
+    clock: Clock
+
     @property
     def due(self) -> float: ...
 
@@ -105,8 +107,9 @@ class BusDriver:
             info = self.body.open()
             self.clock.sleep_until(own.now())  # it has taken its time
             self._command: HandCommand | None = None
-            self._waiting: list[HandState] = []
+            self._waiting: list[tuple[float, HandState | None, np.ndarray]] = []
             self._state: HandState | None = None
+            self._object_row = np.full(_SEEN, np.nan)
             return info
         context = multiprocessing.get_context("spawn")
         shared = _shared(context, self.joints, self.taxels)
@@ -245,7 +248,8 @@ class BusDriver:
 
     def _object_seen(self, part: slice) -> tuple[np.ndarray, float] | None:
         if self.body is not None:
-            row = self.body.seen()[part]
+            self._step(self.body)
+            row = self._object_row[part]
         else:
             row = self._v["state"][max(self._v["newest"].value, 0) % 2, -_SEEN:][part].copy()
         return None if not np.isfinite(row).all() else (row[:-1], float(row[-1]))
@@ -282,10 +286,10 @@ class BusDriver:
         now = self.clock.now()
         while body.due <= now + 1e-6:
             state = body.cycle(self._command)
-            if state is not None:
-                self._waiting.append(state)
-        while self._waiting and self._waiting[0].time <= now + 1e-6:
-            self._state = self._waiting.pop(0)
+            self._waiting.append((body.clock.now() if state is None else state.time, state, body.seen()))
+        while self._waiting and self._waiting[0][0] <= now + 1e-6:
+            _, state, self._object_row = self._waiting.pop(0)
+            self._state = state or self._state
         return self._state
 
     def _gone(self) -> bool:
@@ -392,7 +396,7 @@ def _serve(
                 )
             if era < max(v["era"].value, silent_at) or v["stop"].value:
                 command = HandCommand(command.position, np.zeros(joints), 0, mode=PASSIVE)
-        if v["stop"].value or alone:
+        if alone or (v["stop"].value and v["sent"].value == taken):  # what was sent before it is carried out
             last = min(last, now + LAST)
             if command is None or body.released() is not None or now > last:
                 break

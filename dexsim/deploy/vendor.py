@@ -83,7 +83,7 @@ class XHandBus:
     @property
     def due(self) -> float:
         """When the next round trip may begin [s]."""
-        return self.clock.now()
+        return max(self.clock.now(), self._pause_until)
 
     # -- opening
     # ---------------------------------------------------------------------------------------------------------------
