@@ -44,6 +44,7 @@ from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.reality import Reality, present
+from dexsim.tasks.recorded import Constants, unrecordable
 from dexsim.tasks.scenes import BASE, Scene, Slide, fasten, furnish, mount
 from dexsim.tasks.structs import filled
 from dexsim.tasks.watched import Watched, unread
@@ -442,13 +443,15 @@ class HandEnv(VecEnv):
             return
         self._runs[name] = self._runs.get(name, 0) + 1
         if self._runs[name] <= 2:
-            part()
+            with self._constants:
+                part()
             return
         graph = self._recorded.get(name)
         if graph is None:
             graph = torch.cuda.CUDAGraph()
             graph.register_generator_state(self.rng)
-            with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+            how = {"stream": torch.cuda.current_stream(), "capture_error_mode": "thread_local"}
+            with unrecordable(self.task["name"]), self._constants, torch.cuda.graph(graph, **how):
                 part()
             self._recorded[name] = graph
         graph.replay()
@@ -660,6 +663,7 @@ class HandEnv(VecEnv):
         self.skip_idle_resets = self.engine.kind == "mujoco"
         self._runs: dict[str, int] = {}
         self._recorded: dict[str, torch.cuda.CUDAGraph] = {}
+        self._constants = Constants(self.device)
         self.obs: dict[str, torch.Tensor] = {}
         self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
 
