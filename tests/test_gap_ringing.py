@@ -97,17 +97,24 @@ def answer_of(soft: JointSearch, found) -> JointAnswer:
     return JointAnswer(soft.case, soft, found, Kept([None] * 3, [0, 1], [2], None, None))
 
 
-def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft):
+def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft, monkeypatch):
     """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
     does is a hint, and is not handed on."""
     answer = answer_of(soft, ringing.answered(soft, soft.without_search()))
     assert rms(answer.after) > rms(answer.before)
-    plainly = {"joint": "a plain model follows better"}  # it does not ring, and keeps step with nothing either
-    assert conclude._withheld(plainly, [answer], {"joint"}) == {}
-    assert conclude._withheld(plainly, [answer], set()) == plainly
+    plain = SimpleNamespace(joint="joint", error_before=1.0, error=1e-9)  # it does not ring, and follows no better
+
+    def written():
+        given, refused = conclude.candidates([answer], [plain], {}, ("joint",))
+        return [c.name for c in given["joint"]], refused
+
+    assert written() == (["found", "found, as fitted"], {})
+    monkeypatch.setattr(conclude, "_rings", lambda a: 0.0)
+    assert written()[0][0] == "believed" and written()[0][-1] == "plain"
+    monkeypatch.setattr(conclude, "_rings", lambda a: 1.0)
     answer.after = 3.6 * answer.before
-    worse = conclude._withheld(plainly, [answer], {"joint"})
-    assert "by more with it" in worse["joint"] and conclude._withheld({}, [answer], set()) == {}
+    names, worse = written()
+    assert "by more with it" in worse["joint"] and not any(n.startswith("found") for n in names)
     e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, 0, [], 0.0)
     d = SimpleNamespace(evidence=[e], notes=[])
     conclude._judged_by_ringing(d, {"joint": 0.95})
