@@ -191,7 +191,7 @@ def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[
 
 
 def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """Fit our own least squares to one joint of a part. held: what was held out."""
+    """Fit our own least squares to one joint of a part. held: parts of recordings that were held out (none: all of those files)."""
     from benchmarks.real import baseline
     from dexsim.recording import mechanism, read
     from dexsim.sim.quiet import quiet_warp
@@ -202,6 +202,7 @@ def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, 
     m = mechanism.mechanism(str(part.model), str(part.servo))
     files = {p.name: read(p, joints=m.joints) for p in (*part.recordings, *part.held_out)}
     test = [(files[x["recording"]], x["start"], x["end"]) for x in held]
+    test = test or [(files[p.name], 0.0, np.inf) for p in part.held_out]
     if part.held_out:
         train = [(files[p.name], 0.0, np.inf) for p in part.recordings]
     else:
@@ -268,21 +269,25 @@ def main(argv: list[str]) -> int:
     by, results = {p.name: p for p in parts}, {}
     with ProcessPoolExecutor(max(int(given.get("jobs", 1)), 1), mp_context=get_context("spawn")) as pool:
         waiting = {pool.submit(diagnosed, (p, out, limit)) for p in parts}
+        early = [(p, j) for p in parts if p.held_out and p.judged for j in p.judged]
+        waiting |= {pool.submit(by_hand, (p, out, j, [])) for p, j in early}
+        hand: dict[tuple[str, str], float] = {}
         while waiting:
             done = next(as_completed(waiting))
             waiting.discard(done)
             r = done.result()
             if "joint" in r:
-                results[r["part"]]["joints"][r["joint"]]["by_hand"] = r["error"]
+                hand[r["part"], r["joint"]] = r["error"]
                 continue
             results[r["part"]] = r
             print(f"{r['part']}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
-            waiting |= {pool.submit(by_hand, (by[r["part"]], out, j, r["parts"])) for j in r["joints"] if r["parts"]}
+            late = [j for j in r["joints"] if r["parts"] and (by[r["part"]], j) not in early]
+            waiting |= {pool.submit(by_hand, (by[r["part"]], out, j, r["parts"])) for j in late}
             (out / "written.json").write_text(json.dumps(list(results.values()), default=float), encoding="utf-8")
     ordered = [results[p.name] for p in parts]
     for r in ordered:
-        for row in r["joints"].values():
-            row |= {"passed": judged(row)}
+        for joint, row in r["joints"].items():
+            row |= {"by_hand": hand.get((r["part"], joint)), "passed": judged(row)}
     (out / "written.json").write_text(json.dumps(ordered, default=float), encoding="utf-8")
     print("\n" + text_of(ordered))
     return 0
