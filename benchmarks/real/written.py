@@ -191,7 +191,8 @@ def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[
 
 
 def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """Fit our own least squares to one joint of a part. held: parts of recordings that were held out (none: all of those files)."""
+    """Fit our own least squares to one joint of a part. held: parts of recordings that were held out (none: all
+    of those files)."""
     from benchmarks.real import baseline
     from dexsim.recording import mechanism, read
     from dexsim.sim.quiet import quiet_warp
