@@ -22,6 +22,16 @@ def made(tmp_path_factory):
     return path, export.export(str(path), folder / "bundle", steps=12)
 
 
+def test_a_bundle_carries_the_state(made):
+    assert export.check(made[1])
+    b = bundle.load(made[1])
+    assert b.recurrent and b.manifest["policy"]["state"] == {"h": [1, 16], "c": [1, 16]}
+    row = np.ones((1, b.manifest["policy"]["observation_size"]), np.float32)
+    one, two = b.act(row), b.act(row)
+    b.begin()
+    assert not np.allclose(one, two) and np.array_equal(b.act(row), one)
+
+
 def test_state_begins_anew_with_each_episode(made):
     from dexsim.tasks import make_env
 
@@ -34,13 +44,3 @@ def test_state_begins_anew_with_each_episode(made):
     env.episode_length_buf = torch.tensor([0, 1])  # the first world begins again, the second goes on
     second = policy(obs)
     assert torch.equal(first[0], second[0]) and not torch.allclose(first[1], second[1])
-
-
-def test_a_bundle_carries_the_state(made):
-    assert export.check(made[1])
-    b = bundle.load(made[1])
-    assert b.recurrent and b.manifest["policy"]["state"] == {"h": [1, 16], "c": [1, 16]}
-    row = np.ones((1, b.manifest["policy"]["observation_size"]), np.float32)
-    one, two = b.act(row), b.act(row)
-    b.begin()
-    assert not np.allclose(one, two) and np.array_equal(b.act(row), one)

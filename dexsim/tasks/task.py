@@ -112,7 +112,7 @@ class Task(HandEnv):
         if cls.scene.base is not None:
             raise UserError(
                 f"{source}: its hand moves on a base of six servos, which the deployed loop does not drive; export a"
-                " policy of a fixed hand, or drive base and hand from a loop of your own (docs/howto/deploying.md)"
+                " policy of a fixed hand, or drive base and hand from a loop of your own (docs/tutorials/real_hand.md)"
             )
 
     def __init__(
