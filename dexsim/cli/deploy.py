@@ -106,6 +106,8 @@ def main(argv: Sequence[str]) -> int:
         f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g}"
         " Hz"
     )
+    if given.get("driver", "sim") != "sim":
+        print("note     if this computer dies, the hand keeps its last target: keep its power switch within reach")
     print(f"driver   {driver.name}; starting ...", flush=True)
     with _Stop() as stop:
         try:

@@ -19,8 +19,9 @@ import numpy as np
 from dexsim.deploy.driver import PASSIVE, Clock, HandCommand, HandState
 from dexsim.errors import UserError
 from dexsim.hand import Hand
+from dexsim.recording import schema
 
-STATE, COMMAND = "/joint_states", "/joint_commands"
+STATE, COMMAND = schema.STATES, schema.COMMANDS
 MESSAGES = ("joint_state", "xhand")
 LIMP, WATCH = 30.0, 0.15
 """mA of a limp hand; s that it is watched."""
