@@ -72,7 +72,7 @@ def write_recording(path: File, recording: Recording) -> Path:
 
 
 def replay_recording(
-    recording: Recording, model: File | None = None, servo: File | None = None, timestep: float = 0.002
+    recording: Recording, model: File | None = None, servo: File | None = None, timestep: float = 5e-4
 ) -> Recording:
     """What the simulator makes of a recording's commands, from its first measured position on, without any correction.
 

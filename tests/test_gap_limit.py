@@ -154,7 +154,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
     asked = []
     given = {"j": [full_model.Candidate("believed", 1.0, None)]}
     monkeypatch.setattr(diagnosis.conclude, "candidates", lambda *_: (given, {}))
-    monkeypatch.setattr(full_model, "write_best", lambda *_: asked.append(_[-1]))
+    monkeypatch.setattr(full_model, "write_best", lambda *given: asked.append(given[9]))
     monkeypatch.setattr(diagnosis.logged_torque, "told", lambda *_: {})
     monkeypatch.setattr(diagnosis, "plan_next", lambda *_: asked.append("plan"))
     drives = object.__new__(Drives)

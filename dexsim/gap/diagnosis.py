@@ -563,15 +563,19 @@ class Drives(Steps):
         what = w.m, w.runs, w.by_name, cases, given, self.noise.joints, p.test, p.span_test
         best = partial(full_model.write_best, *what)
         engine = s.replay
-        if engine != "none" and w.limit.spent(1 - PLANNING):
+        if engine != "none" and self._late():
             w.limit.leave_out("not replayed in the engine that trains")
             engine = "none"
         try:
-            self.written = best(s.device, engine)
+            self.written = best(s.device, engine, self._late)
         except UserError as error:
             w.notes.append(f"not replayed in the engine that trains: {error}")
             self.written = best(engine="none")
         w.clock.lap("choice in the engine that trains")
+
+    def _late(self) -> bool:
+        """Return whether the limit of time leaves no more for the choice of what is written."""
+        return self.w.limit.spent(1 - PLANNING)
 
     def report(self, d: Diagnosis) -> None:
         """The joints into a diagnosis: findings, verdict, what is handed on."""
@@ -631,9 +635,12 @@ class Drives(Steps):
             return
         spec = w.m.spec if d.model_spec is None else d.model_spec
         cases = [x.case for x in self.searched]
-        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test)
+        late = lambda: w.limit.spent(1 - 0.5 * PLANNING)  # noqa: E731
+        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test, late)
         if found is None:
             return
+        if len(found.parts) < found.of:
+            w.limit.leave_out(f"the files are replayed over {len(found.parts)} of {found.of} parts held out")
         self.written.replayed = found
         d.data["held_out"]["replayed"] = found.entry()
         if d.data["held_out"]["error"].startswith("position"):

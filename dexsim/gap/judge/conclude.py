@@ -758,7 +758,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         )
         plain = baseline.left_by_what_is_handed_on(data["baseline"]) if metric.startswith("position") else None
         left = (
-            f"{number(before)} {unit} are left"
+            f"{number(after)} {unit} are left"
             if plain is None
             else f"{number(1e3 * plain)} {unit} are left by the plain model, which is handed on,"
         )

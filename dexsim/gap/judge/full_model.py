@@ -101,13 +101,14 @@ class World:
 @dataclass
 class Replayed:
     """What the files leave of what was held out, replayed as they are by the function of `play replay=`: rms [rad or m]
-    over all judged joints, by joint, and by recording and joint; engine; step_s; parts: (recording, start s, end s);
-    whole: whether these are all of what was held out."""
+    over all judged joints, by joint, and by recording and joint; engine; step_s; parts: (recording, start s, end s), of
+    so many that were held out."""
 
     error: float
     joints: dict[str, float]
     recordings: dict[str, dict[str, float]]
     parts: list[tuple[str, float, float]]
+    of: int = 0
     engine: str = "C MuJoCo"
     step_s: float = STEP
 
@@ -527,10 +528,11 @@ def write_best(
     span_test: dict[int, tuple[float, float]] | None,
     device: str = "cpu",
     engine: str = "mujoco",
+    passed: Callable[[], bool] = lambda: False,
 ) -> Written:
-    """Of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m]; engine:
-    of `REPLAY`; none: by the search's own plant. Raises UserError where the model or a drive does not serve the
-    engine."""
+    """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
+    engine: of `REPLAY`; none: by the search's own plant; passed: whether time is up. Raises UserError where the
+    model or a drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if engine == "none" or not cases or not len(windows[0].window):
@@ -565,10 +567,10 @@ def write_best(
         for j, name in choice.items():
             errors[j][name] = found[j]
     chosen = {j: choose(x, noise[j]) for j, x in errors.items()}
-    if len(by) > 1 and len(set(chosen.values())) > 1:
+    if len(by) > 1 and len(set(chosen.values())) > 1 and not passed():
         (together,) = replayed([chosen])
         moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * errors[j][chosen[j]] and len(by[j]) > 1]
-        swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
+        swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]] if not passed() else []
         for (j, k), found in zip(swaps, replayed([chosen | {j: k} for j, k in swaps]), strict=True):
             errors[j][k] = found[j]
         for j in by:
@@ -605,9 +607,10 @@ def replay_files(
     cases: Sequence[Case],
     test: list[int],
     span_test: dict[int, tuple[float, float]] | None,
+    passed: Callable[[], bool] = lambda: False,
 ) -> Replayed | None:
-    """What the files leave of all that was held out, as `play replay=` says it of each recording or part of one; None
-    where there is nothing to replay."""
+    """Replay the files over all that was held out, as `play replay=` does with each recording or part of one; None
+    where there is nothing to replay. passed: whether time is up: further parts are left out then."""
     ws = cases[0].plant.windows(None, test, span=span_test, every_run=True) if cases else None
     if ws is None or not len(ws.window):
         return None
@@ -617,6 +620,8 @@ def replay_files(
     total = {j: np.zeros(2) for j in judged}
     each: dict[str, dict[str, np.ndarray]] = {}
     for w in range(len(ws.window)):
+        if parts and passed():
+            break
         run, rows = int(ws.run[w]), ws.sample_row[ws.sample_window == w]
         r, start, end = recordings[runs[run].name], float(ws.window_t[w]), float(t[rows[-1]])
         start, whole = _start(r, start), float(r.states.position.t[-1]) - end < STEP
@@ -639,4 +644,5 @@ def replay_files(
         {j: rms(x) for j, x in total.items()},
         {name: {j: rms(x) for j, x in given.items()} for name, given in each.items()},
         parts,
+        len(ws.window),
     )
