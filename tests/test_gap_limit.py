@@ -165,6 +165,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
         runs=[],
         settings=settings,
         m=SimpleNamespace(joints=("j",)),
+        readable=[],
         by_name={},
         notes=[],
         clock=SimpleNamespace(lap=lambda _: None),
