@@ -350,7 +350,7 @@ def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: 
 
 @wp.func
 def stribeck_power(ratio: Any, exponent: Any):
-    """p [1] of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed /
+    """Return p [1] of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed /
     stribeck_speed [1].
 
     2: Gaussian (Armstrong-Helouvry 1994, Tustin's exponential is 1); see B. Armstrong-Helouvry, P. Dupont, C. Canudas

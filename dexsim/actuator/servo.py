@@ -203,7 +203,8 @@ class Servo:
         return self.params[:, :, INDEX[column(name).name]]
 
     def check_simulated(self, name: str) -> None:
-        """UserError if the kernel was built without what a column needs: neither the table nor `varied` names it."""
+        """Raise UserError if the kernel was built without what a column needs: neither the table nor `varied` names
+        it."""
         feature = FEATURE_OF.get(column(name).name)
         if feature and feature not in self.features:
             raise UserError(
@@ -323,7 +324,7 @@ class Servo:
 
 
 def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None:
-    """UserError where `coupling_from` is no other joint's number."""
+    """Raise UserError where `coupling_from` is no other joint's number."""
     for j, joint in enumerate(joints):
         source, bounds = nominal[j, INDEX["coupling_from"]], table.value(joint, "coupling")
         used = not bounds.unknown and (bounds.low != 0.0 or bounds.high != 0.0)
@@ -351,7 +352,8 @@ def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
 def _addresses(
     mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int
 ) -> tuple[list[int], list[int]]:
-    """qpos and dof addresses of the named joints; UserError for an unknown name or a joint not a hinge or slide."""
+    """Return the qpos and dof addresses of the named joints; UserError for an unknown name or a joint not a hinge or
+    slide."""
     if len(names) != count:
         raise UserError(f"servo: {len(names)} joints given where {count} are driven: {list(names)}.")
     qpos, dof = [], []

@@ -87,7 +87,7 @@ class Value:
 
 
 def _number(x: Any) -> float | None:
-    """x as a float, or None if it is not a number."""
+    """Return x as a float, or None if it is not a number."""
     number = typed.real(x)
     return None if number != number else number
 
@@ -220,7 +220,7 @@ class ServoTable:
     # -- what holds for a joint ------------------------------------------------------------
 
     def check_joints(self, known: Iterable[str]) -> None:
-        """UserError if the table names a joint that is not among `known`."""
+        """Raise UserError if the table names a joint that is not among `known`."""
         known = list(known)
         for given in (self.entries, self.current_per_torque, self.loop_encoder, self.position_encoder, self.fitted):
             for joint in given if isinstance(given, dict) else ():
@@ -277,7 +277,8 @@ class ServoTable:
         return out
 
     def bounds(self, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """low, high [J, C] float64: the range each value is believed in (the column's whole range where unknown)."""
+        """Return low, high [J, C] float64: the range each value is believed in (the column's whole range where
+        unknown)."""
         values = [[self.value(joint, name) for name in NAMES] for joint in joints]
         return np.array([[v.low for v in row] for row in values]), np.array([[v.high for v in row] for row in values])
 

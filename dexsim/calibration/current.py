@@ -103,8 +103,8 @@ def half(
 
 
 def combine(real: Half | None, sim: Half | None) -> dict[str, dict[str, Any]]:
-    """By joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per N.m) with
-    intervals, normalizations and reasons."""
+    """Return by joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per
+    N.m) with intervals, normalizations and reasons."""
     out: dict[str, dict[str, Any]] = {}
     one = real or sim
     for joint in one.joints if one else ():

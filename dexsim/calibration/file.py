@@ -114,7 +114,7 @@ class Calibration:
         self._order = order
 
     def torque_norm(self, current: np.ndarray) -> np.ndarray:
-        """tau/tau_max [J] from the current as the SDK gives it, in A [J]: what the policy's torque field was in
+        """Return tau/tau_max [J] from the current as the SDK gives it, in A [J]: what the policy's torque field was in
         training. `matched`: the torque whose fingertip force this current was measured to give; `paper`: I / I_max."""
         signed = self.current_sign * np.asarray(current, float)
         scale = self.current_per_torque * self.torque_max if self.normalization == "matched" else self.current_max

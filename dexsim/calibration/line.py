@@ -163,7 +163,7 @@ def _ratio_and_slope(*sums: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """slope, offset by least squares."""
+    """Return slope and offset by least squares."""
     mx, my = x.mean(), y.mean()
     slope = ((x - mx) @ (y - my)) / ((x - mx) @ (x - mx))
     return float(slope), float(my - slope * mx)

@@ -283,7 +283,7 @@ def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, fl
 
 
 def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
-    """The ball touches this tip and nothing else, with the tips' stiffness [N/m]."""
+    """Let the ball touch this tip and nothing else, with the tips' stiffness [N/m]."""
     model = spec.compile()
     d = 0.95
     k = stiffness * (1 - d) * model.body_invweight0[model.geom(tip).bodyid[0], 0]

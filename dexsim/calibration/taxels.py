@@ -198,7 +198,7 @@ def _fits(
 
 
 def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
-    """One common scale from the load; each taxel's gain from its neighbours, or else from the load alone with gains
+    """Fit one common scale from the load; each taxel's gain from its neighbours, or else from the load alone with gains
     believed to lie near one: only if it tells the load of presses that were not fitted (five folds of the recording)
     better than equal gains do."""
     live = np.array([k for k in range(clean.shape[1]) if k not in out.dead and k not in out.unseen])
@@ -213,7 +213,7 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         return float(total @ y[rows] / (total @ total))
 
     def error(way: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Of the load on presses that were not fitted, over the mean load."""
+        """Return the error of the load on presses that were not fitted, over the mean load."""
         rest = []
         for k in range(5):
             gain = way(fold != k)
@@ -232,7 +232,7 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         return local * np.maximum(broad, 0.0)
 
     def from_load(rows: np.ndarray, prior: float) -> np.ndarray:
-        """y = s x (1 + d), d believed to be N(0, prior^2)."""
+        """Solve y = s x (1 + d), d believed to be N(0, prior^2)."""
         gain = np.ones(clean.shape[1])
         a = scale(gain, rows) * x[rows][:, live]
         rest = y[rows] - a.sum(1)

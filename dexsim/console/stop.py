@@ -57,8 +57,8 @@ class Stop:
 
 
 def without_terminal() -> None:
-    """Where the terminal is gone, send what is still printed nowhere: an error of ``print`` must not keep anything from
-    being saved."""
+    """Send, where the terminal is gone, what is still printed nowhere: an error of ``print`` must not keep anything
+    from being saved."""
     for stream, number in ((sys.stdout, 1), (sys.stderr, 2)):
         try:
             stream.write("\n")

@@ -54,7 +54,7 @@ def count(value: float) -> str:
 
 
 def number(v: float, digits: int = 3) -> str:
-    """v with so many digits, without an exponent where a person would not write one."""
+    """Return v with so many digits, without an exponent where a person would not write one."""
     v = float(v)
     if v != 0 and not 1e-4 <= abs(v) < 1e6:
         return f"{v:.{digits}g}"

@@ -169,7 +169,7 @@ class GraphedUpdate:
         return tuple(t.data_ptr() for t in tensors)
 
     def _mini_batch(self) -> None:
-        """One step of the optimizer on the samples `_chosen`."""
+        """Take one step of the optimizer on the samples `_chosen`."""
         alg, st = self.alg, self.alg.storage
         actor, critic, distribution = alg.actor, alg.critic, alg.actor.distribution
 
@@ -210,7 +210,7 @@ class GraphedUpdate:
             self._sums += torch.stack((value, surrogate, entropy))
 
     def _adapt(self, kl: torch.Tensor) -> None:
-        """rsl-rl's adaptive learning rate, on the device."""
+        """Adapt the learning rate as rsl-rl does, on the device."""
         alg, rate = self.alg, self._rate
         lower, higher = (rate / FACTOR).clamp(min=LOWEST), (rate * FACTOR).clamp(max=HIGHEST)
         up = (kl < alg.desired_kl / 2.0) & (kl > 0.0)

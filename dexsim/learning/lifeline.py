@@ -64,7 +64,7 @@ class Lifeline:
         threading.Thread(target=self._watch, name="lifeline", daemon=True).start()
 
     def fail(self, text: str, status: int) -> None:
-        """This rank ends on purpose: the others follow. Rank 0 prints the text of another rank; its own is printed by
+        """End this rank on purpose: the others follow. Rank 0 prints the text of another rank; its own is printed by
         the caller. An empty text: nothing to say. Ranks other than 0 exit here with ``status``."""
         with self._lock:
             self._said = True
@@ -104,7 +104,7 @@ class Lifeline:
                     return
 
     def _end(self, kind: bytes, text: str, rank: int) -> None:
-        """Another rank failed (it said why) or is lost: pass it on, print one line, exit."""
+        """Pass on that another rank failed (it said why) or is lost, print one line, exit."""
         if kind == b"" and self.rank:
             text = "rank 0 is gone; the run ends" if self.rank == 1 else ""  # one speaks for all
         elif kind == b"":

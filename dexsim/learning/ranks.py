@@ -87,7 +87,7 @@ class Ranks:
 
     @contextlib.contextmanager
     def joined(self, device: str) -> Iterator[None]:
-        """Be part of the group; at the end, or when one of the ranks ends early, all end (see ``Lifeline``)."""
+        """Join the group; at the end, or when one of the ranks ends early, all end (see ``Lifeline``)."""
         if self.size == 1:
             yield
             return
@@ -167,7 +167,7 @@ class Ranks:
         return self._lifeline is not None
 
     def on_loss(self, text: str) -> None:
-        """What to add, should another rank be lost from now on: how to go on."""
+        """Set what to add, should another rank be lost from now on: how to go on."""
         if self._lifeline is not None:
             self._lifeline.hint = text
 
@@ -199,7 +199,7 @@ class Ranks:
 
     @contextlib.contextmanager
     def one_compiles(self) -> Iterator[None]:
-        """Around what compiles kernels: the first rank of each machine does it alone, the others then find them
+        """Let one compile: the first rank of each machine does it alone, the others then find them
         cached."""
         first = self.local == 0
         if self.several and not first:
@@ -210,7 +210,7 @@ class Ranks:
 
     @contextlib.contextmanager
     def only_leader_prints(self) -> Iterator[None]:
-        """Standard output of the other ranks goes nowhere; their errors still show."""
+        """Send the standard output of the other ranks nowhere; their errors still show."""
         if self.leader:
             yield
             return

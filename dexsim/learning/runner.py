@@ -98,7 +98,7 @@ class Runner(OnPolicyRunner):
         return sum(w.numel() * w.element_size() for w in self.env.keep_worlds().values()) <= SMALL
 
     def open_writer(self, folder: Path) -> Any:
-        """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
+        """Open rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
         known = self._git["commit"] != "unknown"
         self.logger.log_dir, self.logger.git_status_repos = str(folder), [__file__] if known else []
         with agent_errors():  # rsl-rl writes git/<repository>.diff as well
@@ -176,7 +176,7 @@ class Runner(OnPolicyRunner):
         }
 
     def _go_back(self, moment: dict[str, Any]) -> None:
-        """To the moment before a rollout."""
+        """Return to the moment before a rollout."""
         self.env.load_state_dict(moment["env"])
         self._load_worlds(moment["worlds"])
         checkpoint.set_rng_state(moment["rng"])
@@ -322,7 +322,7 @@ class Runner(OnPolicyRunner):
             self._fresh = not bool(self.env.episode_length_buf.any())
 
     def _resume_worlds(self, data: dict[str, Any]) -> None:
-        """The worlds of a checkpoint, if they can be this run's."""
+        """Take over the worlds of a checkpoint, if they can be this run's."""
         self._resumed_worlds = False
         other = worlds.changed(data["config"], self.full_cfg)
         if self.ranks.size > 1 or not hasattr(self.env, "load_worlds"):

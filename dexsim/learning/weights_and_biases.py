@@ -18,7 +18,7 @@ class _Settings:
 
 
 def check_installed() -> None:
-    """It is no dependency of dexsim. Raises UserError where it is missing."""
+    """Check that wandb, which is no dependency of dexsim, is installed. Raises UserError where it is missing."""
     spec = importlib.util.find_spec("wandb")
     # a folder wandb/, which its runs leave, is found as a package without a file
     if spec is None or spec.origin is None:

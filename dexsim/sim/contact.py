@@ -17,7 +17,7 @@ _SCALE = 65536.0  # 1.5e-5 N resolution, +-32 kN range
 
 
 def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair], slots: int = 2) -> np.ndarray:
-    """For geoms (a, b): the pairs they belong to, int32 [ngeom, ngeom, slots]; +p+1 if a is of the pair's first
+    """Return, for geoms (a, b), the pairs they belong to, int32 [ngeom, ngeom, slots]; +p+1 if a is of the pair's first
     member, -(p+1) if b is, 0 = none."""
     table = np.zeros((model.ngeom, model.ngeom, slots), dtype=np.int32)
     for p, pair in enumerate(pairs):
@@ -157,7 +157,8 @@ def outside_torque(
     # out
     outside: wp.array2d(dtype=float),
 ):
-    """`Engine.keep_outside`; row: the constraint that is a dof's dry friction, -1: none; force: of all constraints."""
+    """Compute what `Engine.keep_outside` says; row: the constraint that is a dof's dry friction, -1: none; force: of
+    all constraints."""
     w, i = wp.tid()
     felt = smooth[w, i] - applied[w, i] - damper[w, i] + constraint[w, i]
     if row[w, i] >= 0:

@@ -123,17 +123,17 @@ class Engine:
 
     # -- the engine's own part -----------------------------------------------------------------------------------------
     def field(self, name: str) -> torch.Tensor:
-        """Per-world values [N, ...] of a declared model field; written in place, seen by the next step."""
+        """Return the per-world values [N, ...] of a declared model field; written in place, seen by the next step."""
         raise NotImplementedError
 
     def wp_field(self, name: str) -> wp.array:
-        """The same memory as `field`, as a Warp array of `real` (dof fields: [N, nv])."""
+        """Return the same memory as `field`, as a Warp array of `real` (dof fields: [N, nv])."""
         raise NotImplementedError
 
     def step(
         self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None
     ) -> None:
-        """substeps x (before_each, one physics step), then poses, contact forces and flags, then `after`.
+        """Step substeps x (before_each, one physics step), then poses, contact forces and flags, then `after`.
 
         The callbacks only launch Warp kernels on arrays that exist already: MuJoCo-Warp records the sequence once
         and replays it.
@@ -141,16 +141,16 @@ class Engine:
         raise NotImplementedError
 
     def refresh(self) -> None:
-        """Body poses for the present qpos (after `set_state`), nothing else."""
+        """Compute the body poses for the present qpos (after `set_state`), nothing else."""
         raise NotImplementedError
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Where mask [N] (bool) holds: state := (qpos [N, nq], qvel [N, nv]), time, warm start, applied and contact
-        forces := 0. Poses follow at the next `refresh` or `step`."""
+        """Set, where mask [N] (bool) holds, the state to (qpos [N, nq], qvel [N, nv]), time, warm start, applied and
+        contact forces := 0. Poses follow at the next `refresh` or `step`."""
         raise NotImplementedError
 
     def reset(self, mask: torch.Tensor) -> None:
-        """`set_state` to the model's qpos0 at rest."""
+        """Do `set_state` to the model's qpos0 at rest."""
         qpos = torch.as_tensor(self.mjm.qpos0, dtype=self.t.qpos.dtype, device=self.device).expand(self.n, -1)
         self.set_state(mask, qpos, torch.zeros_like(self.t.qvel))
 
@@ -174,9 +174,10 @@ class Engine:
         return out
 
     def keep_outside(self) -> None:
-        """From now on `wp.outside` and `t.outside` [N, nv] hold what a dof felt from outside in the last physics step,
-        N.m or N: gravity, Coriolis and springs, contacts, limits, pushes; all but `qfrc_applied`, damping and the dof's
-        own dry friction. 0 after `set_state`. Nobody who does not ask pays for it. Call it before the first `step`."""
+        """Make that from now on `wp.outside` and `t.outside` [N, nv] hold what a dof felt from outside in the last
+        physics step, N.m or N: gravity, Coriolis and springs, contacts, limits, pushes; all but `qfrc_applied`,
+        damping and the dof's own dry friction. 0 after `set_state`. Nobody who does not ask pays for it. Call it
+        before the first `step`."""
         if self.wp.outside is None:
             self.wp.outside = wp.zeros((self.n, self.mjm.nv), dtype=self.real, device=self.device)
             self.t.outside = wp.to_torch(self.wp.outside)
@@ -190,7 +191,8 @@ class Engine:
         raise NotImplementedError
 
     def peaks(self) -> dict[str, float]:
-        """Largest numbers of contacts and constraint rows seen, and the room for them. Reads from the device."""
+        """Return the largest numbers of contacts and constraint rows seen, and the room for them. Reads from the
+        device."""
         raise NotImplementedError
 
     def check_overflow(self) -> None:

@@ -12,7 +12,7 @@ from dexsim.sim.engine import ContactPair, Engine
 
 
 def no_log_file() -> None:
-    """MuJoCo's warnings go to stderr; not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that
+    """Send MuJoCo's warnings to stderr, not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that
     somebody chose stays."""
     log = mujoco.MjLogConfig.get()
     if log.logto_file and log.logfile == "MUJOCO_LOG.TXT":

@@ -18,7 +18,7 @@ def _libc() -> ctypes.CDLL | None:
 
 
 def give_back() -> None:
-    """The C library's free pages, of all its arenas, back to the system.
+    """Give the C library's free pages, of all its arenas, back to the system.
 
     It keeps what is freed between two pieces that are still in use: of environments made and closed one after the other
     some 40 MB, at places that change with their sizes, so that memory seems to grow although as much as before is in

@@ -182,7 +182,7 @@ class MujocoEngine(Engine):
         self._outside_args = [*map(view, arrays), self.wp.qfrc_applied, self.wp.outside]
 
     def _one_step(self) -> None:
-        """One physics step of the batch, and what the dofs felt from outside in it, where that is asked for."""
+        """Take one physics step of the batch, and what the dofs felt from outside in it, where that is asked for."""
         self._with_armature()
         if self.wp.outside is None:
             self.batch.step()
@@ -217,8 +217,8 @@ class MujocoEngine(Engine):
         self.t.overflow.zero_()
 
     def _kinematics(self) -> None:
-        """Poses of the present qpos. The batch offers whole stages only, and each of its calls waits for all its
-        threads."""
+        """Compute the poses of the present qpos. The batch offers whole stages only, and each of its calls waits for
+        all its threads."""
         args = [self._tree, self.wp.qpos, self._pos, self._quat, self.wp.xpos, self.wp.xmat]
         self._launch("poses", kernels.poses, self.n, args)
 

@@ -62,7 +62,7 @@ def times(a: wp.vec4d, b: wp.vec4d):
 
 @wp.func
 def turned(v: wp.vec3d, q: wp.vec4d):
-    """v rotated by the unit quaternion q."""
+    """Return v rotated by the unit quaternion q."""
     u = wp.vec3d(q[1], q[2], q[3])
     t = wp.float64(2.0) * wp.cross(u, v)
     return v + q[0] * t + wp.cross(u, t)
@@ -70,7 +70,7 @@ def turned(v: wp.vec3d, q: wp.vec4d):
 
 @wp.func
 def unit(q: wp.vec4d):
-    """q over its length; like MuJoCo, no rotation where it has none."""
+    """Return q over its length; like MuJoCo, no rotation where it has none."""
     n = wp.length(q)
     out = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
     if n > wp.float64(1.0e-15):
@@ -89,7 +89,7 @@ def poses(
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
 ):
-    """Body frames by the recursion of mj_kinematics."""
+    """Compute the body frames by the recursion of mj_kinematics."""
     w = wp.tid()
     half = wp.float64(0.5)
     pos[w, 0] = wp.vec3d()
@@ -192,7 +192,7 @@ def check_worlds(
     # out
     flags: wp.array(dtype=int),
 ):
-    """nan_bit where a state is not finite or a speed is beyond what anything here does: the solver has diverged."""
+    """Set nan_bit where a state is not finite or a speed is beyond what anything here does: the solver has diverged."""
     w = wp.tid()
     bad = int(0)
     for i in range(qpos.shape[1]):
@@ -234,8 +234,9 @@ def outside_torque(
     # out
     outside: wp.array2d(dtype=wp.float64),
 ):
-    """`Engine.keep_outside`. The batch does not hand out the constraints' own forces, so that of dry friction is
-    computed as MuJoCo does: -(a - a_ref) / R within the level, R = (1 - d) / d * invweight, a_ref = -B v."""
+    """Compute what `Engine.keep_outside` says. The batch does not hand out the constraints' own forces, so that of
+    dry friction is computed as MuJoCo does: -(a - a_ref) / R within the level, R = (1 - d) / d * invweight, a_ref =
+    -B v."""
     w, i = wp.tid()
     most = level[w % level.shape[0], i]
     friction = wp.float64(0.0)

@@ -140,7 +140,7 @@ class WarpEngine(Engine):
         self._run(("step", substeps, before_each, after), program)
 
     def physics_step(self) -> None:
-        """One bare physics step, launched and not recorded."""
+        """Launch one bare physics step, launched and not recorded."""
         with ExitStack() as stack:
             for ours in (self.narrow, self.newton):
                 if ours is not None:
@@ -206,7 +206,8 @@ class WarpEngine(Engine):
         )
 
     def _run(self, key: tuple, program: Callable[[], None]) -> None:
-        """First call: eager (kernels compile). Second: recorded, then replayed; the same path on CPU and CUDA."""
+        """Run a step. First call: eager (kernels compile). Second: recorded, then replayed; the same path on CPU and
+        CUDA."""
         with wp.ScopedDevice(self.device):
             inside = self.device.startswith("cuda") and torch.cuda.is_current_stream_capturing()
             if inside or key not in self._eager_done:  # inside another recording, be part of it

@@ -219,7 +219,8 @@ class LiveView:
             w.changed.set()
 
     def _show_world(self) -> None:
-        """Meshes of the chosen world: the hand once, the object anew (its shape differs by world and episode)."""
+        """Show the meshes of the chosen world: the hand once, the object anew (its shape differs by world and
+        episode)."""
         model = self.env.drawn_model(self.wishes.world)
         self._model, self._data = model, mujoco.MjData(model)
         scene, thing = self.server.scene, model.body(OBJECT).id

@@ -83,15 +83,15 @@ class Gate:
             return True
 
     def wait(self, transport: Any) -> None:
-        """A socket has connected and said nothing yet; the one that has waited longest goes where there are too
-        many. Called from the server's own loop only, as `waited` is."""
+        """Note that a socket has connected and said nothing yet; the one that has waited longest goes where there
+        are too many. Called from the server's own loop only, as `waited` is."""
         self.waiting[id(transport)] = transport
         if len(self.waiting) > MOST_WAITING:
             self.waiting.pop(next(iter(self.waiting))).abort()
             self.refused += 1
 
     def waited(self, transport: Any) -> None:
-        """It has said what it wants, or is gone."""
+        """Note that it has said what it wants, or is gone."""
         self.waiting.pop(id(transport), None)
 
     def leave(self) -> None:
@@ -102,7 +102,7 @@ class Gate:
 
 @contextlib.contextmanager
 def gated(gate: Gate) -> Iterator[None]:
-    """While viser's server starts in here, its WebSocket server asks `gate` first."""
+    """Make the WebSocket server of viser's server, which starts in here, ask `gate` first."""
     import websockets.asyncio.server as ws
     from websockets.datastructures import Headers
     from websockets.http11 import Response
@@ -166,8 +166,9 @@ def gated(gate: Gate) -> Iterator[None]:
 
 
 def only_known(server: Any, checks: dict[str, Callable[[Any], bool]]) -> None:
-    """From now on viser's server passes on no message but where its page looks from, and new values of the controls in
-    `checks` (viser's id -> whether a value is one that the control can have). All else a page may send is dropped."""
+    """Let viser's server from now on pass on no message but where its page looks from, and new values of the
+    controls in `checks` (viser's id -> whether a value is one that the control can have). All else a page may send
+    is dropped."""
     from viser import _messages
 
     sockets = server._websock_server

@@ -149,7 +149,7 @@ def pad_labels(names: Sequence[str]) -> str:
 
 
 def _signed(value: float, digits: int) -> str:
-    """With its sign, but no "-0.000"."""
+    """Return a number with its sign, but no "-0.000"."""
     return f"{round(value, digits) + 0.0:+.{digits}f}" if round(value, digits) else f"{0:.{digits}f}"
 
 

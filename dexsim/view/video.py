@@ -110,7 +110,7 @@ def render(
 
 
 def _hand_over(folder: Path, clips: Sequence[Clip], settings: dict[str, Any]) -> None:
-    """What the rendering process reads: the models, the arrays and the settings."""
+    """Write what the rendering process reads: the models, the arrays and the settings."""
     import mujoco
 
     for k, clip in enumerate(clips):

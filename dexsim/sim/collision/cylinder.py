@@ -46,7 +46,7 @@ class Nearest:
 
 @wp.func
 def off(half: wp.vec3, x: wp.vec3) -> wp.vec3:
-    """From the point of the cylinder that is nearest to x, to x [m]; zero within."""
+    """Return the way from the point of the cylinder that is nearest to x, to x [m]; zero within."""
     rho = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     k = float(0.0)
     if rho > half[0]:

@@ -104,7 +104,7 @@ def write(
     pos: wp.vec3,
     normal: wp.vec3,
 ):
-    """One contact. dist [m]: of the surfaces, without margin; normal: from geoms[0] to geoms[1], world frame."""
+    """Write one contact. dist [m]: of the surfaces, without margin; normal: from geoms[0] to geoms[1], world frame."""
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
         mat.geom_condim,
         mat.geom_priority,
@@ -243,9 +243,9 @@ def two(pairs: Pairs, mat: Materials, k: int) -> Two:
 def add(
     pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3, v: wp.vec3, normal: wp.vec3, dist: float
 ):
-    """The contact of pair k. q: B's nearest point; v: from there to A's core; normal: from A to B; all in B's frame.
-    dist [m]: of the cores, negative if they overlap. A contact lies halfway between the surfaces, and margins move both
-    alike."""
+    """Add the contact of pair k. q: B's nearest point; v: from there to A's core; normal: from A to B; all in B's
+    frame. dist [m]: of the cores, negative if they overlap. A contact lies halfway between the surfaces, and margins
+    move both alike."""
     geoms = pairs.geom[k]
     world = pairs.world[k]
     b_mat = pairs.geom_xmat[world, geoms[1]]
@@ -264,8 +264,9 @@ def apart(
     enclosing: wp.array(dtype=wp.vec4i),
     deep_number: wp.array(dtype=int),
 ):
-    """Each pair of a point, segment, box or hull with a hull: its contact, if cores are apart. Pairs that overlap are
-    listed in `deep`, with four corners that enclose the origin of A - B, or -1 where they only touch."""
+    """Find contacts of each pair of a point, segment, box or hull with a hull: its contact, if cores are apart.
+    Pairs that overlap are listed in `deep`, with four corners that enclose the origin of A - B, or -1 where they
+    only touch."""
     k = wp.tid()
     if k >= wp.min(pairs.number[0], pairs.room):
         return
@@ -312,7 +313,7 @@ def overlapping(
     # out
     out: Contacts,
 ):
-    """The contacts of the pairs in `deep`."""
+    """Find the contacts of the pairs in `deep`."""
     for j in range(wp.tid(), wp.min(deep_number[0], pairs.room), stride):
         k = deep[j]
         t = two(pairs, mat, k)
@@ -343,8 +344,8 @@ def beside_cylinder(
     # out
     out: Contacts,
 ):
-    """Each pair of a cylinder with a segment, box or hull: its contact. In the cylinder's frame; normals from it to the
-    other."""
+    """Find contacts of each pair of a cylinder with a segment, box or hull: its contact. In the cylinder's frame;
+    normals from it to the other."""
     k = wp.tid()
     if k >= wp.min(pairs.number[0], pairs.room):
         return

@@ -89,7 +89,7 @@ class NarrowPhase:
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
-        """Within this, `mujoco_warp.step` finds the contacts of hulls here."""
+        """Let `mujoco_warp.step`, within this, find the contacts of hulls here."""
         theirs = collision_driver.convex_narrowphase
 
         def convex(m: mjw.Model, d: mjw.Data, ctx: Any, table: list[tuple[GeomType, GeomType]]) -> None:

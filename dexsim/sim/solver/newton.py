@@ -77,7 +77,7 @@ class NewtonSolver:
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
-        """Within this, `mujoco_warp.step` solves here."""
+        """Let `mujoco_warp.step`, within this, solve here."""
         kept = theirs.solve
 
         @event_scope
