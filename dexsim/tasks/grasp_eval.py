@@ -132,6 +132,7 @@ def _play(
     shown = list(range(min(4, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
     qpos, shown_force = [], []
+    drawn: dict[str, list[np.ndarray]] = {"push": [], "gravity": [], "taxels": []}
     push_force = (PUSH_WEIGHTS * 9.81 * mass)[:, None] * direction
     # |m (g + a_push)|, the push where it is drawn to act: what the fingers must carry
     load = (9.81 * mass[:, None] * down + push_force * pushed[:, None]).norm(dim=1)
@@ -173,6 +174,10 @@ def _play(
         if shown:
             qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
             shown_force.append(env.tip_force[shown].cpu().numpy())
+            drawn["push"].append(env.outside_force[shown].cpu().numpy())
+            drawn["gravity"].append(env.engine.field("opt.gravity")[shown].cpu().numpy())
+            if env.touch.raw is not None:
+                drawn["taxels"].append(env.touch.raw[shown].cpu().numpy())
         if progress is not None and k % 10 == 0:
             progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
     env.outside_force.zero_()
@@ -196,8 +201,11 @@ def _play(
             "label": [f"{name}, {1000 * m:.0f} g, friction"
                       f" {mu:.1f}" for name, m,
                       mu in zip(names, out["mass"][shown], out["friction"][shown], strict=True)],
-            "overlay": [{"force": f, "command": np.full(steps, c * env.f_max)} for f,
-                        c in zip(force_shown, given, strict=True)],
+            "overlay": [
+                {"force": f, "command": np.full(steps, c * env.f_max), "layout": env.touch.layout}
+                | {k: np.stack([row[i] for row in rows]) for k, rows in drawn.items() if rows}
+                for i, (f, c) in enumerate(zip(force_shown, given, strict=True))
+            ],
         }  # fmt: skip
     return out
 

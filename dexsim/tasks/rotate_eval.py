@@ -176,6 +176,7 @@ def _play(
             for x, v in zip(env.objects.size[:, 0], which, strict=True)]  # fmt: skip
     mass = (1000 * env.objects.mass).cpu().numpy()
     qpos, force, score = [], [], []
+    taxels: list[np.ndarray] = []
     for k in range(steps):
         obs, _, dones, _ = env.step(policy(obs))
         hit = env.reached & alive
@@ -191,6 +192,8 @@ def _play(
             qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
             force.append(env.touch.force_clean[shown].cpu().numpy())
             score.append(count[shown].cpu().numpy())
+            if env.touch.raw is not None:
+                taxels.append(env.touch.raw[shown].cpu().numpy())
         if k % 40 == 39:
             if progress is not None:
                 at = done + min(n, episodes - done) * (k + 1) // steps
@@ -209,7 +212,12 @@ def _play(
             "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
             "label": [f"{wide[w]}, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
                       for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
-            "overlay": [{"force": np.stack([f[i] for f in force[:s]])} for i, s in enumerate(stop)],
+            "overlay": [
+                {"force": np.stack([f[i] for f in force[:s]]), "layout": env.touch.layout}
+                | ({"taxels": np.stack([x[i] for x in taxels[:s]])} if taxels else {})
+                for i, s in enumerate(stop)
+            ],
+            "colours": True,
             "camera": {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0},
         }  # fmt: skip
     return out

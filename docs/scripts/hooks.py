@@ -15,6 +15,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import reference  # noqa: E402
 
+def on_post_build(config: dict, **_: object) -> None:
+    """Write llms.txt, the list of pages for assistants, into the site."""
+    (Path(config["site_dir"]) / "llms.txt").write_text(reference.llms(), encoding="utf-8")
+
+
 GENERATED = re.compile(r"^<!-- GENERATED: (\w+) -->$", re.M)
 BLOCK = re.compile(r"^```math\n(.*?)\n```$", re.M | re.S)
 INLINE = re.compile(r"\$`([^`\n]+)`\$")
