@@ -17,7 +17,7 @@ import numpy as np
 
 NO_GL = 3
 LONGEST_S = 60.0
-FASTEST = 60.0  # frames per second that a video needs at most
+FASTEST = 30.0  # frames per second that a video needs at most
 
 class Camera(TypedDict):
     """A view: a point [3] m, the distance from it [m], azimuth and elevation [deg]."""

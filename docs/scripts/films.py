@@ -84,12 +84,7 @@ def squeeze(path: Path, most: int = 1_000_000) -> None:
 
 def film(clips: list[Clip], env: Any, path: Path, full: float, camera: dict[str, Any], size: tuple[int, int]) -> None:
     """Render clips side by side into a film of at most 1 MB."""
-    every = max(1, round(1 / 24 / env.dt))  # 24 frames a second are enough
-    for clip in clips:
-        for name in ("qpos", "force", "command", "push", "taxels"):
-            rows = getattr(clip, name)
-            setattr(clip, name, None if rows is None else rows[::every])
-    render(clips, path, every * env.dt, env.hand.finger_names, full, size, camera)
+    render(clips, path, env.dt, env.hand.finger_names, full, size, camera)
     squeeze(path)
     print(path, path.stat().st_size)
 
