@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import reference  # noqa: E402
 
+
 def on_post_build(config: dict, **_: object) -> None:
     """Write llms.txt, the list of pages for assistants, into the site."""
     (Path(config["site_dir"]) / "llms.txt").write_text(reference.llms(), encoding="utf-8")
