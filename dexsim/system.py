@@ -71,6 +71,12 @@ def _lives_on_windows(pid: int) -> bool:
     return status.value == _STILL_ACTIVE
 
 
+def stop(pid: int) -> None:
+    """Ask a process to end as Ctrl-C does; on Windows, which cannot, end it. One that is gone is no error."""
+    with contextlib.suppress(OSError):
+        os.kill(pid, signal.SIGTERM if sys.platform == "win32" else signal.SIGINT)
+
+
 def cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):

@@ -44,7 +44,7 @@ def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
 
 def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
     assert sweep.run(["-m", "seed=1,2,3", f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)]) == 1
-    assert [json.loads((tmp_path / "s" / str(k) / "job.json").read_text())["status"] for k in range(3)] == [0, 3, 0]
+    assert [json.loads((tmp_path / "s" / "jobs" / f"{k}.json").read_text())["status"] for k in range(3)] == [0, 3, 0]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-EXTRAS = {"base": (), "test": ("deploy", "objects", "hub", "test"), "docs": ("docs",)}
+EXTRAS = {"base": (), "test": ("deploy", "objects", "hub", "cluster", "test"), "docs": ("docs",)}
 BUILD = "setuptools>=77\n"
 """What builds dexsim itself: installed from the lock, too, and not fetched by pip."""
 HELD = "torch<2.14\n"

@@ -28,6 +28,7 @@ Line = tuple[str, str, str]
 EXTRAS = {
     "deploy": ("onnxruntime", "dexsim export, dexsim deploy"),
     "objects": ("coacd", "hollow meshes as objects"),
+    "cluster": ("submitit", "on=slurm, on=dask"),
     "hub": ("huggingface_hub", "checkpoint=hub:..."),
     "wandb": ("wandb", "agent.logger=wandb"),
 }

@@ -1,9 +1,7 @@
-"""Several runs from one command, through Hydra's sweeper and launcher: dexsim train --multirun seed=1,2,3
-servo=xhand,ideal.
+"""Several runs from one command: dexsim train --multirun seed=1,2,3 servo=xhand,ideal.
 
-Hydra expands the lists into jobs and hands them to its launcher; each job is `dexsim train` again, in a process of its
-own. The basic launcher runs them one after the other; a launcher plugin (hydra/launcher=joblib, submitit_slurm, ...)
-runs them as it does.
+Hydra's sweeper expands the lists; each of its jobs is `dexsim train` in a process of its own, here or on a cluster
+(:mod:`dexsim.console.jobs`).
 """
 
 from __future__ import annotations
@@ -11,18 +9,18 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from dexsim.console import jobs
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
 FLAGS = ("--multirun", "-m")
-COMMAND = (sys.executable, "-m", "dexsim", "train")
+PROGRAM = (sys.executable, "-m", "dexsim")
 
 
 def wanted(argv: list[str]) -> bool:
@@ -30,13 +28,13 @@ def wanted(argv: list[str]) -> bool:
     return any(a in FLAGS for a in argv)
 
 
-def run(argv: list[str], config_dir: Path, command: Sequence[str] = COMMAND) -> int:
+def run(argv: list[str], config_dir: Path, program: Sequence[str] = PROGRAM) -> int:
     """Run all jobs; returns 0 when all ended with 0, else 1. Raises UserError for what Hydra refuses.
 
     Each job's run folder is `<sweep>/<number>`; the sweep folder is runs/<task>/sweep_<date and time>, or
     `sweep=FOLDER`.
     """
-    argv = [a for a in argv if a not in FLAGS]
+    engine, argv = jobs.taken([a for a in argv if a not in FLAGS], [] if "device=cpu" in argv else _cuda())
     for name in ("out", "run"):
         if any(a.startswith(f"{name}=") for a in argv):
             raise UserError(
@@ -60,35 +58,21 @@ def run(argv: list[str], config_dir: Path, command: Sequence[str] = COMMAND) -> 
         "hydra/job_logging=disabled",
         "hydra/hydra_logging=none",
     ]
-    _hydra(argv, places, config_dir, Job(command))
-    rows, failed = _collect(folder)
-    print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
-    return 1 if failed or not rows else 0
+    wanted: list[jobs.Job] = []
 
-
-class Job:
-    """What a launcher calls for each job; picklable, so that a launcher may run it elsewhere (with the same files)."""
-
-    def __init__(self, command: Sequence[str]) -> None:
-        self.command = list(command)
-
-    def __call__(self, _cfg: Any) -> int:
+    def add(_cfg: Any) -> None:
         from hydra.core.hydra_config import HydraConfig
 
         hydra = HydraConfig.get()
-        folder = Path(hydra.runtime.output_dir)
-        settings, number = list(hydra.overrides.task), int(hydra.job.num)
-        env, devices = dict(os.environ), _cuda()
-        if devices and "basic" not in hydra.launcher._target_.lower():  # side by side: the GPUs in turn
-            env["CUDA_VISIBLE_DEVICES"] = devices[number % len(devices)]
-        print(f"job {number}: {' '.join(settings)}", flush=True)
-        start = time.perf_counter()
-        status = subprocess.run([*self.command, *settings, f"out={folder}"], env=env).returncode
-        note = {"settings": settings, "status": status, "seconds": round(time.perf_counter() - start, 1)}
-        (folder / "job.json").write_text(json.dumps(note), "utf-8")
-        if status in (130, 143):
-            raise KeyboardInterrupt
-        return status
+        settings, place = list(hydra.overrides.task), Path(hydra.runtime.output_dir)
+        print(f"job {place.name}: {' '.join(settings)}", flush=True)
+        wanted.append(jobs.Job((("train", *settings, f"out={place}"),), place, tuple(program), resumes=True))
+
+    _hydra(argv, places, config_dir, add)
+    jobs.run(wanted, engine)
+    rows, failed = _collect(folder)
+    print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
+    return 1 if failed or not rows else 0
 
 
 def _cuda() -> list[str]:
@@ -101,7 +85,7 @@ def _cuda() -> list[str]:
     return [str(k) for k in range(machine.cuda_devices())]
 
 
-def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Job) -> None:
+def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Callable[[Any], None]) -> None:
     """Hydra's own entry, with our settings file; its one-line refusals become UserError."""
     from hydra._internal.utils import _run_hydra, get_args_parser
     from hydra.errors import HydraException
@@ -126,20 +110,21 @@ def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Job) -> No
 def _collect(folder: Path) -> tuple[list[tuple], bool]:
     """A row for each job: name, settings, status, iterations, last step reward, seconds; and whether one failed."""
     rows, failed = [], False
-    notes = sorted(folder.glob("*/job.json"), key=lambda p: int(p.parent.name))
-    jobs = [json.loads(note.read_text("utf-8")) for note in notes]
-    common = set.intersection(*(set(job["settings"]) for job in jobs)) if len(jobs) > 1 else set()
-    for note, job in zip(notes, jobs):
+    notes = sorted(folder.glob("jobs/*.json"), key=lambda p: int(p.stem))
+    told = [json.loads(note.read_text("utf-8")) for note in notes]
+    typed = [[x for x in note["commands"][0][1:] if not x.startswith("out=")] for note in told]
+    common = set.intersection(*map(set, typed)) if len(told) > 1 else set()
+    for note, job, own in zip(notes, told, typed):
         progress: list[dict[str, str]] = []
-        if (note.parent / "progress.csv").exists():
-            with open(note.parent / "progress.csv", newline="", encoding="utf-8") as file:
+        if (run := folder / note.stem / "progress.csv").exists():
+            with open(run, newline="", encoding="utf-8") as file:
                 progress = list(csv.DictReader(file))
         last = progress[-1] if progress else {}
         tail = [float(r["step_reward"]) for r in progress[-10:]]
         rows.append(
             (
-                note.parent.name,
-                " ".join(x for x in job["settings"] if x not in common),
+                note.stem,
+                " ".join(x for x in own if x not in common),
                 job["status"],
                 int(last.get("iteration", 0)),
                 sum(tail) / len(tail) if tail else float("nan"),
