@@ -8,6 +8,7 @@ import io
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 
 from dexsim.console import folders
@@ -27,6 +28,8 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
     for stream in (sys.stdout, sys.stderr):  # halves of characters are printed as \\ud800, in any locale
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # libraries', to their programmers
     if about and {"-h", "--help"} & set(argv):
         print(about.strip())
         return 0

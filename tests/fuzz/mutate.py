@@ -15,7 +15,7 @@ import yaml
 
 from dexsim.recording import write
 
-from . import corpus
+from . import corpus, mjcf
 
 ODD: tuple[Any, ...] = (
     None,
@@ -214,6 +214,10 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
         return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](
             rng, files[kind][0], folder
         )
+    if kind in ("model", "robot"):
+        path = folder / "case.xml"
+        mjcf.write(path, rng)
+        return path
     if kind not in ("recording", "object"):
         path = folder / "case.yaml"
         path.write_bytes(text_of(kind, rng))

@@ -23,9 +23,10 @@ from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.gap.read import Run, channels, inputs
 from dexsim.hand import load_hand
+from dexsim.import_hand import source
 from dexsim.paths import CONFIGS
 from dexsim.recording import metadata, read, write
-from dexsim.recording.mechanism import Mechanism
+from dexsim.recording.mechanism import Mechanism, mechanism
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 from dexsim.tactile import file as tactile_file
 from dexsim.tactile.layout import hand_layout
@@ -204,6 +205,19 @@ def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
     return ""
 
 
+def model(path: Path) -> str:
+    """A model of MuJoCo's, as a diagnosis takes it."""
+    m = mechanism(path, corpus.SERVO | {"joints": {"*": {"kp": 1.0}}, "loop_encoder": "motor", "current_per_torque": 1})
+    m.spec.compile()
+    return ""
+
+
+def robot(path: Path) -> str:
+    """The same, to be imported as a hand."""
+    source.read(path)
+    return ""
+
+
 TARGETS: dict[str, Callable[[Path], str]] = {
     "recording": recording,
     "servo": servo,
@@ -216,6 +230,8 @@ TARGETS: dict[str, Callable[[Path], str]] = {
     "overrides": overrides,
     "hand": hand,
     "object": object_,
+    "model": model,
+    "robot": robot,
 }
 
 
