@@ -97,7 +97,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     ended = -(child.exitcode or 0)
     if answer:
         raise UserError(f"{what}: {answer}{more if 'memory' in answer else ''}")
-    if ended in (getattr(signal, "SIGXCPU", -1), signal.SIGKILL if hasattr(signal, "SIGKILL") else -1):
+    if ended in system.OUT_OF_TIME:
         raise UserError(f"{what}: takes more than {seconds:.0f} s of processor time to read{more}")
     how = signal.Signals(ended).name if ended > 0 else f"exit status {child.exitcode}"
     raise UserError(f"{what}: breaks the library that reads it ({how}, with at most {most / 2**30:.3g} GiB of memory)")
@@ -148,9 +148,10 @@ def _child(
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(silent, stream)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN if name == "SIGINT" else signal.SIG_DFL)
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):  # the program's own
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program ends its child itself
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # the threads of before the fork are not there
     sys.addaudithook(_opened)

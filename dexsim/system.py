@@ -18,6 +18,7 @@ RENDERERS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
 INSTALL = "sudo apt-get install libegl1 libosmesa6, or the like of your system"
 SHARED = Path("/dev/shm")
 _STILL_ACTIVE, _QUERY = 259, 0x1000  # Windows: GetExitCodeProcess, PROCESS_QUERY_LIMITED_INFORMATION
+OUT_OF_TIME = (24, 9)  # SIGXCPU, and SIGKILL where that was not enough
 _CRASHES = (-6, -11, 0xC0000005, 0xC0000409)  # SIGABRT, SIGSEGV; Windows: access violation, abort
 
 

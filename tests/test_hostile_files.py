@@ -556,8 +556,8 @@ COPIES = '<replicate count="999999"><geom size=".1"/></replicate></worldbody>'
 MODELS = {
     "pipe in meshdir": ("<asset>", '<asset><mesh name="x" file="inner.obj"/>', "a pipe|no such file"),
     "pipe included by an included one": ("<asset>", '<include file="more.xml"/><asset>', "names a pipe"),
-    "copies": (WORLD, COPIES, "takes more than 1 s"),
-    "copies that no parser of ours sees": (WORLD, "<!-- \x01 -->" + COPIES, "takes more than 1 s|is not XML"),
+    "copies": (WORLD, COPIES, "takes more than"),
+    "copies that no parser of ours sees": (WORLD, "<!-- \x01 -->" + COPIES, "takes more than|is not XML"),
     "heights": ("<asset>", '<asset><hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/>', "more than 1 GiB"),
     "figures of users": ("<asset>", '<size nuser_body="1000000000"/><asset>', "more than 1 GiB"),
 }

@@ -71,7 +71,7 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
             return _say(f"{str(error.filename)[:200]}: {error.strerror}; give another path, or its rights", 2)
         if error.errno not in FULL:
             raise
-        where = f" at {error.filename}" if error.filename else ""
+        where = f" at {error.filename}" if error.filename else ", or what the output goes to"
         return _say(f"the disk is full{where}; free some space (training goes on with resume=<run folder>/last.pt)", 2)
 
 

@@ -108,7 +108,8 @@ def _together(r: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     c, s, none = r.commands, r.states.position, np.zeros((0, len(r.joints)))
     if len(c) < 20 or len(s) < 20:
         return none[:, 0], none, none
-    grid = np.arange(max(c.t[0], s.t[0]), min(c.t[-1], s.t[-1]), 0.01)[:30000]
+    first = max(c.t[0], s.t[0])
+    grid = np.arange(first, min(c.t[-1], s.t[-1], first + 300.0), 0.01)
     out = [np.zeros((len(grid), len(r.joints))) for _ in range(2)]
     for j in range(len(r.joints)):
         for x, series, kind in zip(out, (c, s), ("previous", "line"), strict=True):

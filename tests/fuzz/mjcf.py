@@ -15,10 +15,12 @@ import numpy as np
 from dexsim import guard
 from dexsim.errors import UserError
 
-HAND = """<mujoco><compiler angle="radian"/><asset><material name="m"/><mesh name="s" builtin="sphere" params="2"/></asset>
+HAND = """<mujoco><compiler angle="radian"/>
+<asset><material name="m"/><mesh name="s" builtin="sphere" params="2"/></asset>
 <worldbody><body name="palm"><geom name="g" type="box" size=".04 .04 .01" mass=".2"/><site name="p"/>
 {fingers}</body></worldbody></mujoco>"""
-FINGER = """<body name="{n}1" pos="{x} 0 .01"><joint name="{n}a" axis="0 1 0" range="0 1.5" limited="true" armature=".001"/>
+FINGER = """<body name="{n}1" pos="{x} 0 .01">
+<joint name="{n}a" axis="0 1 0" range="0 1.5" limited="true" armature=".001"/>
 <geom type="capsule" size=".008" fromto="0 0 0 0 0 .04" mass=".03"/><body name="{n}2" pos="0 0 .04">
 <joint name="{n}b" axis="0 1 0" range="0 1.5" limited="true" armature=".001"/>
 <geom type="capsule" size=".008" fromto="0 0 0 0 0 .03" mass=".02"/></body></body>"""

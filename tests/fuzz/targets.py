@@ -11,14 +11,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.assets.objects import own
 from dexsim.calibration.file import Calibration
-from dexsim.cli import start
+from dexsim.cli import settings, start
 from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.gap.read import Run, channels, inputs
@@ -124,7 +123,7 @@ def _said(path: Path) -> Any:
 def beside(path: Path) -> str:
     """As the metadata file beside a recording."""
     path = path.rename(path.with_name("case.mcap.yaml"))
-    stated, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
+    stated, _, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
     metadata.complete(stated, True, True)
     said = {key: metadata._text(value) for key, value in (_said(path) or {}).items()}
     return silence.of_settings(said, stated)
@@ -185,11 +184,8 @@ def overrides(path: Path) -> str:
 
 def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
     """Return the first typed setting that is another in the settings that a training would begin with."""
-    parser, asked = OverridesParser.create(), {}
-    for line in lines:
-        if line.startswith(("~", "+", "--")) or "=" not in line:
-            continue
-        override = parser.parse_override(line)
+    asked = {}
+    for override in settings.parse([x for x in lines if "=" in x and x[:1] not in "~+-"], CONFIGS).values:
         if not override.is_sweep_override():
             asked[override.key_or_group] = override.value()
     for key, value in asked.items():
