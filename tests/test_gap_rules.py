@@ -619,6 +619,7 @@ def test_a_stand_in_is_offered_where_much_is_left():
         search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(best=None, none=None)
         drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
+                                 written=SimpleNamespace(plain=lambda joint: False),
                                  w=SimpleNamespace(runs=[], limit=TimeLimit(),
                                                    settings=SimpleNamespace(seed=0)))  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:

@@ -253,6 +253,56 @@ def test_a_model_without_its_servo_or_joints(tmp_path):
         mech.mechanism(tmp_path / "bad.xml", servo)
 
 
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="shoulder" axis="0 1 0" armature="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.6" contype="0"/><body pos="0 0 -0.3">
+<joint name="elbow" axis="0 1 0" armature="0.005"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5" contype="0"/></body></body></worldbody>
+%s</mujoco>"""
+OWN = """<tendon><fixed name="both"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="-1"/></fixed></tendon>
+<actuator><position name="hold" joint="shoulder" kp="60"/><motor name="pull" tendon="both"/></actuator>
+<equality><joint joint1="elbow" joint2="shoulder"/></equality><sensor><actuatorfrc actuator="hold"/></sensor>
+<keyframe><key ctrl="1 1"/></keyframe>"""
+LOOPS = {"joints": {"shoulder": {"kp": 20.0, "kd": 1.0}, "elbow": {"kp": 9.0, "kd": 0.4}}}
+
+
+def arm(folder, more="", servo=None):
+    (folder / "arm.xml").write_text(ARM % more)
+    return mech.mechanism(folder / "arm.xml", servo or LOOPS)
+
+
+def swung(m):
+    """Return a recording of both joints, in which each shakes the other."""
+    t = np.arange(0, 3.0, 0.01)
+    commands = Series(t, np.stack([0.5 * np.sin(5 * t), np.sin(7 * t)], 1))
+    run = mech.drive(m, commands, m.joints, 3.0, np.zeros(2), timestep=5e-4)
+    r = mech.recorded(run, m, commands, m.joints, rate=500.0)
+    r.meta["servo"] = ""
+    return r
+
+
+def test_a_models_own_actuators_tendons_and_couplings_of_driven_joints_are_left_out(tmp_path):
+    r = swung(arm(tmp_path))
+    plain, own = (mech.replay(r, arm(tmp_path, more)) for more in ("", OWN))
+    assert np.abs(plain.position - own.position).max() < 1e-9
+    assert compare(r, own, arm(tmp_path)).position_rmse().max() < 1e-4
+
+
+def test_a_joint_without_a_servo_or_not_fitted_to_follows_its_recording(tmp_path):
+    """And pulls at the others as it did: they move as if it were driven, whose drive nobody knows."""
+    r = swung(arm(tmp_path))
+    alone = arm(tmp_path, servo={"joints": {"shoulder": LOOPS["joints"]["shoulder"]}})
+    fitted = arm(tmp_path, servo=LOOPS | {"fitted": {"shoulder": {}}})
+    fitted.table.set("elbow", "kp", 0.5)
+    for m in (alone, fitted):
+        assert mech.held_joints(m, r.joints) == ["elbow"]
+        c = compare(r, mech.replay(r, m), m)
+        assert c.position_rmse().max() < 2e-3 < 0.1 < np.ptp(r.states.position.value, 0).min()
+        part = compare(r, mech.replay(r, m, start=1.2, end=2.5), m)
+        assert part.t[0] >= 1.2 and part.t[-1] <= 2.51 and part.position_rmse().max() < 4e-3
+    limp = mech.replay(r, alone, hold="limp")
+    assert compare(r, limp, alone).position_rmse()[1] > 0.1
+
+
 # --- play.py record=FILE
 
 

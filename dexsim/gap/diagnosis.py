@@ -609,7 +609,8 @@ class Drives(Steps):
         p, limit, longest, late = self.parts, self.w.limit, 0.0, []
         for x in self.searched:
             case, search, outcome = x.case, x.search, x.outcome
-            if d.joints[case.joint]["after"] < JUDGE.within * self.noise.floor:
+            # a torque beside the plain model, which is written, would be another one
+            if d.joints[case.joint]["after"] < JUDGE.within * self.noise.floor or self.written.plain(case.joint):
                 continue
             if limit.spent(1 - STANDING_IN) or limit.rest() < 2 * longest:
                 late.append(case.joint)

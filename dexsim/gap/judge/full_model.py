@@ -137,12 +137,16 @@ class Written:
         """What is written of a joint."""
         return next(c for c in self.candidates[joint] if c.name == self.chosen[joint])
 
+    def plain(self, joint: str) -> bool:
+        """Return whether the plain model of a joint is written."""
+        return self.chosen[joint] == "plain"
+
     def beaten(self, joint: str, noise: float) -> bool:
         """Whether the plain model of a joint is written although something was found, and follows better in the
         search's own plant too. noise: of the joint [rad or m]."""
         plant = {c.name: c.plant for c in self.candidates[joint]}
         alike = max((1 + BELIEF.tolerance) * plant.get("plain", math.inf), JUDGE.within * noise)
-        return self.chosen[joint] == "plain" and plant.get("found", 0.0) > alike
+        return self.plain(joint) and plant.get("found", 0.0) > alike
 
     def reason(self, case: Case) -> str:
         """Why the plain model of a joint is written and not what was found, in words."""
