@@ -153,10 +153,10 @@ def test_what_is_wrong_in_the_file_is_one_line(tmp_path, path, value, said):
 @pytest.mark.parametrize(
     "old, new, said",
     [
-        ("<actuator>", '<tendon><fixed name="pull"><joint joint="a_curl" '
-                       'coef="1"/></fixed></tendon><actuator>', "1 tendon (pull)"),
+        ("<actuator>", '<equality><weld name="tie" body1="a_end" '
+                       'body2="b_end"/></equality><actuator>', "'tie' is neither of joints nor of tendons"),
         ("<actuator>", '<equality><joint name="tie" joint1="a_curl" '
-                       'joint2="a_bend"/></equality><actuator>', "1 equality constraint (tie)"),
+                       'joint2="a_bend"/></equality><actuator>', "'a_curl' follows 'a_bend' in the model"),
         ('<light pos="0 0 1"/>', '<geom name="floor" type="plane" size="1 1 1"/>', "geom 'floor' belongs to the world"),
         ('<light pos="0 0 1"/>', '<body name="cup"><freejoint/><geom size="0.1"/></body>', "is a free joint"),
         ('<light pos="0 0 '
@@ -174,19 +174,6 @@ def test_what_a_model_cannot_be_is_one_line(tmp_path, old, new, said):
     with pytest.raises(UserError) as error:
         load_hand(folder)
     assert said in str(error.value) and str(folder) in str(error.value), str(error.value)
-
-
-def test_a_urdf_with_a_mimic_joint_is_refused(tmp_path):
-    folder = made_hand(tmp_path / "made")
-    urdf = """<robot name="made"><link name="hull"/><link name="a_end"><inertial><mass value="1"/>
-      <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-      <joint name="a_curl" type="revolute"><parent link="hull"/><child link="a_end"/><axis xyz="1 0 0"/>
-      <limit lower="0" upper="1" effort="1" velocity="1"/><mimic joint="a_bend"/></joint></robot>"""
-    (folder / "made.urdf").write_text(urdf)
-    text = (folder / "hand.yaml").read_text().replace("model: made.xml", "model: made.urdf")
-    (folder / "hand.yaml").write_text(text)
-    with pytest.raises(UserError, match=r"model \(made.urdf\): has 1 mimic joint \(a_curl\)"):
-        load_hand(folder)
 
 
 def test_names_of_hands(tmp_path, monkeypatch):

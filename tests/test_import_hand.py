@@ -324,16 +324,6 @@ BAD = {
         r"joint 'ring_1' is continuous",
     ),
     "one name twice": (lambda t: t.replace("ring_far", "middle_far"), r"two links have the name 'middle_far'"),
-    "mimic": (
-        lambda t: (
-            t.replace(
-                'effort="0.6" velocity="7"/></joint>', 'effort="0.6" velocity="7"/><mimic joint="thumb_1"/></joint>', 2
-            )
-            .replace('<mimic joint="thumb_1"/>', '<mimic joint="index_1"/>', 2)
-            .replace('<mimic joint="index_1"/>', "", 1)
-        ),
-        r"move together.*index_2.*coupled=independent",
-    ),
     "millimetres": (lambda t: _scaled(t), r"longest finger is .* m, allowed .*millimetres"),
     "xacro": (
         lambda t: t.replace(
@@ -437,11 +427,15 @@ def test_a_folder_that_is_not_ours_is_not_touched(tmp_path):
 
 
 def test_coupled_joints_are_driven_alone_only_when_asked(one_start, tmp_path):
-    change, _ = BAD["mimic"]
-    path = _broken(tmp_path, change)
-    result = import_hand(path, tmp_path / "hand", Settings(coupled="independent"), picture=False)
+    path = hands.write(tmp_path / "robot")
+    start, joint, rest = path.read_text().partition('<joint name="index_2"')
+    path.write_text(start + joint + rest.replace("</joint>", '<mimic joint="index_1"/></joint>', 1))
+    result = import_hand(path, tmp_path / "hand", Settings(coupled="independent", pads=None), picture=False)
     assert any("taken apart" in line and "index_2" in line for line in result.lines)
     assert "index_2" in load_hand(tmp_path / "hand").joints
+    result = import_hand(path, tmp_path / "tied", Settings(pads=None), picture=False)
+    assert any("coupled" in line and "index_2" in line for line in result.lines)
+    assert load_hand(tmp_path / "tied").couplings.passive == ("index_2",)
 
 
 def test_a_package_path_is_found_beside_and_above_the_file(one_start, tmp_path):
@@ -618,7 +612,7 @@ def test_check_tells_a_joint_that_opens_where_it_should_close(claw, tmp_path, ca
         (["a.urdf", "out=x", "drops=-1"], "drops=-1: must be a whole number from 0 to 100000"),
         (["a.urdf", "out=x", "drops=3.5"], "drops=3.5: must be a whole number"),
         (["a.urdf", "out=x", "drops=100001"], "drops=100001: must be a whole number"),
-        (["a.urdf", "out=x", "coupled=maybe"], "coupled=maybe: must be refuse or independent"),
+        (["a.urdf", "out=x", "coupled=maybe"], "coupled=maybe: must be keep or independent"),
         (["a.urdf", "out=x", "colour=red"], "'colour=red': no such setting"),
         (["a.urdf", "out=x"], "a.urdf does not exist"),
     ],

@@ -11,6 +11,7 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.hand import Hand
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.skin import tip_skins
 from dexsim.recording import mechanism
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
@@ -258,7 +259,7 @@ def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, fl
     closes. Returns its centre [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
     model = hand.compiled
     data = mujoco.MjData(model)
-    data.qpos[[model.joint(name).qposadr[0] for name in hand.joints]] = hand.pose("open")
+    Couplings(model, hand.joints).put(data, hand.pose("open"))
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     layout, count = pads_of(hand), pads_of(hand).count[finger]

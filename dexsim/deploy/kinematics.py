@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand import Hand, load_hand
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.skin import tip_skins
 from dexsim.tactile.layout import hand_layout
 
@@ -23,7 +24,7 @@ class HandKinematics:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         m = self.model
-        self._q = np.array([m.joint(j).qposadr[0] for j in hand.joints])
+        self._couplings = Couplings(m, hand.joints)
         self._body = np.array([m.body(b).id for b in hand.tip_bodies])
         self._offset = np.array([f.position for f in hand.fingers])
         layout = hand_layout(hand)
@@ -34,7 +35,7 @@ class HandKinematics:
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Angles [J] rad -> (tips [F, 3] m, positions [F, 3] m and rotations [F, 3, 3] of the tips' bodies)."""
         d = self.data
-        d.qpos[self._q] = q
+        self._couplings.put(d, q)
         mujoco.mj_kinematics(self.model, d)
         position, turn = d.xpos[self._body].copy(), d.xmat[self._body].reshape(-1, 3, 3).copy()
         return position + np.einsum("fij,fj->fi", turn, self._offset), position, turn

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.schema import HandFile, Pad
 
 if TYPE_CHECKING:
@@ -65,6 +66,11 @@ class Hand:
     def compiled(self) -> mujoco.MjModel:
         """The compiled model of the hand alone, shared: not to be changed."""
         return self._spec.copy().compile()
+
+    @cached_property
+    def couplings(self) -> Couplings:
+        """How joints without a drive of their own follow those that have one, of `compiled`."""
+        return Couplings(self.compiled, self.joints, f"hand {self.folder}")
 
     @property
     def name(self) -> str:

@@ -85,15 +85,19 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
     order = {j.name: k for k, j in enumerate(file.joints)}
     flip = np.array([1.0, -1.0 if mirror else 1.0, 1.0])
     fingers = []
+    leader = next((f for f in file.fingers if f.flexion), None)
+    if leader is None:
+        raise UserError(f"{where}: fingers: none has a joint in flexion: name those that close a finger")
     for entry, geoms in zip(file.fingers, tips, strict=True):
+        bends = entry if entry.flexion else leader  # one that follows another bends with it
         normal = np.array(entry.tip.normal) / np.linalg.norm(entry.tip.normal)
         fingers.append(
             Finger(
                 name=entry.name,
                 joints=tuple(order[j] for j in entry.joints),
-                flexion=tuple(order[j] for j in entry.flexion),
-                closes=tuple(entry.closes or [1] * len(entry.flexion)),
-                root=model.body_of_joint(spec, entry.joints[0]),
+                flexion=tuple(order[j] for j in bends.flexion),
+                closes=tuple(bends.closes or [1] * len(bends.flexion)),
+                root=model.root_body(spec, entry.joints, entry.tip.body, file.palm.body),
                 body=entry.tip.body,
                 position=_triple(np.array(entry.tip.position) * flip * scale),
                 normal=_triple(normal * flip),

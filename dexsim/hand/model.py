@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from dexsim import guard, model_file
+from dexsim import model_file
 from dexsim.errors import UserError
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.schema import HandFile
 
 OBJECT_BIT, HAND_BIT = 1, 2
 """Collision bits. Colliding hand geoms have contype HAND_BIT and conaffinity OBJECT_BIT, objects' geoms contype
 OBJECT_BIT and conaffinity HAND_BIT; bits 4 and up are the hand's own, about itself."""
+DRIVE = "drive_"
+"""Begins the names of bodies that are no link but the drum or nut of an actuator, which pulls joints by a tendon."""
 LINK_SOLREF = [0.005, 1.0]
+TIES = (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON)
+"""Constraints that may hold a hand's joints together."""
 ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -23,7 +27,7 @@ def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, lis
     """The model in the palm frame, and the names of each fingertip's geoms. Raises UserError."""
     at = path.parent / file.model
     spec = model_file.read(at, f"{where}: model ({file.model})")
-    _alone(spec, at, f"{where}: model ({file.model})")
+    _alone(spec, f"{where}: model ({file.model})")
     _joints(spec, file, where)
     for group in (spec.actuators, spec.sensors, spec.keys, spec.lights, spec.cameras):
         for item in list(group):
@@ -50,25 +54,24 @@ def limits(spec: mujoco.MjSpec, joints: list[str], where: str) -> np.ndarray:
     return np.array(out)
 
 
-def body_of_joint(spec: mujoco.MjSpec, joint: str) -> str:
-    """Name of the body that a joint moves."""
-    return spec.joint(joint).parent.name
+def root_body(spec: mujoco.MjSpec, joints: list[str], tip: str, palm: str) -> str:
+    """Name of the body where a finger begins: the one that its first joint moves; of a finger that is pulled by a
+    tendon, or follows another, alone, the one on the palm."""
+    if joints and not (first := spec.joint(joints[0]).parent.name).startswith(DRIVE):
+        return str(first)
+    body = spec.body(tip)
+    while body.parent.name not in (palm, "world"):
+        body = body.parent
+    return str(body.name)
 
 
-def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
-    """Refuse what servos on single joints cannot drive, and what is not the hand."""
-    coupled = {
-        "tendon": [t.name for t in spec.tendons],
-        "equality constraint": [e.name or e.name1 for e in spec.equalities],
-    }
-    if not guard.ours(path):
-        coupled["mimic joint"] = guard.call(_mimics, path, what=where)
-    for kind, names in coupled.items():
-        if names:
-            shown = ", ".join(n or "unnamed" for n in names[:3]) + (" ..." if len(names) > 3 else "")
+def _alone(spec: mujoco.MjSpec, where: str) -> None:
+    """Refuse what no servo moves, and what is not the hand."""
+    for equality in spec.equalities:
+        if equality.type not in TIES:
             raise UserError(
-                f"{where}: has {len(names)} {kind}{'s' if len(names) > 1 else ''} ({shown}): joints that are coupled"
-                " are not simulated; take them out and drive every joint, or fix those that follow"
+                f"{where}: equality constraint '{equality.name or equality.name1}' is neither of joints nor of tendons:"
+                " take it out"
             )
     for joint in spec.joints:
         if joint.type not in ONE_DOF:
@@ -86,22 +89,22 @@ def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
         )
 
 
-def _mimics(path: Path) -> list[str]:
-    """Names of a URDF's joints that follow others, which MuJoCo does not read."""
-    root = ET.parse(path).getroot()
-    return [j.get("name", "") for j in root.iter("joint") if root.tag == "robot" and j.find("mimic") is not None]
-
-
 def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
     theirs, ours = [j.name for j in spec.joints], [j.name for j in file.joints]
     for name in ours:
         if name not in theirs:
             raise UserError(f"{where}: joints: '{name}' is not in the model; its joints: {', '.join(theirs)}")
-    missing = [n or "(unnamed)" for n in theirs if n not in ours]
-    if missing:
+    for equality in spec.equalities:
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.name1 in ours:
+            raise UserError(
+                f"{where}: joints: '{equality.name1}' follows '{equality.name2}' in the model, it has no drive of its"
+                " own: take it out of joints, or the equality out of the model"
+            )
+    loose = Couplings(spec.copy().compile(), ours, where).loose
+    if loose:
         raise UserError(
-            f"{where}: joints: lacks '{missing[0]}' of the model ({len(missing)} in all); name every hinge and slide,"
-            " or fix it in the model"
+            f"{where}: joints: lacks '{loose[0]}' of the model ({len(loose)} in all); name every hinge and slide that"
+            " no equality and no tendon moves, or fix it in the model"
         )
     for entry in file.joints:
         if entry.armature is not None:
@@ -127,7 +130,8 @@ def _tips(spec: mujoco.MjSpec, file: HandFile, where: str) -> list[tuple[str, ..
         while b is not None and b.name != "world":
             above = [j.name for j in b.joints] + above
             b = b.parent
-        if [j for j in above if j in finger.joints] != finger.joints:
+        elsewhere = [j for j in finger.joints if j not in above and spec.joint(j).parent.name.startswith(DRIVE)]
+        if [j for j in above if j in finger.joints] + elsewhere != finger.joints:
             raise UserError(
                 f"{field}.joints ({finger.joints}): must lie on the way from the palm to its tip, in this order; there"
                 f" are {above}"
@@ -170,9 +174,8 @@ def _place(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
     """Move the root body so that the palm frame, in the open pose, is the world frame."""
     m = spec.copy().compile()
     d = mujoco.MjData(m)
-    for name, angle in file.poses.open.items():
-        if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0:
-            d.qpos[m.joint(name).qposadr[0]] = angle
+    held = {n: a for n, a in file.poses.open.items() if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_JOINT, n) >= 0}
+    Couplings(m, held, where).put(d, np.array(list(held.values())))
     mujoco.mj_kinematics(m, d)
     z = np.array(file.palm.normal) / np.linalg.norm(file.palm.normal)
     x = np.array(file.palm.forward) - z * np.dot(z, file.palm.forward)

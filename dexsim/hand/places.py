@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.hand import Hand
 
 
@@ -46,7 +47,7 @@ def surface(hand: Hand, over: np.ndarray) -> float:
             spec.delete(geom)
     model = spec.compile()
     data = mujoco.MjData(model)
-    data.qpos[[model.joint(j).qposadr[0] for j in hand.joints]] = hand.pose("open")
+    Couplings(model, hand.joints).put(data, hand.pose("open"))
     mujoco.mj_forward(model, data)
     hit, down, top = np.full(1, -1, np.int32), np.array([0.0, 0.0, -1.0]), 10.0
     heights = [0.0]
@@ -61,7 +62,7 @@ def fingertips(hand: Hand, angles: np.ndarray) -> np.ndarray:
     """Fingertips [F, 3] m at joint angles [J] rad, palm frame."""
     model = hand.compiled
     data = mujoco.MjData(model)
-    data.qpos[[model.joint(j).qposadr[0] for j in hand.joints]] = angles
+    hand.couplings.put(data, angles)
     mujoco.mj_kinematics(model, data)
     return np.array(
         [data.body(f.body).xpos + data.body(f.body).xmat.reshape(3, 3) @ np.array(f.position) for f in hand.fingers]

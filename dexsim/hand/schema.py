@@ -24,7 +24,8 @@ Metre = Annotated[float, msgspec.Meta(gt=0.01, le=10.0)]
 
 
 class JointEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A driven joint. effort: N m (N of a slide), speed: rad/s (m/s), the largest of each; its range is the model's.
+    """A driven joint: what a command goes to. Those that follow it by an equality or a tendon of the model are not
+    named. effort: N m (N of a slide), speed: rad/s (m/s), the largest of each; its range is the model's.
     armature: kg m2 (kg) of the rotor seen at the joint, instead of the model's, which often has none."""
 
     name: Text
@@ -65,12 +66,13 @@ class Pad(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FingerEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A finger. joints: root to tip; flexion: those that close it, root to tip; closes: the sign of the motion of each
+    """A finger. joints: driven ones root to tip, then drives that pull it by a tendon; none of a finger that follows
+    another; flexion: those that close it, root to tip; closes: the sign of the motion of each
     that closes it (all +1 without)."""
 
     name: Name
-    joints: Annotated[list[Text], msgspec.Meta(min_length=1, max_length=32)]
-    flexion: Annotated[list[Text], msgspec.Meta(min_length=1, max_length=32)]
+    joints: Annotated[list[Text], msgspec.Meta(max_length=32)]
+    flexion: Annotated[list[Text], msgspec.Meta(max_length=32)]
     tip: Tip
     pad: Pad | None = None
     closes: list[Literal[1, -1]] | None = None
@@ -105,7 +107,7 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     handedness: Literal["right", "left", "none"]
     model: Text
     servo: Text
-    joints: Annotated[list[JointEntry], msgspec.Meta(min_length=2, max_length=256)]
+    joints: Annotated[list[JointEntry], msgspec.Meta(min_length=1, max_length=256)]
     palm: Palm
     fingers: Annotated[list[FingerEntry], msgspec.Meta(min_length=2, max_length=32)]
     opposing: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=31)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,13 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from dexsim.hand.model import DRIVE
 from dexsim.import_hand import geometry
+from dexsim.import_hand.drives import Pull
 from dexsim.import_hand.figures import Figures
 from dexsim.import_hand.shapes import MARGIN, Capsule, Shapes
 from dexsim.import_hand.tree import Tree
 
 OBJECT_BIT, HAND_BIT = 1, 2  # as dexsim.hand.model has them: the bits above are the hand's own, about itself
 FIRST_OWN = 2
+TIE = "0.01 1"  # of what ties joints: as stiff as two physics steps allow
 SOLREF = "0.005 1"
 PLAIN = "0.62 0.64 0.67 1"
 
@@ -49,11 +53,13 @@ def build(
     figures: Figures,
     excluded: list[tuple[str, str]],
     note: str,
+    pulls: Sequence[Pull] = (),
 ) -> Model:
     """MJCF of the hand: its root is the palm, which stands in the world's origin.
 
     Links meet those of other fingers and objects; a tip meets objects with its mesh and the hand with a capsule inside.
-    excluded: pairs of bodies that do not meet each other.
+    excluded: pairs of bodies that do not meet each other. pulls: actuators that pull a tendon, each a drum on the
+    palm whose angle is the tendon's length.
     """
     out = Model("")
     owner: dict[int, int] = {}  # body -> finger
@@ -96,7 +102,7 @@ def build(
             lines.append(
                 f'{inner}<joint name="{_t(joint)}"{kind} pos="{_n(m.jnt_pos[j])}" axis="{_n(m.jnt_axis[j])}"'
                 f' range="{_n(m.jnt_range[j])}" armature="{_n(figures.armature[joint])}"'
-                f' damping="{_n(figures.damping[joint])}"{_spring(m, j)}/>'
+                f' damping="{_n(figures.damping[joint])}"{_spring(m, j)}{_rubs(m, j, tree)}/>'
             )
         for n, c in enumerate(c for c in shapes.capsules if c.body == b):
             others = everyone & ~own(b)
@@ -136,6 +142,8 @@ def build(
         lines.append(f"{pad}</body>")
 
     emit(tree.palm, 2)
+    drums, tendons, equalities = _ties(m, tree, figures, pulls)
+    lines[-1:-1] = drums
     order = {f"tip_{f.name}": k for k, f in enumerate(tree.fingers)}
     out.tip_geoms.sort(key=lambda g: order[g])
     assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
@@ -143,7 +151,7 @@ def build(
     out.xml = _TEMPLATE.format(
         name=_t(name), note=note.replace("--", "-"), assets=assets, bodies="\n".join(lines), solref=SOLREF,
         margin=MARGIN,
-        contact=f"\n  <contact>\n{apart}\n  </contact>" if apart else "",
+        contact=(f"\n  <contact>\n{apart}\n  </contact>" if apart else "") + tendons + equalities,
     )  # fmt: skip
     return out
 
@@ -155,6 +163,68 @@ def _spring(m: mujoco.MjModel, j: int) -> str:
     if m.jnt_stiffness[j]:
         said.append(("springref", m.qpos_spring[at]))
     return "".join(f' {key}="{_n(value)}"' for key, value in said if value)
+
+
+def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> str:
+    """Dry friction of a joint without a drive: that of driven ones is their servo's."""
+    level = m.dof_frictionloss[m.jnt_dofadr[j]]
+    return f' frictionloss="{_n(level)}"' if j in tree.passive and level else ""
+
+
+def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]) -> tuple[list[str], str, str]:
+    """Lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
+    names = {m.joint(j).name for j in tree.every}
+    drums, tendons, ties = [], [], []
+    for pull in pulls:
+        arms = {j: c for j, c in pull.arms.items() if j in names}
+        at = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in arms.items())
+        drum = _t(f"{DRIVE}{pull.name}")
+        drums.append(
+            f'      <body name="{drum}"><inertial pos="0 0 0" mass="1e-4" diaginertia="1e-9 1e-9 1e-9"/><joint'
+            f' name="{_t(pull.name)}" axis="0 0 1" range="{_n(pull_range(m, pull))}" ref="{_n(at)}"'
+            f' armature="{_n(figures.armature[pull.name])}" damping="{_n(figures.damping[pull.name])}"/></body>'
+        )
+        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in {**arms, pull.name: -1.0}.items())
+        tendons.append(f'    <fixed name="{drum}">{along}</fixed>')
+        ties.append(f'    <tendon tendon1="{drum}" solref="{TIE}"/>')
+    for t in range(m.ntendon):
+        wraps = range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t])
+        arms = {m.joint(m.wrap_objid[w]).name: m.wrap_prm[w] for w in wraps}
+        if not set(arms) <= names:
+            continue
+        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in arms.items())
+        own = "".join(f' {key}="{_n(value)}"' for key, value in (
+            ("stiffness", m.tendon_stiffness[t]), ("damping", m.tendon_damping[t]),
+            ("frictionloss", m.tendon_frictionloss[t])) if value)  # fmt: skip
+        if m.tendon_stiffness[t]:
+            own += f' springlength="{_n(m.tendon_lengthspring[t])}"'
+        if m.tendon_limited[t]:
+            own += f' range="{_n(m.tendon_range[t])}"'
+        tendons.append(f'    <fixed name="{_t(m.tendon(t).name or f"tendon_{t}")}"{own}>{along}</fixed>')
+    for e in range(m.neq):
+        pair = [int(m.eq_obj1id[e]), int(m.eq_obj2id[e])]
+        if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT:
+            what, of = "joint", [m.joint(k).name for k in pair if k >= 0]
+            if not set(of) <= names:
+                continue
+        else:
+            what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k >= 0]
+        both = " ".join(f'{what}{n}="{_t(x)}"' for n, x in enumerate(of, 1))
+        ties.append(f'    <{what} {both} polycoef="{_n(m.eq_data[e, :5])}" solref="{TIE}"/>')
+    return (
+        drums,
+        "\n  <tendon>\n" + "\n".join(tendons) + "\n  </tendon>" if tendons else "",
+        "\n  <equality>\n" + "\n".join(ties) + "\n  </equality>" if ties else "",
+    )
+
+
+def pull_range(m: mujoco.MjModel, pull: Pull) -> tuple[float, float]:
+    """Least and largest length of a pulled tendon: what its joints' limits leave, or the file's own range within."""
+    ends = np.array([np.sort(c * m.jnt_range[m.joint(j).id]) for j, c in pull.arms.items()]).sum(0)
+    low, high = (float(x) for x in ends)
+    if pull.range is not None and low < pull.range[1] and pull.range[0] < high:
+        low, high = max(low, pull.range[0]), min(high, pull.range[1])
+    return low, high
 
 
 def _subtree(m: mujoco.MjModel, root: int) -> list[int]:

@@ -32,7 +32,7 @@ settings (key=default):
   effort= speed=    N m and rad/s of the joints for which the file says none
   density=          kg/m3 of links without an inertia
   inertia=          of links whose moments no body has: shapes (those of its shapes) or balance (the mean of the three)
-  coupled=refuse    joints tied by tendons, mimic or equality: refuse, or independent: a motor for each
+  coupled=keep      joints tied by tendons, mimic or equality follow as the file says; independent: a motor for each
   holes=hull        of a fingertip's mesh with a hole the convex hull is taken, or refuse
   packages=         folders in which package:// is looked for, separated by commas
   drops=256         objects let fall, to find where the hand holds them; 0: told from its cupped pose alone
@@ -117,7 +117,7 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
     from dexsim.import_hand.importing import Settings
 
     options = (
-        ("coupled", ("refuse", "independent")),
+        ("coupled", ("keep", "independent")),
         ("holes", ("hull", "refuse")),
         ("inertia", ("shapes", "balance")),
     )
@@ -125,7 +125,7 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
         if given.get(key, allowed[0]) not in allowed:
             raise UserError(f"{key}={given[key]}: must be {' or '.join(allowed)}")
     out = Settings(said=said)
-    out.coupled, out.holes = given.get("coupled", "refuse"), given.get("holes", "hull")
+    out.coupled, out.holes = given.get("coupled", "keep"), given.get("holes", "hull")
     out.inertia = given.get("inertia")
     out.palm, out.name = given.get("palm") or None, given.get("name") or None
     for key, low, high, unit in (

@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
 
 
 @dataclass
+class Pull:
+    """An actuator that pulls a tendon of fixed coefficients. arms: [m, or 1] by joint, so that it stands at
+    sum(arm * q); range: of that, or None."""
+
+    name: str
+    arms: dict[str, float]
+    range: tuple[float, float] | None
+
+
+@dataclass
 class Drives:
-    """By joint: effort [N m], kp [N m/rad], kd [N m s/rad], at the joint (N, N/m, N s/m of a slide); notes: what of the
-    actuators was not used, a line each."""
+    """By joint, or by name of a pull: effort [N m], kp [N m/rad], kd [N m s/rad], at the joint (N, N/m, N s/m of a
+    slide); notes: what of the actuators was not used, a line each. pulls: actuators that pull a tendon; moved: joints
+    that have a drive."""
 
     effort: dict[str, float] = field(default_factory=dict)
     kp: dict[str, float] = field(default_factory=dict)
     kd: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    pulls: list[Pull] = field(default_factory=list)
+    moved: set[str] = field(default_factory=set)
 
 
 def read(spec: mujoco.MjSpec) -> Drives:
@@ -32,9 +46,17 @@ def read(spec: mujoco.MjSpec) -> Drives:
 
     for k, a in enumerate(spec.actuators):
         name = a.name or a.target or f"actuator {k}"
-        if a.trntype != mujoco.mjtTrn.mjTRN_JOINT or spec.joint(a.target) is None:
+        at = a.target
+        if a.trntype == mujoco.mjtTrn.mjTRN_TENDON and (arms := fixed_arms(spec.tendon(a.target))):
+            at = name if spec.joint(name) is None else f"{name}_drive"
+            tendon = spec.tendon(a.target)
+            low, high = (float(x) for x in (tendon.range if np.ptp(tendon.range) > 0 else a.ctrlrange))
+            out.pulls.append(Pull(at, arms, (low, high) if low < high else None))
+        elif a.trntype != mujoco.mjtTrn.mjTRN_JOINT or spec.joint(a.target) is None:
             leave("actuators that do not turn a joint", name)
             continue
+        else:
+            out.moved.add(at)
         gear = float(a.gear[0])
         gain, bias = np.array(a.gainprm, float), np.array(a.biasprm, float)
         affine = a.biastype == mujoco.mjtBias.mjBIAS_AFFINE
@@ -48,20 +70,20 @@ def read(spec: mujoco.MjSpec) -> Drives:
             most = float(np.abs(a.ctrlrange).max() * abs(gain[0] * gear))
             reach = min(reach, most) if reach else most
         if reach > 0:
-            out.effort[a.target] = out.effort.get(a.target, 0.0) + reach
+            out.effort[at] = out.effort.get(at, 0.0) + reach
         if affine:
             if bias[1] < 0:
-                out.kp[a.target] = out.kp.get(a.target, 0.0) - bias[1] * gear**2
+                out.kp[at] = out.kp.get(at, 0.0) - bias[1] * gear**2
                 if not np.isclose(gain[0], -bias[1]):
                     leave("a gain that is not kp", name)
             if bias[2] < 0:
-                out.kd[a.target] = out.kd.get(a.target, 0.0) - bias[2] * gear**2
+                out.kd[at] = out.kd.get(at, 0.0) - bias[2] * gear**2
             elif bias[2] > 0:
                 leave("dampratio", name)
             if bias[0]:
                 leave("a constant force", name)
             joint = spec.joint(a.target)
-            if bias[1] < 0 and a.ctrllimited != 0 and np.ptp(a.ctrlrange) > 0 and gear:
+            if joint is not None and bias[1] < 0 and a.ctrllimited != 0 and np.ptp(a.ctrlrange) > 0 and gear:
                 ends = np.sort(np.array(a.ctrlrange, float) / gear)
                 span = np.ptp(np.array(joint.range, float))
                 turn = np.degrees(1.0) if _degrees(spec) and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
@@ -70,6 +92,20 @@ def read(spec: mujoco.MjSpec) -> Drives:
         if a.dyntype != mujoco.mjtDyn.mjDYN_NONE:
             leave("the time constant of a filter", name)
     out.notes = [f"not used: {what}: {', '.join(names)}" for what, names in unused.items()]
+    return out
+
+
+def fixed_arms(tendon: Any) -> dict[str, float]:
+    """Coefficients by joint of a tendon; empty for one that is routed over sites and geoms."""
+    out: dict[str, float] = {}
+    for wrap in tendon.path:
+        try:
+            target = wrap.target
+        except (AttributeError, TypeError, ValueError):  # a pulley has none
+            return {}
+        if not isinstance(target, mujoco.MjsJoint):
+            return {}
+        out[target.name] = out.get(target.name, 0.0) + float(wrap.coef)
     return out
 
 

@@ -53,13 +53,17 @@ def check(
     """
     m, where = source.model, f"model {source.path}"
     _size(motions, where)
-    for j in tree.joints:
+    for j in tree.every:
         _limits(m, j, where, source.limits.get(m.joint(j).name))
     out = Figures({}, {}, {}, {})
     for x in motions:
         for j in x.finger.joints:
             name = m.joint(j).name
-            if name in out.effort:
+            if name in out.armature:
+                continue
+            dof = int(m.jnt_dofadr[j])
+            out.armature[name], out.damping[name] = float(m.dof_armature[dof]), float(m.dof_damping[dof])
+            if j in tree.passive:
                 continue
             out.effort[name] = _stated(source.drives.effort, name, effort, out.guessed_effort, PRESS * x.reach)
             out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, SPEED)
@@ -70,15 +74,21 @@ def check(
                     out.warnings.append(
                         f"joint '{name}': {what} {value:g} {unit} is unusual for a hand ({low:g} to {high:g}): check it"
                     )
-            dof = int(m.jnt_dofadr[j])
-            out.armature[name] = float(m.dof_armature[dof])
             if out.armature[name] <= 0:
                 out.armature[name] = ROTOR * out.effort[name]
                 out.guessed_armature.append(name)
-            out.damping[name] = float(m.dof_damping[dof])
             if out.damping[name] <= 0:
                 out.damping[name] = DAMPING * out.effort[name]
                 out.guessed_damping.append(name)
+    for pull in source.drives.pulls:
+        reach = max(
+            (x.reach for x in motions if {m.joint(j).name for j in x.finger.joints} & set(pull.arms)), default=0
+        )
+        out.effort[pull.name] = _stated(source.drives.effort, pull.name, effort, out.guessed_effort, PRESS * reach)
+        out.speed[pull.name] = _stated(source.speeds, pull.name, speed, out.guessed_speed, SPEED)
+        out.armature[pull.name] = ROTOR * out.effort[pull.name]
+        out.damping[pull.name] = DAMPING * out.effort[pull.name]
+        out.guessed_armature.append(pull.name)
     out.warnings += _inertias(m, tree)
     out.massless = _massless(m, tree)
     return out

@@ -149,7 +149,7 @@ def _tip(m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, last: int) -> np.n
     points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0]
     world = d.xmat[finger.tip].reshape(3, 3)
     points = points @ world.T + d.xpos[finger.tip]
-    axis = d.xaxis[last] if m.jnt_type[last] == HINGE else np.zeros(3)
+    axis = d.xaxis[last]
     along = points.mean(0) - d.xanchor[distal]
     along = unit(along - axis * (axis @ along))
     reach = (points - d.xanchor[distal]) @ along
@@ -168,7 +168,7 @@ def _moved(
     world = d.xmat[finger.tip].reshape(3, 3)
     tip = tip_at(d, finger.tip, position)
     hinge = m.jnt_type[last] == HINGE
-    axis = d.xaxis[last] if hinge else np.zeros(3)
+    axis = d.xaxis[last]
     points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0] @ world.T + d.xpos[finger.tip]
     along = points.mean(0) - d.xanchor[distal]
     along = unit(along - axis * (axis @ along))

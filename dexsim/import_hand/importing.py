@@ -29,6 +29,7 @@ from dexsim.import_hand import (
     tree,
 )
 from dexsim.import_hand.corrections import Corrections
+from dexsim.import_hand.drives import Pull
 from dexsim.import_hand.text import yaml_text as hand_text
 
 DROPS = 256  # objects let fall to find where they are held: some 40 s of one core, with the trial
@@ -37,7 +38,7 @@ SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's
 
 @dataclass
 class Settings:
-    """packages: where package:// is looked for; palm: body to take for the palm; coupled: "refuse" or "independent";
+    """packages: where package:// is looked for; palm: body to take for the palm; coupled: "keep" or "independent";
     density: kg/m3 of links without inertia; inertia: "shapes" or "balance", where one is none; effort
     N m, speed rad/s: of joints whose file says none; pads: (rows,
     columns), None for none, or a CSV file; holes: "hull" or "refuse"; drops: objects let fall to find where the hand
@@ -45,7 +46,7 @@ class Settings:
 
     packages: Sequence[Path] = ()
     palm: str | None = None
-    coupled: str = "refuse"
+    coupled: str = "keep"
     density: float | None = None
     inertia: str | None = None
     effort: float | None = None
@@ -88,9 +89,11 @@ def import_hand(
     robot = source.read(model, settings.packages, settings.coupled, settings.density, settings.inertia)
     where, m = f"model {model}", robot.model
     found = tree.find(m, where, settings.palm)
+    found.passive = {j for j in found.every if m.joint(j).name in robot.passive}
     figures.mesh_sizes(robot, found)
     mended = figures.mended(robot, found, settings.inertia)
-    fixes = _corrections(out, note, found, m, settings)
+    pulls = [p for p in robot.drives.pulls if set(p.arms) <= {m.joint(j).name for j in found.every}]
+    fixes = _corrections(out, note, found, m, settings, _driven(m, found, pulls))
     guessed: list[str] = []
 
     def pick(place: str, guess: Any, sure: bool = False) -> Any:
@@ -102,11 +105,12 @@ def import_hand(
     for text in [*robot.notes, *mended]:
         tell(text)
     for text in robot.coupled:
-        tell(f"taken apart: {text}: each of these joints has a motor of its own here")
+        tell(f"coupled: {text}" if settings.coupled == "keep" else
+             f"taken apart: {text}: each of these joints has a motor of its own here")  # fmt: skip
     if found.left:
         tell(f"fixed: {', '.join(found.left)} (before the palm '{m.body(found.palm).name}')")
 
-    motions, doubts = _motions(m, found.fingers, fixes, pick)
+    motions, doubts = _motions(m, found.fingers, fixes, pick, pulls)
     said = fixes.pick("opposing", None)
     names = [f.name for f in found.fingers]
     if said is not None and (not isinstance(said, list) or not said or any(n not in names for n in said)):
@@ -153,23 +157,23 @@ def import_hand(
     name = settings.name or _word(fixes.pick("name", robot.name))
     text = f"{name}: written by dexsim import-hand from {model.name}"
     apart = poses.near_the_palm(m, found)
-    own = build.build(name, m, found, made, known, apart, text)
-    search = _search(own, m, found, motions, thumbs, palm)
+    own = build.build(name, m, found, made, known, apart, text, pulls)
+    search = _search(own, m, found, motions, thumbs, palm, pulls)
     drawn = poses.always_overlapping(search)
     if drawn:
-        own = build.build(name, m, found, made, known, apart + drawn, text)
-        search = _search(own, m, found, motions, thumbs, palm)
+        own = build.build(name, m, found, made, known, apart + drawn, text, pulls)
+        search = _search(own, m, found, motions, thumbs, palm, pulls)
     never, meet = poses.meetings(search)
     tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
          f" corners at most; {1e3 * made.error[0]:.1f} mm off the links; {meet} pairs of links can meet")  # fmt: skip
 
-    order = [str(j) for j in fixes.pick(corrections.ORDER, [m.joint(j).name for j in found.joints])]
+    order = [str(j) for j in fixes.pick(corrections.ORDER, _driven(m, found, pulls))]
     closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
-    own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text)
+    own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text, pulls)
 
     pads = _pads(m, motions, made, settings, where, tell)
     hand = _hand(
-        name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, own, fixes, pick
+        name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, pulls, fixes, pick
     )
     corrections.lay_over(hand, fixes)
     hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
@@ -196,8 +200,13 @@ def import_hand(
     return Result(out, hand, lines, kept, sorted(fixes.used))
 
 
+def _driven(m: mujoco.MjModel, found: tree.Tree, pulls: Sequence[Pull]) -> list[str]:
+    """Names of what commands go to: joints with a drive of their own, and actuators that pull tendons."""
+    return [m.joint(j).name for j in found.joints] + [p.name for p in pulls]
+
+
 def _corrections(
-    out: Path, note: dict[str, Any] | None, found: tree.Tree, m: mujoco.MjModel, settings: Settings
+    out: Path, note: dict[str, Any] | None, found: tree.Tree, m: mujoco.MjModel, settings: Settings, theirs: list[str]
 ) -> Corrections:
     """What a person said: in the hand.yaml that is there, and in the command."""
     fixes = Corrections()
@@ -207,20 +216,19 @@ def _corrections(
 
         schema.read(file)  # refuses what is no hand.yaml, with the place
         now, before = yaml_text.load(file, "hand"), note["hand"]
-        new = {f["joints"][-1]: f["name"] for f in now["fingers"]}
-        old = {f["name"]: new.get(f["joints"][-1], f["name"]) for f in before["fingers"]}
+        new = {f["tip"]["body"]: f["name"] for f in now["fingers"]}
+        old = {f["name"]: new.get(f["tip"]["body"], f["name"]) for f in before["fingers"]}
         for finger in before["fingers"]:
             finger["name"] = old[finger["name"]]
         before["opposing"] = [old.get(n, n) for n in before["opposing"]]
         before["guessed"] = [_renamed(p, old) for p in before.get("guessed") or []]
         for f in found.fingers:
-            f.name = new.get(m.joint(f.joints[-1]).name, f.name)
+            f.name = new.get(m.body(f.tip).name, f.name)
         first = [f["name"] for f in now["fingers"]]
         found.fingers.sort(key=lambda f: first.index(f.name) if f.name in first else len(first))
         fixes = corrections.read(now, before, [_renamed(p, old) for p in note.get("said") or []])
         wire = [j["name"] for j in now["joints"]]
-        theirs = [m.joint(j).name for j in found.joints]
-        if set(wire) == set(theirs) and wire != theirs:
+        if len(set(wire)) == len(theirs) and set(wire) == set(theirs) and wire != theirs:
             fixes.values[corrections.ORDER] = wire
     fixes.values |= settings.said
     return fixes
@@ -236,7 +244,7 @@ def _renamed(place: str, names: dict[str, str]) -> str:
 
 
 def _motions(
-    m: mujoco.MjModel, fingers: list[tree.Finger], fixes: Corrections, pick: Callable[..., Any]
+    m: mujoco.MjModel, fingers: list[tree.Finger], fixes: Corrections, pick: Callable[..., Any], pulls: list[Pull]
 ) -> tuple[list[frame.Motion], list[str]]:
     """How each finger moves, with what a person said of it, and what is not sure of its closing side."""
     bends: list[list[int] | None] = []
@@ -244,6 +252,9 @@ def _motions(
         place = f"fingers.{finger.name}.flexion"
         flexion = fixes.pick(place, None)
         theirs = [m.joint(j).name for j in finger.joints]
+        drums = [p.name for p in pulls if set(p.arms) & set(theirs)]
+        if flexion is not None and any(j in drums for j in flexion):
+            flexion = None  # the joints that it pulls bend the finger; that they do is no guess
         if flexion is not None and (
             not isinstance(flexion, list) or not flexion or any(j not in theirs for j in flexion)
         ):
@@ -287,6 +298,7 @@ def _search(
     motions: list[frame.Motion],
     thumbs: list[int],
     palm: frame.Palm,
+    pulls: list[Pull],
 ) -> poses.Search:
     """The search over the hand's own model, whose ids differ from the source's."""
     new = own.compile()
@@ -298,7 +310,9 @@ def _search(
         moved.append(frame.Motion(finger, flexion, x.closes, x.position, x.normal, x.reach, x.straight))
     points = frame.palm_points(m, found.palm)
     ground = float(np.quantile((points - palm.position) @ palm.normal, 0.95)) if len(points) else 0.0
-    return poses.Search(new, moved, thumbs, palm, 1, ground)
+    drums = {new.joint(p.name).id: {new.joint(j).id: c for j, c in p.arms.items()} for p in pulls}
+    passive = {m.joint(j).name for j in found.passive}
+    return poses.Search(new, moved, thumbs, palm, 1, ground, passive, drums)
 
 
 def _poses(
@@ -320,7 +334,7 @@ def _poses(
         return out_
 
     fixed = said("cupped")
-    if np.isnan(fixed).any():
+    if np.isnan(fixed[list(ids.values())]).any():
         closed, miss = poses.cupped(s, keep=fixed)
         if miss > 1.0:
             tell(
@@ -328,10 +342,10 @@ def _poses(
                 " picture"
             )
     else:
-        closed = fixed
+        closed = s.complete(np.nan_to_num(fixed))
     fixed = said("open")
     opened = poses.opened(s, closed)
-    opened = np.where(np.isnan(fixed), opened, fixed)
+    opened = s.complete(np.where(np.isnan(fixed), opened, fixed))
     for pose, q in (("open", opened), ("cupped", closed)):
         deep = [(a, b, d) for a, b, d in s.overlaps(q) if d > 2 * poses.TOUCH]
         if deep:
@@ -393,7 +407,7 @@ def _pads(
 def _hand(
     name: str, model: Path, m: mujoco.MjModel, found: tree.Tree, motions: list[frame.Motion], thumbs: list[int],
     palm: frame.Palm, known: figures.Figures, order: list[str], open_: dict[str, float], closed: dict[str, float],
-    search: poses.Search, pads: dict[str, taxels.Pad], own: build.Model, fixes: Corrections, pick: Callable[..., Any],
+    search: poses.Search, pads: dict[str, taxels.Pad], pulls: list[Pull], fixes: Corrections, pick: Callable[..., Any],
 ) -> dict[str, Any]:  # fmt: skip
     """Content of hand.yaml."""
 
@@ -408,13 +422,13 @@ def _hand(
     fingers = []
     for x in motions:
         n = x.finger.name
+        own, flexion, closes = _of_drives(m, found, x, pulls)
         pad = None
         if n in pads:
             pad = {"taxels": f"taxels_{n}.csv", "kind": fixes.pick(f"fingers.{n}.pad.kind", "finger"),
                    "rows": pads[n].rows, "skin": f"skin_{n}.obj"}  # fmt: skip
         fingers.append({
-            "name": n, "joints": [m.joint(j).name for j in x.finger.joints],
-            "flexion": [m.joint(j).name for j in x.flexion], "closes": [int(c) for c in x.closes],
+            "name": n, "joints": own, "flexion": flexion, "closes": closes,
             "tip": {"body": m.body(x.finger.tip).name, "position": _list(x.position), "normal": _list(x.normal),
                     "geoms": [f"tip_{n}"]},
             "pad": pad,
@@ -422,6 +436,7 @@ def _hand(
     ids = [search.m.joint(j).id for j in order]
     qo, qc = np.zeros(search.m.nq), np.zeros(search.m.nq)
     qo[ids], qc[ids] = [open_[j] for j in order], [closed[j] for j in order]
+    qo, qc = search.complete(qo), search.complete(qc)
     return {
         "format": "dexsim-hand", "version": 1, "name": name,
         "handedness": pick("handedness", frame.handedness(m, found, motions, thumbs, palm)),
@@ -434,6 +449,22 @@ def _hand(
         "span": float(pick("span", round(poses.span(search, qo, qc), 4))),
         "force": fixes.pick("force", None),
     }  # fmt: skip
+
+
+def _of_drives(
+    m: mujoco.MjModel, found: tree.Tree, x: frame.Motion, pulls: list[Pull]
+) -> tuple[list[str], list[str], list[int]]:
+    """A finger's driven joints and the actuators that pull it; of these, those that bend it, and the sign that does."""
+    inside = {m.joint(j).name for j in x.finger.joints}
+    own = [m.joint(j).name for j in x.finger.joints if j not in found.passive]
+    mine = [p for p in pulls if set(p.arms) & inside]
+    bends = {m.joint(j).name: int(c) for j, c in zip(x.flexion, x.closes, strict=True)}
+    flexion = {n: bends[n] for n in own if n in bends}
+    for pull in mine:
+        votes = sum(np.sign(c) * bends[j] for j, c in pull.arms.items() if j in bends)
+        if votes:
+            flexion[pull.name] = int(np.sign(votes))
+    return own + [p.name for p in mine], list(flexion), list(flexion.values())
 
 
 def _list(v: np.ndarray) -> list[float]:

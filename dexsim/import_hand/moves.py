@@ -45,12 +45,12 @@ def moves(hand: Hand) -> list[Move]:
     """Every joint's move."""
     model = hand.spec().compile()
     data = mujoco.MjData(model)
-    start = picture.qpos(hand, model, hand.pose("open"))
+    start = hand.pose("open")
     owner = {j: k for k, f in enumerate(hand.fingers) for j in f.joints}
     out = []
 
     def tips(q: np.ndarray) -> np.ndarray:
-        data.qpos[:] = q
+        hand.couplings.put(data, q)
         mujoco.mj_kinematics(model, data)
         return np.array([tip_at(data, model.body(f.body).id, np.array(f.position)) for f in hand.fingers])
 
@@ -65,11 +65,10 @@ def moves(hand: Hand) -> list[Move]:
 
     for j, name in enumerate(hand.joints):
         finger = owner.get(j, -1)
-        at = int(model.joint(name).qposadr[0])
         first = None
         for angle in np.linspace(hand.limits[j][0], hand.limits[j][1], STEPS):
             q = start.copy()
-            q[at] = angle
+            q[j] = angle
             tips(q)
             if first is None and (pair := overlap()) is not None:
                 first = (*pair, float(angle))
@@ -77,7 +76,7 @@ def moves(hand: Hand) -> list[Move]:
         ends = []
         for angle in hand.limits[j]:
             q = start.copy()
-            q[at] = angle
+            q[j] = angle
             ends.append(tips(q))
         travel = float(np.linalg.norm(ends[1][finger] - ends[0][finger])) if finger >= 0 else 0.0
         if finger >= 0 and j in hand.fingers[finger].flexion:
@@ -87,7 +86,7 @@ def moves(hand: Hand) -> list[Move]:
             middle = tips(start)[list(goal)].mean(0)
             q = start.copy()
             step = 0.25 * (hand.limits[j, 1] - hand.limits[j, 0])
-            q[at] = np.clip(start[at] + sign * step, *hand.limits[j])
+            q[j] = np.clip(start[j] + sign * step, *hand.limits[j])
             closer = float(np.linalg.norm(tips(start)[finger] - middle) - np.linalg.norm(tips(q)[finger] - middle))
         out.append(Move(name, finger, role, travel, closer, first))
     return out
@@ -155,8 +154,8 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
     from dexsim.view import video
 
     model = hand.spec().compile()
-    start = picture.qpos(hand, model, hand.pose("open"))
-    data = picture.posed(model, start)
+    start = hand.pose("open")
+    data = picture.posed(model, picture.qpos(hand, model, start))
     middle, radius = picture.bounds(model, data)
     camera: dict[str, Any] = {
         "lookat": [float(x) for x in middle],
@@ -172,14 +171,13 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
             rows, text = [], []
             count = max(8, int(seconds * RATE))
             for j, name in enumerate(hand.joints):
-                at = int(model.joint(name).qposadr[0])
                 low, high = hand.limits[j]
                 s = np.linspace(0, 1, count)
-                way = np.interp(s, [0, 0.2, 0.7, 1], [start[at], low, high, start[at]])
+                way = np.interp(s, [0, 0.2, 0.7, 1], [start[j], low, high, start[j]])
                 for angle in way:
                     q = start.copy()
-                    q[at] = angle
-                    rows.append(q)
+                    q[j] = angle
+                    rows.append(picture.qpos(hand, model, q))
                     text.append(f"{name}: {angle:+.2f} rad")
             limit = int(60 * RATE)
             if len(rows) > limit:  # a video holds a minute
@@ -203,11 +201,12 @@ def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[st
 
     shots, titles = [], []
     for j, name in enumerate(hand.joints):
-        at = int(model.joint(name).qposadr[0])
         for angle in hand.limits[j]:
             q = start.copy()
-            q[at] = angle
-            shots.append(Shot(0, q, camera["lookat"], camera["distance"], 140.0, -25.0, (300, 250)))
+            q[j] = angle
+            shots.append(
+                Shot(0, picture.qpos(hand, model, q), camera["lookat"], camera["distance"], 140.0, -25.0, (300, 250))
+            )
             titles.append(f"{name} {angle:+.2f}")
     images = render([model], shots)
     columns = 6

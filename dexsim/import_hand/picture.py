@@ -26,9 +26,9 @@ LABEL = {
 
 def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
     """Joint angles [J] in the hand's order as the model's qpos [nq]."""
-    out = np.zeros(model.nq)
-    out[[int(model.joint(j).qposadr[0]) for j in hand.joints]] = angles
-    return out
+    data = mujoco.MjData(model)
+    hand.couplings.put(data, angles)
+    return data.qpos.copy()
 
 
 def posed(model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:

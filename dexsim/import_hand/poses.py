@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
+import torch
 from scipy.optimize import least_squares
 
+from dexsim.hand.couplings import Couplings
 from dexsim.import_hand.frame import Motion, Palm, stretched, tip_at, unit
 from dexsim.import_hand.tree import Tree
 
@@ -22,7 +24,8 @@ GOOD = 0.35  # of a cupped pose: no further start is tried
 @dataclass
 class Search:
     """Everything a search needs. m: the hand's own model (dexsim's shapes); motions' ids are those of `m`; ground: the
-    palm's front [m], along its normal from its origin."""
+    palm's front [m], along its normal from its origin; passive: joints that follow; drums: by id of an actuator that
+    pulls a tendon, how much of it each joint takes in."""
 
     m: mujoco.MjModel
     motions: list[Motion]
@@ -30,13 +33,23 @@ class Search:
     palm: Palm
     palm_body: int
     ground: float
+    passive: set[str] = field(default_factory=set)
+    drums: dict[int, dict[int, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.data = mujoco.MjData(self.m)
         self.reach = float(np.mean([x.reach for k, x in enumerate(self.motions) if k not in self.thumbs]))
         self.rest = np.clip(stretched(self.m, self.motions), self.m.jnt_range[:, 0], self.m.jnt_range[:, 1])
         self.span = np.ptp(self.m.jnt_range, axis=1)
+        driven = [self.m.joint(j).name for j in range(self.m.njnt) if self.m.joint(j).name not in self.passive]
+        self.couplings = Couplings(self.m, driven)
+        for j, arms in self.drums.items():
+            self.rest[j] = np.clip(sum(c * self.rest[k] for k, c in arms.items()), *self.m.jnt_range[j])
         self.names = [self.m.body(b).name for b in range(self.m.nbody)]
+
+    def complete(self, q: np.ndarray) -> np.ndarray:
+        """Angles [nq] with those that follow where the others hold them."""
+        return self.couplings.complete(torch.as_tensor(q)).numpy() if self.passive else q
 
     def tips(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tips' positions and normals [F, 3] in the palm frame."""
@@ -81,12 +94,14 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
     others = [k for k in range(len(s.motions)) if k not in s.thumbs]
     roots = s.tips(s.rest)[0][others]
     thumb_joints = {j for k in s.thumbs for j in s.motions[k].finger.joints}
+    names = [m.joint(j).name for j in range(m.njnt)]
+    side = [j for j in side if names[j] not in s.passive]
 
     def pose(x: np.ndarray) -> np.ndarray:
         q = x[: m.nq].copy()
         if keep is not None:
             q = np.where(free, q, keep)
-        return q
+        return s.complete(q)
 
     def residuals(x: np.ndarray) -> np.ndarray:
         q, centre = pose(x), x[m.nq :]
@@ -124,8 +139,10 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
                 q[j] += amount * (end - q[j])
         for j in thumb_joints - bent:
             q[j] = rng.uniform(low[j], high[j]) if start else 0.5 * (low[j] + high[j])
+        for j, arms in s.drums.items():
+            q[j] = sum(c * q[k] for k, c in arms.items())
         q = np.clip(q, low, high)
-        tips = s.tips(q)[0]
+        tips = s.tips(s.complete(q))[0]
         x0 = np.append(q, np.clip(tips.mean(0), -reach, reach))
         x0 = np.clip(x0, bounds[0] + 1e-6, bounds[1] - 1e-6)
         scale = np.append(s.span, [reach] * 3)
@@ -135,7 +152,7 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
         if np.sqrt(2 * cost / len(s.motions)) < GOOD:
             break
     assert best is not None  # the first start is better than none
-    return np.clip(best, m.jnt_range[:, 0], m.jnt_range[:, 1]), float(np.sqrt(2 * cost / len(s.motions)))
+    return s.complete(np.clip(best, m.jnt_range[:, 0], m.jnt_range[:, 1])), float(np.sqrt(2 * cost / len(s.motions)))
 
 
 def opened(s: Search, closed: np.ndarray) -> np.ndarray:
@@ -147,11 +164,13 @@ def opened(s: Search, closed: np.ndarray) -> np.ndarray:
     for x in s.motions:
         for j, close in zip(x.flexion, x.closes, strict=True):
             back[j] = np.clip(back[j] - 0.25 * close * s.span[j], *s.m.jnt_range[j])
+    bent += list(s.drums)
     best, least, wide = closed, np.inf, gap(s, closed)
     for rest in (s.rest, back):
         for share in (OPEN, 0.4, 0.2, 0.5, 0.1, 0.6, 0.0, 0.7):
             q = closed.copy()
             q[bent] = rest[bent] + share * (closed[bent] - rest[bent])
+            q = s.complete(q)
             worst = max((d for _, _, d in s.overlaps(q)), default=0.0)
             if worst <= TOUCH and gap(s, q) > wide:
                 return q
@@ -176,7 +195,7 @@ def span(s: Search, open_: np.ndarray, closed: np.ndarray) -> float:
     others = [k for k in range(len(s.motions)) if k not in s.thumbs]
     widest = 0.0
     for share in np.linspace(0, 1, 11):
-        tips = s.tips(open_ + share * (closed - open_))[0]
+        tips = s.tips(s.complete(open_ + share * (closed - open_)))[0]
         widest = max(widest, float(np.linalg.norm(tips[s.thumbs] - tips[others].mean(0), axis=1).max()))
     return min(s.reach, widest)
 
@@ -199,7 +218,7 @@ def always_overlapping(s: Search, count: int = 150, seed: int = 1) -> list[tuple
     m, rng = s.m, np.random.default_rng(seed)
     times: dict[tuple[str, str], int] = {}
     for _ in range(count):
-        for a, b, depth in s.overlaps(rng.uniform(m.jnt_range[:, 0], m.jnt_range[:, 1])):
+        for a, b, depth in s.overlaps(s.complete(rng.uniform(m.jnt_range[:, 0], m.jnt_range[:, 1]))):
             times[a, b] = times.get((a, b), 0) + (depth > TOUCH)
     return sorted(p for p, n in times.items() if n > 0.6 * count)
 
@@ -210,7 +229,7 @@ def meetings(s: Search, count: int = 1500, seed: int = 0) -> tuple[list[tuple[st
     m, rng = s.m, np.random.default_rng(seed)
     touched: dict[tuple[str, str], int] = {}
     for _ in range(count):
-        for a, b, depth in s.overlaps(rng.uniform(m.jnt_range[:, 0], m.jnt_range[:, 1])):
+        for a, b, depth in s.overlaps(s.complete(rng.uniform(m.jnt_range[:, 0], m.jnt_range[:, 1]))):
             if depth > 0.002:
                 touched[a, b] = touched.get((a, b), 0) + 1
     every = set()

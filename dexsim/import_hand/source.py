@@ -25,8 +25,8 @@ ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 class Source:
     """model: of the hand alone. drives: what the file's actuators say; speeds: by joint, where the file says them
     (rad/s). bare: moving bodies whose inertia the file does not give. notes: what was left out, a line each. coupled:
-    what was taken apart. limits: [rad, m] by joint, as a URDF says them: MuJoCo leaves out what is none. mended: by
-    body, the moments that no body has, for which the model has others."""
+    what ties joints, a line each; passive: joints that it moves. limits: [rad, m] by joint, as a URDF says them: MuJoCo
+    leaves out what is none. mended: by body, the moments that no body has, for which the model has others."""
 
     path: Path
     model: mujoco.MjModel
@@ -37,6 +37,7 @@ class Source:
     coupled: list[str] = field(default_factory=list)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     mended: dict[str, Moments] = field(default_factory=dict)
+    passive: set[str] = field(default_factory=set)
 
     @property
     def name(self) -> str:
@@ -44,11 +45,11 @@ class Source:
 
 
 def read(
-    path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", density: float | None = None,
+    path: Path, packages: Sequence[Path] = (), coupled: str = "keep", density: float | None = None,
     inertia: str | None = None,
 ) -> Source:  # fmt: skip
-    """The robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "refuse" joints that move
-    together, or "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia. inertia:
+    """The robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "keep" what ties joints, or
+    "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia. inertia:
     "shapes" takes one that is none from the link's shapes; else it is balanced, and stands in `Source.mended`.
 
     Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
@@ -86,8 +87,10 @@ def _source(
         _meshes_there(spec, path)
     notes: list[str] = []
     _one_tree(spec, path, notes)
-    taken = _coupled(spec, path, coupled)
     said = drives.read(spec)
+    ties, passive = _coupled(spec, path, coupled, said.moved)
+    if coupled == "independent":
+        said.pulls.clear()
     notes += said.notes + drives.contacts(spec) + drives.joints(spec)
     _strip(spec, path, notes)
     if bare and density is None:
@@ -108,7 +111,7 @@ def _source(
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             name, most = model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max())
             said.effort[name] = min(said.effort.get(name, most), most)
-    return Source(path, model, said, speeds, bare, notes, taken, limits, mended)
+    return Source(path, model, said, speeds, bare, notes, ties, limits, mended, passive)
 
 
 def _finite(m: mujoco.MjModel, path: Path) -> None:
@@ -185,39 +188,46 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
         spec.delete(geom)
 
 
-def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str) -> list[str]:
-    """What ties joints together: refused, or taken out on request."""
-    found, things = [], []
-    groups: dict[tuple[str, ...], str] = {}
+def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> tuple[list[str], set[str]]:
+    """What ties joints together, a line each, and the joints that follow others. Taken out where coupled is
+    "independent". moved: joints that an actuator of the file moves."""
+    found, things, passive = [], [], set()
+    closed: list[str] = []
     for tendon in spec.tendons:
         things.append(tendon)
-        joints, routed = [], False
-        for wrap in tendon.path:
-            try:
-                target = wrap.target
-            except (AttributeError, TypeError, ValueError):  # a pulley has none
-                continue
-            if isinstance(target, mujoco.MjsJoint):
-                joints.append(target.name)
-            else:
-                routed = True
-        if routed or len(set(joints)) > 1:  # one over a single joint is a spring or a limit of that joint
-            groups.setdefault(tuple(sorted(set(joints))) or (tendon.name,), tendon.name)
-    found += [f"tendon '{name}' ({', '.join(joints)})" for joints, name in groups.items()]
+        arms = drives.fixed_arms(tendon)
+        if not arms:
+            closed.append(f"tendon '{tendon.name}' is routed over sites or geoms")
+        elif len(arms) > 1:  # one over a single joint is a spring or a limit of that joint
+            found.append(f"tendon '{tendon.name}' ({', '.join(sorted(arms))})")
+            still = [j for j in arms if j not in moved]
+            pulled = any(a.trntype == mujoco.mjtTrn.mjTRN_TENDON and a.target == tendon.name for a in spec.actuators)
+            if len(still) == len(arms) and not pulled:
+                closed.append(f"no actuator moves any of the joints of tendon '{tendon.name}' ({', '.join(arms)})")
+            passive |= set(still)
     for equality in spec.equalities:
-        both = ", ".join(n for n in (equality.name1, equality.name2) if n)
-        kind = "mimic or joint equality" if equality.type == mujoco.mjtEq.mjEQ_JOINT else "equality"
-        found.append(f"{kind} ({both})")
         things.append(equality)
-    if found and coupled != "independent":
+        both = ", ".join(n for n in (equality.name1, equality.name2) if n)
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+            found.append(f"mimic or joint equality ({both})")
+            passive.add(equality.name1)
+            if equality.name1 in moved:
+                closed.append(f"joint '{equality.name1}' has an actuator, and follows '{equality.name2}'")
+        elif equality.type != mujoco.mjtEq.mjEQ_TENDON:
+            kind = {mujoco.mjtEq.mjEQ_CONNECT: "a closed loop (connect", mujoco.mjtEq.mjEQ_WELD: "a weld ("}
+            closed.append(f"{kind.get(equality.type, 'an equality (')} {both})")
+    if coupled == "independent":
+        for thing in things:
+            spec.delete(thing)
+        return found + closed, set()
+    if closed:
         raise UserError(
-            f"model {path}: joints that move together are not simulated: {'; '.join(found[:6])}"
-            f"{f'; {len(found) - 6} more' if len(found) > 6 else ''}: fix those that follow in the file, or"
-            " coupled=independent drives each joint by a motor of its own (another hand than the real one)"
+            f"model {path}: what ties its joints is not simulated: {'; '.join(closed[:6])}"
+            f"{f'; {len(closed) - 6} more' if len(closed) > 6 else ''}: put joint equalities or tendons of fixed"
+            " coefficients in its place, or coupled=independent drives each joint by a motor of its own (another hand"
+            " than the real one)"
         )
-    for thing in things:
-        spec.delete(thing)
-    return found
+    return found, passive
 
 
 def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:

@@ -94,7 +94,7 @@ def paint(
         )
     point = grid @ axes.T - distance[:, None] * normal
     true, _ = geometry.first_hits(surface, grid @ axes.T, -normal)
-    hollow = float(np.where(np.isfinite(true), true - distance, np.inf).max())
+    hollow = float(np.where(np.isfinite(true), true - distance, np.ptp(local[:, 2])).max())
     facing = _smooth(facing, rows, columns)
     tangent = unit(across - facing * (facing @ across)[:, None])
     cell = (2 * shrink * half[0] / max(columns - 1, 1)) * (2 * shrink * half[1] / max(rows - 1, 1))

@@ -35,16 +35,22 @@ class Finger:
 @dataclass
 class Tree:
     """palm: id of the body that all fingers hang on; fingers; left: names of joints before the palm (a wrist, an
-    arm), which are fixed."""
+    arm), which are fixed; passive: ids of the fingers' joints that follow others."""
 
     palm: int
     fingers: list[Finger]
     left: list[str]
+    passive: set[int] = field(default_factory=set)
+
+    @property
+    def every(self) -> list[int]:
+        """Ids of the hand's joints: finger by finger, root to tip, a shared one with the first finger that has it."""
+        return list(dict.fromkeys(j for f in self.fingers for j in f.joints))
 
     @property
     def joints(self) -> list[int]:
-        """Ids of the hand's joints: finger by finger, root to tip, a shared one with the first finger that has it."""
-        return list(dict.fromkeys(j for f in self.fingers for j in f.joints))
+        """Of these, the ones that have a drive of their own."""
+        return [j for j in self.every if j not in self.passive]
 
 
 def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:

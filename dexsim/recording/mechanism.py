@@ -24,6 +24,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, DEFAULTS, STATES, Recording, Series, States
 from dexsim.recording.smooth import local_polynomial
@@ -349,6 +350,7 @@ def drive(
         q, v = int(engine.mjm.jnt_qposadr[joint]), int(engine.mjm.jnt_dofadr[joint])
         lead, lead_speed = _path(follow[1], steps, timestep)
         qpos[0, q : q + 7] = torch.as_tensor(lead[0])
+    qpos = Couplings(engine.mjm, m.joints).complete(qpos) if m.hand and m.hand.couplings.passive else qpos
     engine.set_state(torch.ones(1, dtype=torch.bool), qpos, qvel)
     now = np.where(np.isfinite(initial), initial, start) if initial is not None else start.copy()
     now = np.where(np.isfinite(target), target, now) if target is not None else now

@@ -29,6 +29,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets.objects.own import named
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
+from dexsim.hand.couplings import Couplings
 from dexsim.hand.places import places
 from dexsim.hand.skin import tip_skins
 from dexsim.sim import ContactPair, make_engine
@@ -149,7 +150,7 @@ class HandEnv(VecEnv):
                 spec.delete(spec.joint("object_free"))
                 fasten(spec.body(OBJECT), self.scene.object, spec)  # type: ignore[arg-type]  # not free, not None
         self.furniture = furnish(spec, self.scene)
-        tips, joints = set(self.hand.tip_geoms), set(self.hand.joints)
+        tips, joints = set(self.hand.tip_geoms), {*self.hand.joints, *self.hand.couplings.passive}
         for geom in spec.geoms:
             if geom.name in tips:
                 geom.solimp = [d, d, 1e-3, 0.5, 2.0]
@@ -527,6 +528,8 @@ class HandEnv(VecEnv):
             qvel[:, at_v : at_v + 6] = object_velocity.to(qvel.dtype)
         for index, value in (also or {}).items():
             qpos[:, index] = value.to(qpos.dtype)
+        if self.hand.couplings.passive:
+            qpos = self._couplings.complete(qpos)
         e.set_state(mask, qpos, qvel)
         self.servo.reset(mask, target)
         self.touch.reset(mask)
@@ -602,6 +605,7 @@ class HandEnv(VecEnv):
         def long(x: Any) -> torch.Tensor:
             return torch.as_tensor(x, dtype=torch.long, device=dev)
 
+        self._couplings = Couplings(mjm, self.joints)
         self.joint_q, self.joint_v = long(e.qpos_index(self.joints)), long(e.dof_index(self.joints))
         self._object_at = 0, 0
         if self.scene.object is not None:

@@ -54,8 +54,6 @@ class Pads:
         self.normal = np.array([layout.normal[f][: layout.count[f]].mean(0) for f in range(F)])
         self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
         self.body = [self.model.body(b).id for b in hand.tip_bodies]
-        self.adr = [int(self.model.jnt_qposadr[self.model.joint(j).id]) for j in hand.joints]
-        self.dof = [int(self.model.jnt_dofadr[self.model.joint(j).id]) for j in hand.joints]
         every = rng.uniform(limits[:, 0], limits[:, 1], (TABLE, len(hand.joints)))
         point, normal = np.zeros((TABLE, F, 3)), np.zeros((TABLE, F, 3))
         for k, q in enumerate(every):
@@ -67,7 +65,7 @@ class Pads:
         self.point, self.out = point.swapaxes(0, 1), normal.swapaxes(0, 1)
 
     def _set(self, q: np.ndarray) -> None:
-        self.data.qpos[self.adr] = q
+        self.hand.couplings.put(self.data, q)
         mujoco.mj_kinematics(self.model, self.data)
 
     def torque(self, q: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -79,7 +77,7 @@ class Pads:
             at = self.data.xpos[b] + self.data.xmat[b].reshape(3, 3) @ self.centre[f]
             mujoco.mj_jac(self.model, self.data, jac, None, at, b)
             out += jac.T @ force[f]
-        return out[self.dof]
+        return self.hand.couplings.along(out, self.data.qpos)
 
 
 def candidates(

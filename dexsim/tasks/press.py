@@ -47,14 +47,14 @@ def by_levers(hand: Hand, finger: Finger, limit: list[float]) -> float:
     must stay within its limit [N m]. No friction, no weight."""
     model = hand.compiled
     data = mujoco.MjData(model)
-    data.qpos[[model.joint(j).qposadr[0] for j in hand.joints]] = hand.pose("open")
+    hand.couplings.put(data, hand.pose("open"))
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     body = data.body(finger.body)
     turn, jacobian = body.xmat.reshape(3, 3), np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, body.xpos + turn @ np.array(finger.position), model.body(finger.body).id)
-    arms = [abs(turn @ np.array(finger.normal) @ jacobian[:, model.joint(hand.joints[j]).dofadr[0]])
-            for j in finger.flexion]  # fmt: skip
+    levers = hand.couplings.along(turn @ np.array(finger.normal) @ jacobian, data.qpos)
+    arms = [abs(levers[j]) for j in finger.flexion]
     force = min(tau / max(arm, 1e-3) for tau, arm in zip(limit, arms, strict=True))
     if not np.isfinite(force):
         raise UserError(

@@ -29,19 +29,18 @@ class Reach:
         self.hand, model = hand, hand.compiled
         data = mujoco.MjData(model)
         middle = (hand_layout(hand) or tip_layout(hand)).centre()
-        adr = [model.joint(j).qposadr[0] for j in hand.joints]
         ids = [model.joint(j).id for j in hand.joints]
         cupped = hand.pose("cupped")
         low, high = hand.limits[:, 0].copy(), hand.limits[:, 1].copy()
         for k in hand.others:
             for j in set(hand.fingers[k].joints) - set(hand.fingers[k].flexion):
                 low[j], high[j] = max(low[j], cupped[j] - SIDEWAYS), min(high[j], cupped[j] + SIDEWAYS)
-        every = rng.uniform(low, high, (ROWS, len(adr)))
+        every = rng.uniform(low, high, (ROWS, len(ids)))
         F = len(hand.fingers)
-        point, normal, anchor = np.zeros((ROWS, F, 3)), np.zeros((ROWS, F, 3)), np.zeros((ROWS, len(adr), 3))
+        point, normal, anchor = np.zeros((ROWS, F, 3)), np.zeros((ROWS, F, 3)), np.zeros((ROWS, len(ids), 3))
         bodies = [model.body(f.body).id for f in hand.fingers]
         for row, q in enumerate(every):
-            data.qpos[adr] = q
+            hand.couplings.put(data, q)
             mujoco.mj_kinematics(model, data)
             anchor[row] = data.xanchor[ids]
             for k, (body, finger) in enumerate(zip(bodies, hand.fingers, strict=True)):

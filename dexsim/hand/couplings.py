@@ -1,0 +1,156 @@
+"""Joints that no motor drives by itself: they follow others through equality constraints and fixed tendons.
+
+MuJoCo's constraints move them in a simulation. Here they are placed: where a state is set and where kinematics alone is
+asked for, so that no step begins with a constraint violated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+import torch
+
+from dexsim.errors import UserError
+
+STEP = 1e-5  # rad or m, of differences
+SWEEPS = 30
+"""Of projections onto the tendons' lengths; a finger's tendons share few joints."""
+
+
+class Couplings:
+    """How the joints of `model` that are not `driven` follow those that are.
+
+    passive: their names; loose: of these, the ones that nothing holds; address, dof: of the driven ones in qpos and
+    qvel. A joint equality gives q = q0 + sum_k c_k (q' - q'0)^k of another joint; tendons of fixed
+    coefficients, tied or limited, leave more freedom: of the joints' positions that they allow, the one nearest to the
+    joints' springs' rest is taken, by projections in turn (Kaczmarz), within the joints' limits.
+
+    Raises UserError for joints that follow each other in a ring.
+    """
+
+    def __init__(self, model: mujoco.MjModel, driven: Iterable[str], where: str = "model"):
+        m, order = model, list(driven)
+        names = set(order)
+        self.model = m
+        self.address = [int(m.jnt_qposadr[m.joint(name).id]) for name in order]
+        self.dof = [int(m.jnt_dofadr[m.joint(name).id]) for name in order]
+        tied = {int(m.eq_obj1id[e]): e for e in range(m.neq) if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT}
+        self.passive = tuple(m.joint(j).name for j in range(m.njnt) if _one_dof(m, j) and m.joint(j).name not in names)
+        free = {m.joint(name).id for name in self.passive}
+        self._laws: list[tuple[int, int, np.ndarray]] = []  # qpos of the follower, of the other or -1, coefficients
+        waiting = [j for j in tied if j in free]
+        while waiting:
+            ready = [j for j in waiting if int(m.eq_obj2id[tied[j]]) not in waiting]
+            if not ready:
+                raise UserError(f"{where}: joints {', '.join(m.joint(j).name for j in waiting)} follow each other")
+            for j in ready:
+                e, waiting = tied[j], [x for x in waiting if x != j]
+                other = int(m.eq_obj2id[e])
+                law = m.eq_data[e, :5] if other >= 0 else np.append(m.eq_data[e, :1], np.zeros(4))
+                self._laws.append((int(m.jnt_qposadr[j]), int(m.jnt_qposadr[other]) if other >= 0 else -1, law.copy()))
+                free.discard(j)
+        self._rows: list[tuple[np.ndarray, float, float]] = []  # coefficients [nq], least and largest length
+        held: set[int] = set()
+        for t in range(m.ntendon):
+            if (found := _fixed(m, t)) is None:
+                continue
+            low, high = _lengths(m, t)
+            if np.isfinite([low, high]).any():
+                self._rows.append((found, low, high))
+                held |= {int(a) for a in np.flatnonzero(found)}
+        self._free = sorted({int(m.jnt_qposadr[j]) for j in free} & held)
+        self.loose = tuple(m.joint(j).name for j in sorted(free) if int(m.jnt_qposadr[j]) not in held)
+
+    def complete(self, qpos: torch.Tensor) -> torch.Tensor:
+        """qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
+        m, q = self.model, qpos.clone()
+        for at, other, law in self._laws:
+            x = q[..., other] - m.qpos0[other] if other >= 0 else torch.zeros_like(q[..., at])
+            total = torch.full_like(x, float(law[4]))
+            for c in law[3::-1]:
+                total = total * x + float(c)
+            q[..., at] = m.qpos0[at] + total
+        if self._free:
+            free = torch.as_tensor(self._free, device=q.device)
+            limits = _limits(m, self._free)
+            low, high = (torch.as_tensor(x, dtype=q.dtype, device=q.device) for x in limits.T)
+            q[..., free] = torch.minimum(torch.maximum(self._rest(q, free), low), high)
+            for _ in range(SWEEPS if self._rows else 0):
+                for coefficients, least, most in self._rows:
+                    a = torch.as_tensor(coefficients, dtype=q.dtype, device=q.device)
+                    b = a[free]
+                    if not bool((b != 0).any()):
+                        continue
+                    length = (q * a).sum(-1)
+                    miss = length.clamp(least, most) - length
+                    moved = q[..., free] + miss[..., None] * b / (b @ b)
+                    q[..., free] = torch.minimum(torch.maximum(moved, low), high)
+        return q
+
+    def _rest(self, q: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+        """Where springs would have the joints that tendons hold; where they are, of those without one."""
+        m, addresses = self.model, self._free
+        joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in addresses]
+        rest = torch.as_tensor(m.qpos_spring[addresses], dtype=q.dtype, device=q.device).expand_as(q[..., at])
+        sprung = torch.as_tensor(m.jnt_stiffness[joints] > 0, device=q.device)
+        return torch.where(sprung, rest, torch.as_tensor(m.qpos0[addresses], dtype=q.dtype, device=q.device))
+
+    def put(self, data: mujoco.MjData, values: np.ndarray) -> None:
+        """Set the driven joints' positions [J] in qpos, and those of what follows them."""
+        data.qpos[self.address] = values
+        if self.passive:
+            data.qpos[:] = self.complete(torch.as_tensor(data.qpos.copy())).numpy()
+
+    def along(self, columns: np.ndarray, qpos: np.ndarray) -> np.ndarray:
+        """Columns [..., nv] of a Jacobian by dof as those [..., J] of the driven joints, at a state [nq]: what follows
+        moves along."""
+        if not self.passive:
+            return columns[..., self.dof]
+        return columns @ self.motion(qpos)
+
+    def motion(self, qpos: np.ndarray) -> np.ndarray:
+        """How fast every dof moves with each driven joint [nv, J], at a state [nq]."""
+        m = self.model
+        out = np.zeros((m.nv, len(self.address)))
+        ends = np.repeat(np.asarray(qpos, float)[None], 2 * len(self.address), 0)
+        for k, a in enumerate(self.address):
+            ends[2 * k, a] -= STEP
+            ends[2 * k + 1, a] += STEP
+        both = self.complete(torch.as_tensor(ends)).numpy()
+        slope = (both[1::2] - both[::2]).T / (2 * STEP)
+        for j in range(m.njnt):
+            if _one_dof(m, j):
+                out[m.jnt_dofadr[j]] = slope[m.jnt_qposadr[j]]
+        return out
+
+
+def _one_dof(m: mujoco.MjModel, j: int) -> bool:
+    return int(m.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def _limits(m: mujoco.MjModel, addresses: list[int]) -> np.ndarray:
+    joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in addresses]
+    return np.where(m.jnt_limited[joints, None], m.jnt_range[joints], [-np.inf, np.inf])
+
+
+def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:
+    """Coefficients [nq] of a fixed tendon; None: a spatial one."""
+    out = np.zeros(m.nq)
+    for w in range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t]):
+        if m.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT:
+            return None
+        out[m.jnt_qposadr[m.wrap_objid[w]]] += m.wrap_prm[w]
+    return out
+
+
+def _lengths(m: mujoco.MjModel, t: int) -> tuple[float, float]:
+    """Least and largest length that a tendon may have."""
+    for e in range(m.neq):
+        if m.eq_type[e] == mujoco.mjtEq.mjEQ_TENDON and m.eq_obj1id[e] == t and m.eq_obj2id[e] < 0:
+            length = float(m.tendon_length0[t] + m.eq_data[e, 0])
+            return length, length
+    if m.tendon_limited[t]:
+        return float(m.tendon_range[t, 0]), float(m.tendon_range[t, 1])
+    return -np.inf, np.inf
