@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_gap import SERVO, demo, mechanism_of, motion, plant_run
 
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.cli import recorded
 from dexsim.gap.diagnosis import Settings, diagnose, save
@@ -23,7 +24,7 @@ from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import conditions
 from dexsim.gap.search.search import JointSearch, Member
 from dexsim.paths import CONFIGS
-from dexsim.recording.mechanism import drive
+from dexsim.recording.mechanism import drive, of_recording
 from dexsim.recording.schema import COMMANDS, Series, States
 
 
@@ -228,3 +229,24 @@ def test_what_training_cannot_be_given_is_said():
 )
 def test_of_a_joint_what_follows_best_is_written(errors, chosen):
     assert full_model.choose(errors, 0.1) == chosen
+
+
+def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs():
+    """Of a gain that each recording states itself the fit's factor is written; of the rest its value."""
+    believed = {"joints": {"*": {"kp": 5.0, "kd": 0.1, "delay": 0.01, "coulomb_friction": 0.02}}}
+    m = mechanism_of(ServoTable.from_dict(believed))
+    table = ServoTable.from_dict(
+        {"joints": believed["joints"] | {"joint": {"kp": 5.25, "kd": 0.12}}, "fitted": {"joint": {"kp": 1.05}}}
+    )
+    other = {"kp": 2.0, "coulomb_friction": 0.05}
+    for stated, kp, friction in (({"kp": 8.0, "kd": 0.3}, 8.4, 0.02), (other, 2.1, 0.05)):
+        meta = {"servo": json.dumps({"joints": {"joint": stated}})}
+        r = SimpleNamespace(path="r", joints=("joint",), gravity=np.zeros(3), meta=meta)
+        own = of_recording(m, r).table  # as believed: the recording wins
+        assert own.value("joint", "kp").value == stated["kp"] and own.value("joint", "delay").value == 0.01
+        written = of_recording(mechanism_of(table), r).table.nominal(["joint"])
+        names = ("kp", "kd", "delay", "coulomb_friction")
+        got = [written[0, SERVO_INDEX[n]] for n in names]
+        assert got == pytest.approx([kp, 0.12, 0.01, friction])
+        run = SimpleNamespace(servo=own, supply=None)
+        assert full_model.rows_of(table, run, ["joint"])[0] == pytest.approx(written[0], nan_ok=True)
