@@ -348,6 +348,7 @@ def test_catalogue_is_that_of_the_specification():
         "presliding",
         "joint_spring",
         "external_force",
+        "setpoint_profile",
     }
     assert joint == set(EFFECTS)
     assert confusable("backlash", "stribeck_friction") and not confusable("backlash", "inertia")

@@ -198,6 +198,29 @@ COLUMNS: tuple[Column, ...] = (
         "inside the deadband 0: no torque, 1: the error counts as zero, 2: it counts from the edge on",
         feature="rare",
     ),
+    # A firmware's setpoint: it goes to the target at a limited speed, which it changes at a limited acceleration.
+    Column(
+        "profile_speed",
+        "rad/s",
+        INF,
+        1e-3,
+        INF,
+        3.0,
+        "largest speed at which the firmware moves its setpoint towards the target",
+        feature="profile",
+        remembers=("setpoint", "setpoint_speed"),
+    ),
+    Column(
+        "profile_acceleration",
+        "rad/s2",
+        INF,
+        1e-2,
+        INF,
+        40.0,
+        "largest acceleration of that setpoint: with a speed, a trapezoid; the setpoint slows down in time",
+        feature="profile",
+        remembers=("setpoint_new",),
+    ),
     # Between motor and joint: a rotor of its own, joined to the link by a spring with a gap.
     Column("backlash", "rad", 0.0, 0.0, 2.0, 0.05, "total free play between motor and joint", feature="play"),
     Column(

@@ -39,6 +39,8 @@ RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE, RIPPLE_SHAPE = (
 )
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 DEADBAND, DEADBAND_KIND = INDEX["deadband"], INDEX["deadband_kind"]
+PROFILE_SPEED, PROFILE_ACCELERATION = INDEX["profile_speed"], INDEX["profile_acceleration"]
+SETPOINT, SETPOINT_SPEED, SETPOINT_NEW = (MEMORY[n] for n in ("setpoint", "setpoint_speed", "setpoint_new"))
 DELAY, SPEED_LAG, FILTERED = INDEX["delay"], INDEX["speed_lag"], MEMORY["filtered"]
 COUPLING, SAG = INDEX["coupling"], INDEX["sag"]
 ASYMMETRY, PRESLIDING = INDEX["friction_asymmetry"], INDEX["presliding"]
@@ -617,6 +619,26 @@ def stand_in(constant: Any, by_position: Any, by_speed: Any, by_square: Any, q: 
 # 4th ed. 2012, chapter 17.)
 
 
+@wp.func
+def profiled(at: Any, speed: Any, target: Any, most: Any, acceleration: Any, dt: Any):
+    """(setpoint [rad], its speed [rad/s]) after a step of dt [s] from `at` towards the target [rad]: at most at the
+    speed `most` [rad/s], which changes by at most acceleration [rad/s2] * dt and comes to rest at the target.
+
+    A trapezoid in discrete time: in k steps of a deceleration a the setpoint goes a dt^2 k (k + 1) / 2, so that the
+    fastest from which it stops within |d| is a dt (sqrt(1/4 + 2 |d| / (a dt^2)) - 1/2)."""
+    away = target - at
+    size = wp.abs(away)
+    fast = wp.min(most, size / dt)
+    step = acceleration * dt
+    if acceleration < type(dt)(1.0e8):
+        fast = wp.min(fast, step * (wp.sqrt(type(dt)(0.25) + type(dt)(2.0) * size / (step * dt)) - type(dt)(0.5)))
+    wanted = wp.sign(away) * fast
+    now = wanted
+    if acceleration < type(dt)(1.0e8):
+        now = speed + wp.clamp(wanted - speed, -step, step)
+    return wp.vector(at + now * dt, now)
+
+
 @cache
 def lost_error(features: frozenset[str] = frozenset()) -> Any:
     """Return the Warp function of what of its error a loop does not act on, as a sum of laws of the target, the
@@ -631,18 +653,35 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
         """Return ((lost, slope, acts), memory): lost [rad] of the error e [rad] to a target [rad]; its slope in e at
         that target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
 
+        The setpoint (columns `profile_speed`, `profile_acceleration`): the loop acts on its error, not on the target's.
+        It begins where the joint is, at its speed.
+
         The deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2
         it counts from the edge on."""
         lost = type(e)(0.0)
         slope = type(e)(0.0)
         acts = type(e)(2.0)
         kind = type(e)(0.0)
+        left = e
+        if wp.static("profile" in features):
+            if of[PROFILE_SPEED] < type(e)(1.0e8) or of[PROFILE_ACCELERATION] < type(e)(1.0e8):
+                now = wp.vector(target - e, type(e)(0.0))
+                if not fresh:
+                    now = wp.vector(memory[SETPOINT], memory[SETPOINT_SPEED])
+                    if memory[SETPOINT_NEW] > type(e)(0.5):
+                        now = wp.vector(target - e, (target - e - memory[SETPOINT]) / dt)
+                    now = profiled(now[0], now[1], target, of[PROFILE_SPEED], of[PROFILE_ACCELERATION], dt)
+                memory[SETPOINT] = now[0]
+                memory[SETPOINT_SPEED] = now[1]
+                memory[SETPOINT_NEW] = wp.where(fresh, type(e)(1.0), type(e)(0.0))
+                lost += target - now[0]
+                left = e - lost
         if wp.static("rare" in features):
             kind = of[DEADBAND_KIND]
         width = of[DEADBAND]
         if kind > type(e)(1.5):
-            lost += wp.clamp(e, -width, width)
-        if wp.abs(e) < width:
+            lost += wp.clamp(left, -width, width)
+        if wp.abs(left) < width:
             acts = type(e)(0.0)
             if kind > type(e)(0.5):
                 acts = type(e)(1.0)

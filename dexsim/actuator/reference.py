@@ -120,6 +120,32 @@ def supply_left(
     return there
 
 
+def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) -> Numbers:
+    """Setpoint [...] rad that a firmware moves towards its target [...] rad at a limited speed and acceleration: from
+    the joint's position q [...] rad, at its speed, of the first two steps; q, or the target, without either limit.
+
+    p: columns by name. A limited setpoint stops in time: v <= a dt (sqrt(1/4 + 2 d / (a dt^2)) - 1/2) at the distance
+    d, from d = a dt^2 k (k + 1) / 2 and v = a dt k."""
+    most, steep = np.asarray(p["profile_speed"], float), np.asarray(p["profile_acceleration"], float)
+    limited = (most < 1e8) | (steep < 1e8)
+    if not np.any(limited):
+        return target
+    fresh, new = np.asarray(step.fresh), np.asarray(step.memory["setpoint_new"]) > 0.5
+    dt = max(step.dt, 1e-12)
+    at = np.where(new, q, step.memory["setpoint"])
+    speed = np.where(new, (q - np.asarray(step.memory["setpoint"])) / dt, step.memory["setpoint_speed"])
+    away = np.asarray(target - at)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        stops = steep * dt * (np.sqrt(0.25 + 2 * np.abs(away) / (steep * dt**2)) - 0.5)
+        fast = np.minimum(np.minimum(most, np.abs(away) / dt), np.where(steep < 1e8, stops, np.inf))
+        wanted = np.sign(away) * fast
+        speed = np.where(steep < 1e8, speed + np.clip(wanted - speed, -steep * dt, steep * dt), wanted)
+    at, speed = np.where(fresh, q, at + speed * dt), np.where(fresh, 0.0, speed)
+    for name, value in (("setpoint", at), ("setpoint_speed", speed), ("setpoint_new", np.where(fresh, 1.0, 0.0))):
+        step.memory[name] = np.where(limited, value, step.memory[name])
+    return np.where(limited, at, target)
+
+
 def lost_error(
     p: Mapping[str, Numbers],
     target: Numbers,
@@ -133,8 +159,10 @@ def lost_error(
     p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
     step = step or Step()
     kind = p["deadband_kind"] if "rare" in features else 0.0
+    behind = target - setpoint(p, target, target - e, step) if "profile" in features else np.zeros(np.shape(e))
+    e = e - behind
     inside = np.abs(e) < p["deadband"]
-    lost = np.where(np.greater(kind, 1.5), np.clip(e, -p["deadband"], p["deadband"]), 0.0)
+    lost = behind + np.where(np.greater(kind, 1.5), np.clip(e, -p["deadband"], p["deadband"]), 0.0)
     slope = np.zeros_like(lost)
     return lost, slope, np.where(inside, np.where(np.greater(kind, 0.5), 1.0, 0.0), 2.0)
 

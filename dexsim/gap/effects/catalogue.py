@@ -47,6 +47,7 @@ FIRST = (
     "presliding",
     "joint_spring",
     "external_force",
+    "setpoint_profile",
 )
 """The order in which the search asks; an effect that is not named here comes after, in the order of the files."""
 FIRST_BY_TORQUE = ("viscous_friction", "lag", "load_friction", "stribeck_friction")

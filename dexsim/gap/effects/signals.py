@@ -100,6 +100,40 @@ class Lag(Effect):
         return 0 < value < abs(joint["inertia"]) / (2 * np.pi * slowest)
 
 
+class SetpointProfile(Effect):
+    """A setpoint that the firmware moves towards the target at a limited speed, a limited acceleration, or both."""
+
+    id = "setpoint_profile"
+    words = "moves its setpoint at a limited speed or acceleration"
+    shows = "in large steps, and at the start and end of motions"
+    experiment = "steps of several sizes, and a slow motion: small ones are followed at once, large ones take longer"
+    classes = ("limits at speed",)
+    motions = ("steps", "ladder")
+
+    def variants(self, s: Scales) -> list[Variant]:
+        peak = s.peak_speed
+        fast, steep = min(s.nominal["profile_speed"], 30 * peak), min(s.nominal["profile_acceleration"], 3000 * peak)
+        speed = param("speed", "profile_speed", "set", 0.2 * peak, 30 * peak, fast, "rad/s")
+        # from rest to the peak speed in 0.3 ms to 2 s
+        bend = param("acceleration", "profile_acceleration", "set", 0.5 * peak, 3000 * peak, steep, "rad/s2")
+        speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.04, 0.1, 0.25, 0.6)
+        both = tuple((x * peak, x * peak / t) for x in (0.8, 1.0, 1.3) for t in rises)
+        return [
+            Variant((speed,), tuple((x * peak,) for x in speeds), "speed"),
+            Variant((bend,), tuple((peak / t,) for t in rises), "acceleration"),
+            Variant((speed, bend), both, "speed and acceleration"),
+        ]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        m = case.regimes
+        behind = np.abs(m["_error"])
+        return behind * (m["speed"] > 0.7 * values["speed"]) if "speed" in values else behind
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        units = {"speed": f"{fit.length}/s", "acceleration": f"{fit.length}/s2"}
+        return {key: fit.entry(key, unit) for key, unit in units.items() if key in fit.value}
+
+
 class PositionOffset(Effect):
     """An encoder's zero error."""
 

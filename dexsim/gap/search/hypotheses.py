@@ -128,6 +128,8 @@ USUAL = (
     "speed_lag",
     "backlash",
     "softness",
+    "profile_speed",
+    "profile_acceleration",
 )
 MEASURED = (
     "kp",
@@ -139,6 +141,8 @@ MEASURED = (
     "load_friction",
     "load_friction_backdriven",
     "stribeck_peak",
+    "profile_speed",
+    "profile_acceleration",
 )
 """Columns whose believed figures are off by a few percent; those of others are what they are."""
 

@@ -1,0 +1,94 @@
+"""A setpoint that a firmware moves at a limited speed and acceleration: its law, and that it is found and named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import test_gap
+
+from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.reference import Step, setpoint
+from dexsim.gap.plant.case import build
+from dexsim.gap.read import conditions, inputs
+from dexsim.gap.search.search import JointSearch
+from dexsim.recording import read
+from dexsim.recording.mechanism import mechanism
+
+
+def path(targets, dt, speed=np.inf, acceleration=np.inf, start=0.0):
+    """[n] setpoints after each step towards targets [n], from rest at `start`."""
+    p = {c.name: c.neutral for c in COLUMNS} | {"profile_speed": speed, "profile_acceleration": acceleration}
+    step, out = Step(), []
+    step.dt = dt
+    for k, target in enumerate(targets):
+        step.fresh = k == 0
+        out.append(float(setpoint(p, np.array(float(target)), np.array(start), step)))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.002])
+@pytest.mark.parametrize(("speed", "acceleration"), [(2.0, np.inf), (2.0, 10.0), (np.inf, 10.0), (0.5, 40.0)])
+def test_a_step_takes_as_long_as_a_trapezoid(dt, speed, acceleration):
+    """T = D / v + v / a, or 2 sqrt(D / a) where the speed is not reached (Lynch and Park, Modern Robotics, 9.2.2.2);
+    nothing overshoots, and both limits hold."""
+    size = 0.9
+    x = path(np.full(round(3 / dt), size), dt, speed, acceleration)
+    reached = speed**2 / acceleration <= size
+    takes = size / speed + (speed / acceleration if np.isfinite(acceleration) else 0.0) if reached else (
+        2 * np.sqrt(size / acceleration))  # fmt: skip
+    arrived = np.flatnonzero(x > size - 1e-6)[0] * dt
+    assert arrived == pytest.approx(takes, abs=8 * dt) and x.max() <= size + 1e-4
+    v = np.diff(x) / dt
+    assert np.abs(v).max() <= min(speed, np.sqrt(size * acceleration)) * 1.001
+    assert np.abs(np.diff(v)).max() <= acceleration * dt * 1.001 or not np.isfinite(acceleration)
+
+
+def test_a_slow_motion_is_followed_as_far_behind_as_it_could_stop():
+    """A setpoint that is ready to stop at its target goes v^2 / 2a behind one that moves at v."""
+    t = np.arange(0, 4, 0.002)
+    target = 0.4 * np.sin(2 * t)
+    x = path(target, 0.002, 2.0, 50.0)
+    assert np.abs(x - target)[500:].max() == pytest.approx(0.8**2 / (2 * 50.0), rel=0.15)
+    assert np.array_equal(path(target, 0.002), target)
+
+
+def test_a_target_that_turns_back_is_followed_within_the_limits():
+    target = np.r_[np.full(150, 1.0), np.full(850, -1.0)]
+    x = path(target, 0.002, 3.0, 20.0)
+    v = np.diff(x) / 0.002
+    assert np.abs(np.diff(v)).max() <= 20.0 * 0.002 * 1.001 and x[-1] == pytest.approx(-1.0) and x.min() >= -1 - 1e-3
+
+
+BOTH = {"profile_speed": 2.2, "profile_acceleration": 14.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("changes", "seed"), [({"profile_speed": 1.6}, 0), (BOTH, 1)])
+def test_a_planted_profile_is_named_and_sized(changes, seed):
+    outcome = test_gap.search(changes, kinds=(1 + seed, 3), seconds=3.0)
+    assert outcome.best.ids[0] == "setpoint_profile", (outcome.best.ids, outcome.scanned[:4])
+    for column, value in changes.items():
+        key = column.removeprefix("profile_")
+        assert outcome.best.fit.value(f"setpoint_profile.{key}") == pytest.approx(value, rel=0.15)
+
+
+FINGER = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="index" axis="0 1 0" range="0 1.47"
+armature="2e-4"/><geom type="capsule" fromto="0 0 0 0 0 .08" size=".007" mass=".02" contype="0" conaffinity="0"/></body>
+</worldbody></mujoco>"""
+REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata" / "rh56" / "index_step.csv"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.exists(), reason="the recording of an RH56 finger is not here")
+def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
+    """An Inspire RH56's finger goes 492 counts at a steady 2100 a second: 3.1 rad/s, and no delay nor a weak drive."""
+    (tmp_path / "finger.xml").write_text(FINGER)
+    m = mechanism(str(tmp_path / "finger.xml"), {"joints": {"*": {"kp": 3.0, "kd": 0.05, "torque_limit": 0.6}}})
+    r = read(REAL, meta={"units.position": "registers=1.47..0"}, joints=m.joints)
+    run = inputs.cut(inputs.to_run(r, m, []), 0.0, 1.5)
+    run.smooth()
+    best = JointSearch(build(m.spec.compile(), [run])[0], [0], None, conditions([run])).run().best
+    assert best.ids == ("setpoint_profile",)
+    assert best.fit.value("setpoint_profile.speed") == pytest.approx(3.1, rel=0.05)
