@@ -90,7 +90,7 @@ def sentences(text: str) -> list[str]:
     found = []
     for block in prose(text):
         block = re.sub(r"\b(e\.g|i\.e|etc|vs|approx|Fig)\.", r"\1", block).replace("*", "")
-        found += [s for s in re.split(r"(?<=[.!?])\)?\s+(?=[A-Z\"(0-9])", block) if words(s)]
+        found += [s for s in re.split(r"(?<=[.!?])\)?\s+(?=[A-Z\"(0-9]|code\b)", block) if words(s)]
     return found
 
 

@@ -488,7 +488,7 @@ class _Reading:
                 raise UserError(
                     f"recording {where}: none of its joints ({', '.join(theirs)}) is one of the model's"
                     f" ({', '.join(joints)});"
-                    " say which they are with remap.OURS=THEIRS"
+                    f" say which is which with remap.OURS=THEIRS, such as remap.{joints[0]}={theirs[0]}"
                 )
         elif self.joint_remap and not set(self.joint_remap) <= set(self.hand.joints):
             mapping = {their: their for their in theirs}
