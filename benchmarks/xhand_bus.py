@@ -27,10 +27,10 @@ from dexsim.deploy.simulated_hand import SimulatedXHand, faked
 
 FAULTS = "crc=0.005,board=2"
 DEFAULTS = {"checkpoint": "checkpoints/grasp.pt", "episodes": "20", "seconds": "6", "seed": "5000", "out": "",
-            "ways": "direct,bus", "faults": FAULTS}  # fmt: skip
+            "ways": "direct,bus", "faults": FAULTS, "noise": "0"}  # fmt: skip
 
 
-def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str) -> dict:
+def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, noise: float) -> dict:
     """One run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
     c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
     objects, grip = b.config["task"]["objects"], b.manifest.get("grip")
@@ -43,7 +43,7 @@ def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str) 
     else:
         text = f"{faults},seed={seed}"
         hand = faked(b.config, c, text, seed, False, shape, grip, 1.0, clock=None if way == "process" else clock)
-    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5, **slack), clock)
+    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5, noise=noise, **slack), clock)
     try:
         report = loop.run()
         place = hand.place(clock.now())[0]
@@ -68,7 +68,8 @@ def main(argv: list[str]) -> int:
             began = time.perf_counter()
             rows[way] = []
             for k in range(n):
-                rows[way].append(episode(b, way, first + k, float(given["seconds"]), given["faults"]))
+                rows[way].append(episode(b, way, first + k, float(given["seconds"]), given["faults"],
+                                         float(given["noise"])))
             held = sum(r["held"] for r in rows[way])
             low, high = intervals.share(held, n)
             goals = np.array([r["goals"] for r in rows[way]])

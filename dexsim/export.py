@@ -301,6 +301,9 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
               "lead": float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
               "speed_limit_rad_s": floats(hand.speeds), "order": "joints"}  # fmt: skip
+    spread = {k.rsplit(".", 1)[-1]: v for k, v in data["actor"].items() if k.startswith("distribution.")}
+    if "log_std_param" in spread or "std_param" in spread:  # of the actions while training, for noise=
+        action["std"] = floats(spread["log_std_param"].exp() if "log_std_param" in spread else spread["std_param"])
     return {
         "format": bundle.FORMAT, "version": bundle.VERSION, "task": task["name"],
         "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",

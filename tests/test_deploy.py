@@ -680,3 +680,48 @@ def test_interrupting_the_command(made, tmp_path, how):
         ).stdout.splitlines()
         alive = [row for row in rows if "Z" not in row.split()[1]]
     assert children and not alive
+
+
+# -- what users of the real hand met: freezing policies, slow cameras
+# --------------------------------------------------------------------------------------------------------------------
+def test_the_noise_of_training_is_offered(made):
+    b = bundle.load(made[0])
+    spread = np.array(b.manifest["action"]["std"])
+    assert spread.shape == (12,) and (spread > 0).all()
+    actions = {}
+    for noise in (0.0, 1.0):
+        hand, loop = play(made, noise=noise, seconds=4.0)
+        loop.keep, loop.bundle.act = True, lambda observation: np.zeros((1, 12), np.float32)
+        loop.run()
+        actions[noise] = np.stack(loop.report.actions)
+    assert not actions[0.0].any()
+    np.testing.assert_allclose(actions[1.0].std(0), spread, rtol=0.25)
+    del b.manifest["action"]["std"]
+    with pytest.raises(UserError, match="noise=1: .*does not say how much"):
+        Loop(b, FakeHand(VirtualClock()), FixedPlace(np.zeros(3)), Calibration.default(), LoopSettings(noise=1.0))
+
+
+class Moving:
+    """An object that moves steadily, seen late by `delay` and thirty times a second."""
+
+    def __init__(self, speed, delay):
+        self.speed, self.delay = np.array(speed), delay
+
+    def place(self, now):
+        stamp = np.floor((now - self.delay) * 30) / 30
+        return np.array([0.055, 0.0, 0.04]) + self.speed * (stamp - 100.0), stamp
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.1])
+def test_a_cameras_delay_is_made_up_for(made, ahead):
+    hand, loop = play(made, ahead=ahead, seconds=0.6, seen=1.0)
+    loop.eye, seen = Moving([0.0, 0.0, 0.05], 0.1), []
+    observe = loop.measure.observe
+
+    def watch(state, place, *rest):
+        seen.append(place[2] - loop.eye.place(hand.clock.now())[0][2])
+        return observe(state, place, *rest)
+
+    loop.measure.observe = watch
+    loop.run()
+    np.testing.assert_allclose(seen[4:], 0.05 * ahead, atol=1e-6)

@@ -26,7 +26,7 @@ STEPS = ["connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "
 def walk(out, hand=LaggingHand, steps=STEPS, **faults):
     """(status, check.json, the fake, what was said)."""
     clock, said = VirtualClock(5.0), []
-    package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0, "press": 0} | faults))
+    package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0, "press": 11} | faults))
     driver = VendorXHand("auto", clock, package, side="right")
     given = first_hour.KEYS | {"yes": "true", "joints": JOINTS, "port": "fake"}
     status = first_hour.walk(driver, load_hand("xhand"), clock, steps, given, out, said.append)
@@ -83,7 +83,7 @@ def test_what_is_planted_is_found(tmp_path):
         (partial(Sticky, wrong=True), ["signs"], {}, "index_joint1 went the wrong way"),
         (partial(Sticky, need=1000.0), ["signs"], {}, "thumb_bend_joint went 0.00 of"),
         (LaggingHand, ["zero"], {"board": 3}, "boards that say nothing: ring"),
-        (LaggingHand, ["taxels"], {"press": 9}, "columns are mirrored"),
+        (LaggingHand, ["taxels"], {"press": 119}, "columns are mirrored"),
         (LaggingHand, ["taxels"], {"press": -1}, "nobody pressed it"),
         (partial(LaggingHand, start=0.4, push=-0.06), ["limp"], {"limp": "never"}, "still resists"),
     ],
@@ -120,7 +120,7 @@ def test_the_command_line_is_checked_before_anything_moves(tmp_path, capsys):
 def test_the_whole_hour_on_the_fake_with_the_simulated_hand(tmp_path):
     """In real time, the hand in its own process, with the excitation, its audit and its diagnosis."""
     done = subprocess.run(
-        [sys.executable, "-m", "dexsim", "deploy", "check", "port=fake:press=0", "yes=true", f"out={tmp_path / 'o'}",
+        [sys.executable, "-m", "dexsim", "deploy", "check", "port=fake:press=11", "yes=true", f"out={tmp_path / 'o'}",
          "joints=index_joint1,index_joint2", "excite_current=1500", "kinds=steps", "limit=60"],
         capture_output=True, text=True, timeout=800,
     )  # fmt: skip

@@ -43,13 +43,15 @@ settings (key=default):
   shape=              driver=sim, grasp: the object's shape
   seed=0              driver=sim
 safety (key=default):
-  tor_max=            firmware current limit [mA] (default: the calibration's current_max)
+  tor_max=            firmware current limit [mA] (default: the calibration's current_max; driver=xhand: at most 400)
   kp=100              firmware stiffness
   speed=0.6           largest speed of targets, over the joints' no-load speed
   margin=0            rad kept free at the joint limits
   home_speed=0.5      rad/s of the homing
   wait=3              rotate: s that the open hand then waits for the cube; grip=1: s its fingers take to close on it
   stale=0.12          s: a reading older than this relaxes the hand; late=0.1, hang=0.15, overruns=10 likewise
+  ahead=0             s by which the object's pose is carried on: your camera's delay less that of training
+  noise=0             1: the noise on actions that the policy was trained with, without which some freeze
   seen=               s: so does what was last seen of the object (default: 0.5 of a camera, 0.1 of an IMU)
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
@@ -90,6 +92,11 @@ def main(argv: Sequence[str]) -> int:
         calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
     if given.get("port", "").startswith("fake"):
         changes.setdefault("seen", 0.3)  # the fake's world is seen over its bus: after its pauses and outliers
+    elif given.get("driver") == "xhand" and "tor_max" not in changes:
+        from dexsim.deploy.vendor import MOST_CURRENT
+
+        changes["tor_max"] = tuple(min(1e3 * float(x), MOST_CURRENT) for x in calibration.current_max)
+        print(f"note     no motor gets more than {max(changes['tor_max']):.0f} mA; tor_max= says otherwise")
     settings = LoopSettings(**changes)
     settings.check()
     if "command" in changes and "command" not in of(b.manifest["task"]).OPTIONS:
@@ -119,6 +126,8 @@ def main(argv: Sequence[str]) -> int:
             finally:
                 with contextlib.suppress(OSError):  # the terminal may be gone
                     _ending(loop.report, recorder)
+                    if rescued := getattr(driver, "rescued", ""):
+                        print(f"since    {rescued}", flush=True)
     return 0 if loop.report.ended == "done" else stop.status or 1
 
 

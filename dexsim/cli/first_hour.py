@@ -50,7 +50,7 @@ settings (key=default):
   out=out/check       a new folder: report.html, check.json, check.mcap, excite.mcap, servo.yaml
 
 examples:
-  dexsim deploy check port=fake:press=0 excite_current=1500 yes=true out=out/rehearsal
+  dexsim deploy check port=fake:press=11 excite_current=1500 yes=true out=out/rehearsal
   dexsim deploy check bundle=out/bundle
 """
 KEYS = {"driver": "xhand", "port": "auto", "serial": "", "hand_mirror": "false", "bundle": "", "current": "100",
@@ -319,11 +319,12 @@ class Hour:
         step, layout = Step("taxels", "Which taxel is which"), hand_layout(self.hand)
         if layout is None:
             return Step("taxels", "Which taxel is which", "skipped", ["this hand feels nothing"])
-        guesses = {0: "as in our layout", 9: "columns are mirrored", 110: "rows are mirrored",
-                   119: "rows and columns are mirrored"}  # fmt: skip
+        # a pad's index is column * 12 + row
+        guesses = {11: "as in our layout", 119: "columns are mirrored", 0: "rows are mirrored",
+                   108: "rows and columns are mirrored", 110: "counted row by row"}  # fmt: skip
         press = getattr(self.s.driver, "press", None)
         for f, name in enumerate(self.hand.finger_names):
-            self.say(f"  press the corner of the {name}'s pad that is nearest its base, on the thumb's side")
+            self.say(f"  press the corner of the {name}'s pad that is nearest the tip, on the side of its first column")
             if press is not None:
                 press(f)
             best = np.zeros(self.s.taxels[1])
@@ -338,11 +339,11 @@ class Hour:
                 step.verdict = "look"
                 continue
             k = int(best.argmax())
-            row, column = divmod(k, 10)
-            corner = min(guesses, key=lambda g: abs(g // 10 - row) + abs(g % 10 - column))
+            column, row = divmod(k, 12)
+            corner = min(guesses, key=lambda g: abs(g // 12 - column) + abs(g % 12 - row))
             step.figures[name] = {"index": k, "counts": float(best.max()), "guess": guesses[corner]}
             step.text.append(f"{name}: index {k} (row {row}, column {column}) felt most: {guesses[corner]}")
-            if corner != 0:
+            if corner != 11:
                 step.verdict = "bad"
         return step
 

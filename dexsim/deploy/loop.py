@@ -55,7 +55,8 @@ LIMITS: dict[str, tuple[float, float, str]] = {
     "seconds": (0, 1e7, "s"), "command": (0, 1, ""), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
     "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"),
     "read_hz": (20, 1000, "Hz"),
-    "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "late": (0.005, 10, "s"), "overruns": (1, 1e6, ""),
+    "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "ahead": (0, 0.5, "s"),
+    "noise": (0, 2, ""), "late": (0.005, 10, "s"), "overruns": (1, 1e6, ""),
     "hang": (0.02, 10, "s"),
     "speed": (0.001, 100, ""), "margin": (0, 3.2, "rad"), "tor_max": (1, 32767, "mA"), "kp": (0, 32767, ""),
     "recover_s": (0, 3600, "s"),
@@ -74,9 +75,11 @@ class LoopSettings:
     an error code, the hand refuses what is sent or the policy's actions are not finite; seen s: so does what was last
     seen of the object (default: `SEEN`); late s: so does a turn that is later than this; overruns: so do as many turns
     in a row that end more than a reading period after they were due; hang s: so does a loop that does not turn at all
-    (seen by a thread of its own, and by the process that holds the bus). speed: targets' largest, over the joints'
-    no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [J] or one; kp:
-    its gain.
+    (seen by a thread of its own, and by the process that holds the bus). ahead s: by which the object's pose is carried
+    on at its last speed, for a camera that is slower than the one in training; noise: over the noise that the policy
+    was trained with, added to its actions (0: none; some policies freeze without it on a real hand). speed: targets'
+    largest, over the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's
+    current limit, [J] or one; kp: its gain.
     recover: after letting go, home again once readings have been good for recover_s; else the run ends.
     """
 
@@ -92,6 +95,8 @@ class LoopSettings:
     read_hz: float = 100.0
     stale: float = 0.12
     seen: float | None = None
+    ahead: float = 0.0
+    noise: float = 0.0
     late: float = 0.1
     overruns: int = 10
     hang: float = 0.15
@@ -190,6 +195,11 @@ class Loop:
             calibration.current_sign,
             tuple(m["joints"]),
         )
+        spread = m["action"].get("std")
+        if settings.noise and spread is None:
+            raise UserError(f"noise={settings.noise:g}: bundle {bundle.path} does not say how much; export it again")
+        self._noise = settings.noise * np.array(spread, float) if settings.noise else None
+        self._rng = np.random.default_rng(0)
         self.home = np.clip(self.home, self.guard.low, self.guard.high)
         self.target: np.ndarray | None = None
         self.phase = HOMING if settings.home else RUN
@@ -432,6 +442,7 @@ class Loop:
         return True
 
     fresh_for = 0
+    _warned = False
 
     def _act(self, now: float) -> None:
         if self.phase == HOMING:
@@ -484,8 +495,19 @@ class Loop:
         if seen is None or self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
-        self._seen, self._seen_at = seen[0], min(float(seen[1]), now)
+        self._seen, self._seen_at = self._carried(np.asarray(seen[0], float), float(seen[1])), min(float(seen[1]), now)
         return True
+
+    def _carried(self, pose: np.ndarray, stamp: float) -> np.ndarray:
+        """What is seen at its stamp [s], `ahead` later at the speed between the last two that were seen."""
+        if stamp != self._poses[1][0]:
+            self._poses = self._poses[1], (stamp, pose)
+        (t0, before), (t1, last) = self._poses
+        if not self.settings.ahead or before is None or last is None or not 0.001 < t1 - t0 < 0.2:
+            return pose
+        before = -before if len(pose) == 4 and before @ last < 0 else before  # the nearer of a rotation's two signs
+        pose = last + (last - before) * (self.settings.ahead / (t1 - t0))
+        return pose / np.linalg.norm(pose) if len(pose) == 4 else pose
 
     def _policy(self, now: float) -> None:
         self._take(now)  # actions come between readings: act on what there is now
@@ -497,6 +519,8 @@ class Loop:
         state, command = self.state, self.settings.command
         observation, touch = self.measure.observe(state, self._seen, command, self.target, self._action)
         action = self.bundle.act(observation)[0]
+        if self._noise is not None:
+            action = (action + self._noise * self._rng.standard_normal(len(action))).astype(np.float32)
         nonsense = not np.isfinite(action).all()
         self._nonsense.note(nonsense, now)
         if nonsense:
@@ -573,6 +597,7 @@ class Loop:
         self.measure.reset()
         self.bundle.begin()
         self._unseen, self._nonsense = None, Lasting()
+        self._poses: tuple = ((0.0, None), (0.0, None))
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:
@@ -596,7 +621,9 @@ class Loop:
                 return
             except BaseException as error:  # Ctrl-C too: nothing comes before the hand
                 self.report.counts["relax_failed"] += 1
-                self.report.not_relaxed = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+                what = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+                self.report.not_relaxed = f"{what}{' '.join(str(error).split())[:300]}"
+                self._warn()
             finally:
                 if held:
                     self._lock.release()
@@ -621,7 +648,13 @@ class Loop:
                 break
             self.clock.sleep_until(self.clock.now() + RELAX_EVERY)
         if self.report.not_relaxed:
-            self.say(f"DANGER   the hand may still drive ({self.report.not_relaxed}): cut its power")
+            self._warn()
+
+    def _warn(self) -> None:
+        """Say once, and at once, that the hand may still drive."""
+        if not self._warned:
+            self._warned = True
+            self.say(f"DANGER   the hand may still drive: cut its power ({self.report.not_relaxed})")
 
     def _watch(self) -> None:
         """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""

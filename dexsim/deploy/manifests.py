@@ -51,6 +51,7 @@ class Action(msgspec.Struct):
     low: Joints
     high: Joints
     speed_limit_rad_s: JointsAbove
+    std: JointsAbove | None = None
 
 
 class Rates(msgspec.Struct):

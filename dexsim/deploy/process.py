@@ -94,6 +94,7 @@ class BusDriver:
         self._process: multiprocessing.context.SpawnProcess | _Thread | None = None
         self._lock = threading.Lock()
         self._ended = ""
+        self.rescued = ""  # by what a hand was let go whose process had died
 
     # -- HandDriver
     # ---------------------------------------------------------------------------------------------------------------
@@ -226,6 +227,7 @@ class BusDriver:
         limp = self._v["released"].value == 1 or not self._number
         why = _text(self._v["proof"]) or _text(self._v["problem"]) or "it gave no answer"
         self._end()
+        self.rescued = f"a new process opened the bus and let go of the hand ({why})" if died and limp else ""
         if not limp:
             raise UserError(f"{self.name}: the hand is not known to be limp ({why}); cut its power")
 

@@ -32,6 +32,8 @@ from dexsim.errors import UserError
 BAUD = 3_000_000
 JOINTS, TAXELS = 12, (5, 120, 3)
 """Of the only hand that this package drives."""
+MOST_CURRENT = 400.0
+"""mA, of a run that does not say: what others drive this hand with (300 to 400)."""
 NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT, CRC = 1501018, 1501019, 1501020, 1501035, 1501070
 TOO_WARM, REFUSED, BOOT = 1501028, (1501029, 1501030), 1501036
 ACCEPTED = frozenset((0, NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT))
@@ -257,8 +259,9 @@ class XHandBus:
             return
         for f in range(TAXELS[0]):
             board = raw.sensor_data[f]
-            touch = np.array([(t.fx, t.fy, t.fz) for t in board.raw_force], np.int16)
-            content = touch.tobytes() + bytes(int(x) & 0xFF for x in getattr(board, "temperature", ()))
+            flat = [x for t in board.raw_force for x in (t.fx, t.fy, t.fz)]
+            touch = np.array(flat, np.int16).reshape(TAXELS[1:])
+            content = touch.tobytes() + bytes([int(x) & 0xFF for x in getattr(board, "temperature", ())])
             if code in GOOD_TOUCH or (content != self._boards[f] and any(content)):
                 self._touch[f], self._touched[f] = touch, now
             self._boards[f] = content
