@@ -17,6 +17,7 @@ make_env            many simulated hands at one task
 train               train a policy
 load_policy         a trained policy as a function of observations
 play                play episodes, return the metrics
+PPO                 what learns, for train(agent=PPO(gamma=0.99))
 ServoTable          the drives of a mechanism as servo.yaml states them: load, value, set, save
 Recording           what read_recording returns
 Diagnosis           what diagnose returns
@@ -38,6 +39,7 @@ from dexsim.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from dexsim.actuator.table import ServoTable
+    from dexsim.agents import PPO
     from dexsim.api import (
         demo_recordings,
         diagnose,
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from dexsim.recording.schema import Recording
 
 __all__ = [
+    "PPO",
     "Diagnosis",
     "Recording",
     "ServoTable",
@@ -74,6 +77,7 @@ __all__ = [
 
 _ELSEWHERE = {
     "Diagnosis": "dexsim.gap.inquiry",
+    "PPO": "dexsim.agents",
     "Recording": "dexsim.recording.schema",
     "ServoTable": "dexsim.actuator.table",
     "UserError": "dexsim.errors",

@@ -18,6 +18,7 @@ from dexsim.paths import CONFIGS
 if TYPE_CHECKING:
     import torch
 
+    from dexsim.agents import PPO
     from dexsim.gap.inquiry import Diagnosis
     from dexsim.recording.schema import Recording
     from dexsim.tasks.env import HandEnv
@@ -202,6 +203,12 @@ def make_env(
     seed: int = 1,
     settings: Sequence[str] = (),
     checkpoint: File | None = None,
+    *,
+    hand: File | None = None,
+    servo: File | None = None,
+    objects: Sequence[File] | None = None,
+    kept_out: Sequence[File] | None = None,
+    rewards: Mapping[str, float] | None = None,
 ) -> HandEnv:
     """Many simulated hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it gymnasium's).
 
@@ -210,8 +217,10 @@ def make_env(
         worlds: hands simulated at once; None: what fits the machine.
         device: "cpu", "cuda", "cuda:1"; None: cuda where there is one.
         seed: of everything random.
-        settings: "key=value" each, as on the command line.
+        settings: "key=value" each, as on the command line; they come last.
         checkpoint: the environment that this policy was trained in; `task` is then not used.
+        hand: a name, or a folder with a hand.yaml. servo: a servo.yaml. objects, kept_out: shapes and mesh files to
+            train with, and to be judged with. rewards: weights of terms by name.
 
     Returns:
         `get_observations()` -> a TensorDict of groups [N, D] float32; `step(actions [N, A] in [-1, 1])` ->
@@ -222,7 +231,8 @@ def make_env(
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_env as make
 
-    begun = _start(task, worlds, device, seed, settings, checkpoint)
+    own = _things(hand, servo, objects, kept_out, rewards)
+    begun = _start(task, worlds, device, seed, [*own, *settings], checkpoint)
     cfg = begun.cfg
     seed_all(cfg["seed"])
     machine.set_threads(cfg["device"])
@@ -255,12 +265,24 @@ def train(
     seed: int = 1,
     settings: Sequence[str] = (),
     out: File | None = None,
+    *,
+    agent: PPO | None = None,
+    hand: File | None = None,
+    servo: File | None = None,
+    objects: Sequence[File] | None = None,
+    kept_out: Sequence[File] | None = None,
+    rewards: Mapping[str, float] | None = None,
+    resume: File | None = None,
+    final_episodes: int | None = None,
 ) -> Path:
     """Train a policy as `dexsim train` does, with its printout; returns the run's folder.
 
     Args:
         iterations: of learning; None: what fits the machine. The others as `make_env`.
         out: the run's folder; None: runs/<task>/<date and time>.
+        agent: what learns; None: the settings' own.
+        resume: last.pt of a run to go on from.
+        final_episodes: played and filmed at the end; 0: none; None: as the settings have it.
 
     Returns:
         The folder with policy.pt, last.pt (to go on from), config.yaml, progress.csv, curves.png and play/.
@@ -273,7 +295,11 @@ def train(
 
     own = [] if iterations is None else [f"iterations={iterations}"]
     own += [] if out is None else [_setting("out", out)]
-    begun = _start(task, worlds, device, seed, [*settings, *own])
+    own += [] if resume is None else [_setting("resume", resume)]
+    own += [] if final_episodes is None else [f"final_episodes={final_episodes}"]
+    own += [] if agent is None else agent.settings()
+    own += _things(hand, servo, objects, kept_out, rewards)
+    begun = _start(task, worlds, device, seed, [*own, *settings])
     where = folder.for_run(begun.cfg)
     begun.cfg["out"] = str(where)
     if training.run(begun, where=where) != 0:
@@ -344,6 +370,21 @@ def _start(
         ready = start.for_train([f"task={_named(task)}", *argv], CONFIGS)
     assert ready is not None  # neither --help nor --cfg was asked
     return ready
+
+
+def _things(
+    hand: File | None,
+    servo: File | None,
+    objects: Sequence[File] | None,
+    kept_out: Sequence[File] | None,
+    rewards: Mapping[str, float] | None,
+) -> list[str]:
+    """Keywords as settings."""
+    out = [_setting(k, v) for k, v in (("hand", hand), ("servo_file", servo)) if v is not None]
+    for key, names in (("objects", objects), ("kept_out", kept_out)):
+        if names is not None:
+            out.append(f"{key}=[{','.join(_setting('', name)[1:] for name in names)}]")
+    return out + [f"task.rewards.{name}={weight}" for name, weight in (rewards or {}).items()]
 
 
 def _named(task: Task) -> str:

@@ -155,7 +155,8 @@ def _actions(model: Any, rows: Any, begins: list[bool]) -> Any:
     keeps = _state(model)
     if not keeps:
         return model(rows)
-    out, state = [], ()
+    out: list[Any] = []
+    state: tuple[Any, ...] = ()
     for row, fresh in zip(rows, begins, strict=True):
         if fresh:
             state = tuple(torch.zeros(n, 1, m) for n, m in keeps.values())

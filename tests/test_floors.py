@@ -21,7 +21,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
         "errors paths version rotation intervals system",
-        "guard door",
+        "guard door agents",
         "console files typed",
         "outputs yaml_text model_file",
         "assets hand",

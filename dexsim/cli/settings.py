@@ -100,7 +100,7 @@ def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
     own = choices.get("task")
     if own is None or own in groups(config_dir).get("task", ()):
         return copy.deepcopy(_composed(config_dir, tuple(choices.items()), stamps))
-    made = registry.load(registry.find(own)).config()  # a task whose settings stand in its class
+    made = registry.load(registry.find(own)).config()
     others = [(k, v) for k, v in choices.items() if k != "task"]
     cfg = copy.deepcopy(_composed(config_dir, (("~task", ""), *others), stamps))
     OmegaConf.set_struct(cfg, False)

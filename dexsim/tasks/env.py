@@ -14,13 +14,12 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
 import numpy as np
 import torch
 import warp as wp
-from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from dexsim import files, model_file, rotation
@@ -49,6 +48,14 @@ from dexsim.tasks.recorded import Constants, unrecordable
 from dexsim.tasks.scenes import BASE, Scene, Slide, fasten, furnish, mount
 from dexsim.tasks.structs import filled
 from dexsim.tasks.watched import Watched, unread
+
+if TYPE_CHECKING:
+
+    class VecEnv:
+        """Stand for rsl-rl's class, which says nothing of its types: a wrong name on an environment is then seen."""
+
+else:
+    from rsl_rl.env import VecEnv
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
@@ -243,6 +250,11 @@ class HandEnv(VecEnv):
                 )
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
                 raise UserError(f"task.rewards.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
+
+    @classmethod
+    def config(cls) -> dict[str, Any]:
+        """The settings of a task that has them in its class; see `dexsim.tasks.Task`. Raises UserError."""
+        raise UserError(f"{cls.__name__}: its settings stand in a file; derive from dexsim.tasks.Task for your own")
 
     @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:

@@ -28,7 +28,7 @@ from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
+    pass
 
 TABLE = 6000  # joint angles tried for each finger
 TRIES = 400  # places of a cube for each that is wanted, before it is said that there are none
@@ -136,7 +136,7 @@ def candidates(
     return GraspSet(edges, angles, angles.clone(), poses), torch.as_tensor(np.array(shares))
 
 
-def press(env: HandEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
+def press(env: RotateEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
     """Targets [N, J] that press with force [N] N from angles q [N, J]."""
     torque = np.array([pads.torque(a.double().numpy(), (f * s).numpy())
                        for a, s, f in zip(q, share, force.double(), strict=True)])  # fmt: skip
@@ -148,7 +148,7 @@ def press(env: HandEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force:
 
 
 def settle(
-    env: HandEnv, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.Tensor
+    env: RotateEnv, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.Tensor
 ) -> tuple[GraspSet, torch.Tensor]:
     """Close every hand on its cube and let go of it without weight: (grasps, which are fit [N])."""
     _begin(env, start)
@@ -168,7 +168,7 @@ def settle(
     return end, still & near & _by_fingertips(env)
 
 
-def holds(env: HandEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
+def holds(env: RotateEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
     """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under their targets, in worlds drawn anew, each
     weighed in a direction of its own."""
     _begin(env, start)

@@ -26,7 +26,6 @@ from dexsim.tasks.registry import task_class
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_file
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
     from dexsim.tasks.rotate import RotateEnv
 
 SETTLE, HOLD = 2.0, 2.0  # s
@@ -119,7 +118,7 @@ def _against(
             target[i, list(hand.fingers[f].joints)] = torch.as_tensor(reach.q[f][row], dtype=torch.float32)
 
 
-def settle(env: HandEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
+def settle(env: RotateEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit
     [N])."""
     _begin(env, replace(start, target=start.hand))
@@ -138,7 +137,7 @@ def settle(env: HandEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     return end, still & flat & touched & inside & ~env.nan
 
 
-def holds(env: HandEnv, start: GraspSet) -> torch.Tensor:
+def holds(env: RotateEnv, start: GraspSet) -> torch.Tensor:
     """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under action zero, in worlds drawn anew."""
     _begin(env, start)
     ok = torch.ones(len(start), dtype=torch.bool)

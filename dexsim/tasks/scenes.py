@@ -225,7 +225,7 @@ def fasten(body: mujoco.MjsBody, how: Hinge | Slide | Screw, spec: mujoco.MjSpec
 def furnish(spec: mujoco.MjSpec, scene: Scene) -> Built:
     """Add table, things and trees to a spec, in place. Raises UserError."""
     built = Built([], {})
-    names = [OBJECT, "table", *(x.name for x in (*scene.things, *scene.trees))]
+    names = [OBJECT, "table", *(x.name for x in scene.things), *(x.name for x in scene.trees)]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise UserError(f"scene: two parts are called {twice!r}; give each a name of its own")

@@ -85,7 +85,7 @@ def observe(
     """
     given = {"noise": noise, "delay": delay, "dropout": dropout, "frames": frames, "only": only, "real": real}
     if callable(unit):
-        raise UserError(f'term {unit.__name__}: write @observe("unit"), with the unit of its value')
+        raise UserError(f'term {getattr(unit, "__name__", "?")}: write @observe("unit"), with the unit of its value')
     return lambda method: _declare("observe", method, unit, given)
 
 

@@ -37,11 +37,11 @@ class Watched(dict):
         self._all()
         return super().values()
 
-    def __or__(self, other: Any) -> dict:  # type: ignore[override]
+    def __or__(self, other: Any) -> dict:
         self._all()
         return dict(super().items()) | other
 
-    def __ror__(self, other: Any) -> dict:  # type: ignore[override]
+    def __ror__(self, other: Any) -> dict:
         self._all()
         return other | dict(super().items())
 

@@ -18,7 +18,7 @@ class Frames:
     """Renders worlds of one scene. size: width, height; camera: what differs from the usual view (`render.CAMERA`)."""
 
     def __init__(self, size: tuple[int, int] = (640, 480), camera: dict[str, Any] | None = None):
-        self.size, self._view = size, CAMERA | (camera or {})  # type: ignore[operator]
+        self.size, self._view = size, CAMERA | (camera or {})
         self._behind = backdrop(size[1], size[0])
         self._renderer: Any = None
         self._model: Any = None

@@ -14,16 +14,16 @@ class Reorient(Task):
 
     settings = {
         "episode_s": 20.0,
-        "evaluation": {"cap_s": 120.0},
+        "evaluation": {"cap_s": 200.0},
         "presets": {
             "cuda": {
-                "worlds": 8192, "iterations": 3000, "sim": {"control_period": 0.042}, "first_actions": 0.01,
-                "agent": {"num_steps_per_env": 12, "algorithm": {"gamma": 0.995, "entropy_coef": 0.002}},
+                "worlds": 8192, "iterations": 3800, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+                "agent": {"num_steps_per_env": 12, "algorithm": {"gamma": 0.995, "entropy_coef": 0.004}},
             },
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
         },
     }  # fmt: skip
-    randomize = {"object": {"size": [0.05, 0.06], "mass": {"log": [0.04, 0.12]}}}
+    randomize = {"object": {"size": [0.045, 0.052], "mass": {"log": [0.03, 0.1]}}}
 
     goal = memory(4)  # orientation to reach, w x y z
     angle = memory()  # rad, left to the goal
@@ -109,7 +109,7 @@ class Reorient(Task):
                           o.friction[:, None], self.torque], 1)  # fmt: skip
 
     # -- what is paid
-    @reward(2.0)
+    @reward(4.0)
     def nearer(self):
         """turned towards the goal, rad"""
         return self.progress.clamp(-0.5, 0.5)
@@ -129,12 +129,12 @@ class Reorient(Task):
         """the cube fell"""
         return self.dropped().float()
 
-    @reward(-0.5)
+    @reward(-0.2)
     def away(self):
         """drift of the cube, m"""
         return self.drift().clamp(max=0.2)
 
-    @reward(-0.001)
+    @reward(-0.0005)
     def change(self):
         """change of the action"""
         return (self.action - self.last_action).square().sum(1)

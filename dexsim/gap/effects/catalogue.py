@@ -70,13 +70,14 @@ Entry = TypeVar("Entry", Effect, TouchEffect)
 
 def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[str]) -> tuple[Entry, ...]:
     """An entry of each class of a kind that stands in the files of these families: to write it there is to add it."""
-    found = [
+    found: list[Entry] = [
         c()
         for family in families
         for c in vars(family).values()
         if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
     ]
-    return in_order([*found, *_brought(kind)], first)
+    own: list[Entry] = [*found, *_brought(kind)]
+    return in_order(own, first)
 
 
 def _brought(kind: type[Entry]) -> list[Entry]:
