@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from dexsim.recording.schema import Recording
 
 __all__ = [
-    "PPO",
     "Diagnosis",
+    "PPO",
     "Recording",
     "ServoTable",
     "UserError",
