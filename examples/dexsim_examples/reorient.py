@@ -36,7 +36,7 @@ class Reorient(Task):
     def begin(self, mask):
         pose, m = self.hold(mask), mask[:, None]
         self.home = torch.where(m, pose[:, :3], self.home)
-        self.goal = torch.where(m, self.next_goal(pose[:, 3:]), self.goal)
+        self.goal = torch.where(m, self.sampler.quaternion(), self.goal)
         self.angle = torch.where(mask, rotation.error(pose[:, 3:], self.goal), self.angle)
 
     def update(self):
@@ -47,14 +47,8 @@ class Reorient(Task):
         self.since = torch.where(self.reached, 0.0, self.since + self.dt)
         renew = self.reached | ((self.since > PATIENCE) & self.learning)
         self.since = torch.where(renew, 0.0, self.since)
-        self.goal = torch.where(renew[:, None], self.next_goal(self.object_pose[:, 3:]), self.goal)
+        self.goal = torch.where(renew[:, None], self.sampler.quaternion(), self.goal)
         self.angle = rotation.error(self.object_pose[:, 3:], self.goal)
-
-    def next_goal(self, now):
-        """Any orientation [N, 4]; while learning, for three worlds of four one that is at most 1.6 rad away."""
-        s, anywhere = self.sampler, self.sampler.quaternion()
-        near = rotation.multiply(rotation.about(s.direction(), 0.45 + 1.15 * s.uniform()), now)
-        return torch.where(((s.uniform() < 0.75) & self.learning)[:, None], near, anywhere)
 
     def drift(self):
         """Distance of the cube from where it lay at first [N], m."""
@@ -119,7 +113,7 @@ class Reorient(Task):
         """closeness to the goal"""
         return 1 / (self.angle + epsilon)
 
-    @reward(15.0)
+    @reward(8.0)
     def bonus(self):
         """a goal reached"""
         return self.reached.float()
