@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dexsim import yaml_text
-from dexsim.console import program
+from dexsim.console import jobs, program
 from dexsim.errors import UserError
 from dexsim.typed import number, whole
 
@@ -42,6 +42,7 @@ writes to out=:
 examples:
   python diagnose.py recordings='[a.mcap,b.mcap,c.mcap]' out=out/hand
   python diagnose.py recordings='[a.mcap,b.mcap]' held_out='[c.mcap]' model=rig.xml servo=rig.yaml out=out/rig
+  python diagnose.py fleet='logs/*/' model=rig.xml servo=rig.yaml out=out/fleet
   python diagnose.py demo=true
 
 settings (key=default):
@@ -69,6 +70,11 @@ settings (key=default):
                               (command_delay),
                               or backlash, compliance, coulomb_friction, deadband, load_friction, stribeck_friction
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
+  fleet=                      folders of machines of one type, 'logs/*/': each is diagnosed from its own recordings
+                              (and by its own model.xml, servo.yaml, where it has them); out=DIR gets a page that
+                              compares them
+  before=                     fleet=: the folder of an earlier diagnosis of the fleet; says which machine drifted since
+  on= at_once= slurm.NAME=    fleet=: where its jobs run (docs/howto/gpus.md)
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
   units.QUANTITY=             the unit of what is recorded: units.position=deg, ticks:4096, percent, normalized,
                               registers (0 to 1000); units.position.JOINT= of one joint
@@ -77,6 +83,8 @@ settings (key=default):
 """
 KEYS = (
     "recordings",
+    "fleet",
+    "before",
     "held_out",
     "model",
     "hand",
@@ -152,7 +160,13 @@ def main(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(program.words(HELP), end="")
         return 0 if argv else 2
+    if any(a.startswith("fleet=") for a in argv):
+        from dexsim.gap import fleet
+
+        return fleet.run(argv, parse(jobs.taken(argv)[1]))
     given = parse(argv)
+    if "before" in given:
+        raise UserError("before=: only with fleet=")
     if given.get("columns"):
         from dexsim.actuator.columns import describe
 
