@@ -372,8 +372,8 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
         ]
     )
     reached /= reached.max(0)
-    asked = np.where((reached == 1.0).any(1), 0.0, reached.mean(1))
-    last = int(np.argmax(asked))
+    share = np.where((reached == 1.0).any(1), 0.0, reached.mean(1))
+    last = int(np.argmax(share))
     out = [r for k, r in enumerate(runs) if k != last] + [runs[last]]
     for name, r in zip("abcd", out, strict=True):
         r.name = f"{name}.mcap"
@@ -715,11 +715,11 @@ def _watch(stream, total: int, start: float, limit: float) -> list[dict]:
     out: list[dict] = []
     with tqdm(total=total, desc="cases") as bar:
         while len(out) < total:
-            left = limit - (time.perf_counter() - start) if limit else None
+            remaining = limit - (time.perf_counter() - start) if limit else None
             try:
-                if left is not None and left <= 0:
+                if remaining is not None and remaining <= 0:
                     raise mp.TimeoutError
-                out.append(stream.next(left) if hasattr(stream, "next") else next(stream))
+                out.append(stream.next(remaining) if hasattr(stream, "next") else next(stream))
             except mp.TimeoutError:
                 bar.write(f"{limit:g} s are over: {len(out)} of {total} cases are done")
                 break

@@ -97,11 +97,11 @@ def _with_braking(case: Path, out: Path) -> Path:
     path = case / "servo.yaml"
     if not path.is_file():
         return path
-    told = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if told["drive"] == "torque":
-        for columns in told["joints"].values():
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if content["drive"] == "torque":
+        for columns in content["joints"].values():
             columns["braking_slope"] = 1.0
-    (out / "servo_said.yaml").write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
+    (out / "servo_said.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return out / "servo_said.yaml"
 
 

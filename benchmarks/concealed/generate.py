@@ -362,11 +362,11 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
         believed = {k: float(v[at]) for k, v in d.believed.items()}
         logs = _logs(run, command, at, source)
         known = {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}
-        told = laws.reported(kind, law, logs, n, o | known)
+        stated = laws.reported(kind, law, logs, n, o | known)
         if kind.effect == "payload":
-            told = {"mass": n["mass"] + n["extra"] - believed["mass"]}
+            stated = {"mass": n["mass"] + n["extra"] - believed["mass"]}
         strength = law.own if law is not None and law.own is not None else kind.own
-        effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told,
+        effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": stated,
                         "facts": fact, **laws.told(label, law, o),
                         "also": _also(kind, d, at, source),
                         "when": _when([strength(L, n, o) for L in logs])})  # fmt: skip

@@ -215,14 +215,14 @@ def reported(kind: Kind, law: Law | None, logs: list[Shown], n: dict, o: dict) -
 
     logs: of the recordings to fit; n, o: parameters of the joint as they are and as they are believed.
     """
-    told = kind.report(n, o)
+    values = kind.report(n, o)
     if law is not None:
         together = {k: np.concatenate([np.asarray(L[k], float) for L in logs]) for k in logs[0]}
-        told = told | law.report(together, n)
+        values = values | law.report(together, n)
         if law is SECOND["delay"]:
             seconds = len(logs[0]["torque"]) * plant.TICK
-            told = told | {"delay": late(n["delay"], n["jitter"], len(logs), seconds) - o["delay"]}
-    return {k: float(v) for k, v in told.items()}
+            values = values | {"delay": late(n["delay"], n["jitter"], len(logs), seconds) - o["delay"]}
+    return {k: float(v) for k, v in values.items()}
 
 
 def told(kind: str, law: Law | None, p: dict) -> dict[str, str]:

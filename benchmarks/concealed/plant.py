@@ -276,9 +276,9 @@ def simulate(
     v, vm, z, rest, tau = (np.zeros((B, S)) for _ in range(5))
     locked = np.diag((~there).astype(float) * 1.0)
     base, base_v = np.zeros((B, S)), np.zeros((B, S))
-    apart = np.zeros((C, D))
-    apart[rig.place[:, 0], rig.place[:, 1]] = np.linalg.norm(rig.com, axis=-1)[rig.place[:, 0], rig.place[:, 1]]
-    radius = grid(P["bulk"]) * apart * reach if has["bulk"] else None
+    gaps = np.zeros((C, D))
+    gaps[rig.place[:, 0], rig.place[:, 1]] = np.linalg.norm(rig.com, axis=-1)[rig.place[:, 0], rig.place[:, 1]]
+    radius = grid(P["bulk"]) * gaps * reach if has["bulk"] else None
 
     def terms() -> tuple[np.ndarray, np.ndarray]:
         M, h = dynamics(rig, mass, extra, reach, grid(q + base), grid(v + base_v), g, radius)
@@ -369,11 +369,11 @@ def simulate(
             is_soft, knee = P["knee"] > 0, np.maximum(P["knee"], 1.0)
             duty = np.where(is_soft, soft_limit(raw, 1.0, knee), duty)
             given = np.where(is_soft, soft_limit(raw, most, knee), given)
-        asked = np.where(P["voltage"] > 0.5, P["torque_limit"] * (duty * supply - vm / P["no_load_speed"]), given)
+        commanded = np.where(P["voltage"] > 0.5, P["torque_limit"] * (duty * supply - vm / P["no_load_speed"]), given)
         if has["lag_order"]:
-            stage = stage + rate * (asked - stage)
-            asked = np.where(P["lag_order"] > 1.5, stage, asked)
-        tau = tau + rate * (asked - tau) if driven else np.zeros((B, S))
+            stage = stage + rate * (commanded - stage)
+            commanded = np.where(P["lag_order"] > 1.5, stage, commanded)
+        tau = tau + rate * (commanded - tau) if driven else np.zeros((B, S))
         drive = tau
         rub = 1.0
         if has["thermal_torque"]:

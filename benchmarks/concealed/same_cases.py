@@ -47,9 +47,9 @@ def compared(before: dict[str, dict], after: dict[str, dict]) -> tuple[list[dict
     """Return the cases that both answered, in one order. Raises UserError where they are not the same cases."""
     names = [n for n in before if n in after]
     for n in names:
-        asked = [{k: r[k] for k in ASKED} for r in (before[n], after[n])]
-        if asked[0] != asked[1]:
-            raise UserError(f"case {n}: {asked[0]} before and {asked[1]} after: not the same cases")
+        questions = [{k: r[k] for k in ASKED} for r in (before[n], after[n])]
+        if questions[0] != questions[1]:
+            raise UserError(f"case {n}: {questions[0]} before and {questions[1]} after: not the same cases")
     return [before[n] for n in names], [after[n] for n in names]
 
 

@@ -184,8 +184,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
 
     def hidden(x: np.ndarray) -> float:
         fit = lsq_linear(R, Q.T @ x.reshape(-1), (-np.array(widths), np.array(widths))).x
-        left = (x.reshape(-1) - np.stack(slopes, 1) @ fit).reshape(x.shape)[-HELD:]
-        return float(np.sqrt(np.mean(left[..., base.max((0, 1)) > 0.02] ** 2)))
+        residual = (x.reshape(-1) - np.stack(slopes, 1) @ fit).reshape(x.shape)[-HELD:]
+        return float(np.sqrt(np.mean(residual[..., base.max((0, 1)) > 0.02] ** 2)))
 
     floor = float(np.hypot(LSB / np.sqrt(12), NOISE))
     floor = float(np.hypot(floor, hidden(base * (1 - 1 / own_gain))))
@@ -249,14 +249,14 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
                 [letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)]
                 for a, b in zip(edge[::2], edge[1::2], strict=True)
             ]
-    told = {k: float(v) for k, v in kind.report(p).items()} if kind else {}
+    stated = {k: float(v) for k, v in kind.report(p).items()} if kind else {}
     if law is not None:
-        told |= law.report(pad, [f for _, f, _ in done[: len(RECORDINGS) - HELD]], p)
+        stated |= law.report(pad, [f for _, f, _ in done[: len(RECORDINGS) - HELD]], p)
     which_law = {"law": "only"}
     if pair is not None:
         which_law = {"law": "second" if law else "first", "law_is": pair.second if law else pair.first}
     effects = [] if not kind else [{"effect": kind.effect, "kind": entry["kinds"][0], "joint": "pad",
-                                    "parameters": told, **which_law,
+                                    "parameters": stated, **which_law,
                                     "facts": facts, "also": [], "when": when}]  # fmt: skip
     answer = {"name": name, "group": "touch", "decoy": "", "bad": "", "asked_tier": entry["tier"],
               "tier": tier_of(facts["ratio"]) if kind else "none", "shape": "touch",

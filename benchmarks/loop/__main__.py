@@ -622,8 +622,8 @@ def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
         return np.where(there, (other.mean(axis) - naive.mean(axis)) / np.where(there, gap, 1.0), math.nan)
 
     value, draws = float(part(naive, other, truth)), intervals.draws((naive, other, truth), part, 0, 2000)
-    told = draws[np.isfinite(draws)]
-    low, high = (float(v) for v in np.percentile(told, (2.5, 97.5))) if len(told) else (math.nan, math.nan)
+    finite = draws[np.isfinite(draws)]
+    low, high = (float(v) for v in np.percentile(finite, (2.5, 97.5))) if len(finite) else (math.nan, math.nan)
     return {"value": value, "low": low, "high": high, "seeds": len(naive)}
 
 

@@ -208,16 +208,16 @@ def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target
         [np.linspace(a, b, INNER, endpoint=False) for a, b in zip(reads[:-1], reads[1:], strict=True)] + [reads[-1:]]
     )
     data, n = mujoco.MjData(model), len(reads)
-    felt, force = np.zeros((n, 5, sensor.touch.layout.taxels, 3)), np.zeros(n)
+    forces, force = np.zeros((n, 5, sensor.touch.layout.taxels, 3)), np.zeros(n)
     sensor.forget()
     start = float(sensor.engine.t.time[0]) + 1.0  # the sensor's clock goes on
     for i, now in enumerate(every):
         f = sensor.stiffness * max(-_gap(model, data, [np.interp(now, t, x) for x in q.T]), 0.0)
         out = sensor.feel(start + now, data, f)
         if i % INNER == 0:
-            felt[i // INNER, ..., 2], force[i // INNER] = out, f
+            forces[i // INNER, ..., 2], force[i // INNER] = out, f
     sensor.touch.check()
-    felt[..., 2] = np.round(np.clip(felt[..., 2] / sensor.lsb, 0, 255))
+    forces[..., 2] = np.round(np.clip(forces[..., 2] / sensor.lsb, 0, 255))
     names = [model.joint(j).name for j in range(model.njnt)]
     order = [("slide", "across", "press").index(x) for x in names]
     at = np.stack([np.interp(reads, t, x) for x in q.T], 1)[:, order]
@@ -230,7 +230,7 @@ def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target
     recording = Recording(Path("press.mcap"), meta, tuple(names),
                           Series(np.zeros(0), np.zeros((0, len(names))), COMMANDS, np.zeros(0)),
                           States(Series(reads, np.round(at / 1e-5) * 1e-5, STATES, reads.copy())),
-                          tactile=Series(reads, felt, TACTILE),
+                          tactile=Series(reads, forces, TACTILE),
                           external_force=Series(reads, cell, EXTERNAL_FORCE, reads.copy(), "indenter"),
                           start_ns=int(1e9 + k * 60e9))  # fmt: skip
     write(target, recording)
@@ -248,9 +248,9 @@ def pinch(given: dict[str, str]) -> None:
     sensor, rng = Sensor(world, "index", pinched=True), np.random.default_rng(world["seed"])
     t = np.cumsum(rng.uniform(0.9, 1.1, 270)) / RATE
     depth = 0.8e-3 * np.sin(np.pi * t) ** 2
-    felt = np.zeros((len(t), 5, xhand.TAXELS_PER_FINGER, 3))
+    forces = np.zeros((len(t), 5, xhand.TAXELS_PER_FINGER, 3))
     for i, now in enumerate(t):
-        felt[i, ..., 2] = np.round(sensor.feel_thumb(float(now), float(depth[i])) / sensor.lsb)
+        forces[i, ..., 2] = np.round(sensor.feel_thumb(float(now), float(depth[i])) / sensor.lsb)
     meta = DEFAULTS | {"source": "real", "robot": "xhand_right", "joint_names": "distance", "effort_is": "none",
                        "tactile_unit": "count", "tactile_lsb": f"{sensor.lsb:g}",
                        "notes": "the thumb's tip pressed on the index's by hand"}  # fmt: skip
@@ -265,13 +265,13 @@ def pinch(given: dict[str, str]) -> None:
             ("distance",),
             Series(np.zeros(0), np.zeros((0, 1)), COMMANDS, np.zeros(0)),
             states,
-            tactile=Series(t, felt, TACTILE),
+            tactile=Series(t, forces, TACTILE),
             start_ns=1_000_000_000,
         ),
     )
 
 
-def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
+def make(folders: list[Path], taxels: list[int], lsb: float) -> dict:
     """Return what training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip;
     felt: taxels of each that felt anything; lsb N a count.
 
@@ -284,7 +284,7 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
 
     values: dict[str, list[float]] = {"delay": [], "hysteresis": [], "hysteresis_time": []}
     listed, dead, total = [], 0, 0
-    for folder, n in zip(folders, felt, strict=True):
+    for folder, n in zip(folders, taxels, strict=True):
         effects = {
             f["effect"]: f["parameters"]
             for f in json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))["findings"]
@@ -343,15 +343,15 @@ def summed(given: dict[str, str]) -> None:
     from dexsim.recording import read
 
     roots = [Path(p) for p in given["found"].split(",")]
-    felt, lsb = [], 0.0
+    taxels, lsb = [], 0.0
     for root in roots:
         counts = [read(p, audit=False) for p in sorted(root.glob("press_*.mcap"))]
         pad = max(range(5), key=lambda f: sum(r.tactile.value[:, f, :, 2].sum() for r in counts))
-        felt.append(int((sum((r.tactile.value[:, pad, :, 2] > 2).sum(0) for r in counts) > 3).sum()))
+        taxels.append(int((sum((r.tactile.value[:, pad, :, 2] > 2).sum(0) for r in counts) > 3).sum()))
         lsb = counts[0].tactile_lsb
-    content = make([r / "found" for r in roots], felt, lsb)
+    content = make([r / "found" for r in roots], taxels, lsb)
     head = (
-        f"# From presses on {len(roots)} fingertips ({sum(felt)} taxels felt them), diagnosed one by one: python -m "
+        f"# From presses on {len(roots)} fingertips ({sum(taxels)} taxels felt them), diagnosed one by one: python -m "
         "benchmarks.loop.presses sum\n"
     )
     Path(given["out"]).write_text(

@@ -61,12 +61,12 @@ def main(argv: list[str]) -> int:
     for name in SEEDS:
         path = CONFIGS / "reality" / f"{name}.yaml"
         body = text(draw(name)).split("\n")
-        kept = [line for line in body if not line.startswith("#")]
+        lines = [line for line in body if not line.startswith("#")]
         head = ["# A concealed reality of the closed loop (`python -m benchmarks.loop`), standing in for hardware:"
                 " never trained in.",
                 "# Numbers drawn once: python -m benchmarks.loop.worlds. What it hides (in its servo) was chosen by",
                 "# what it costs a naive policy."]
-        path.write_text("\n".join(head + kept), encoding="utf-8")
+        path.write_text("\n".join(head + lines), encoding="utf-8")
         print(path)
     return 0
 

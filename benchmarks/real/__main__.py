@@ -237,8 +237,8 @@ def ergocub(data: Path, out: Path, jobs: int) -> dict:
 
     work = [(data, out, run, which, (run,), ()) for which, runs in FINGERS.items() for run in runs]
     for which, runs in FINGERS.items():
-        kept = held_out(which)
-        work += [(data, out, f"all_{which}", which, tuple(r for r in runs if r not in kept), kept)] if kept else []
+        held = held_out(which)
+        work += [(data, out, f"all_{which}", which, tuple(r for r in runs if r not in held), held)] if held else []
     start, rows = time.perf_counter(), {}
     for done in _parts(finger, work, jobs):
         rows[done["name"]] = done

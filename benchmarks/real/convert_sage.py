@@ -99,5 +99,5 @@ def convert(data: Path, out: Path, held: int = 10) -> Sage:
                 gravity="0 0 -9.81",
             )
         )
-    kept = made[2::3][:held]
-    return Sage([p for p in made if p not in kept], kept, model, servo, late)
+    chosen = made[2::3][:held]
+    return Sage([p for p in made if p not in chosen], chosen, model, servo, late)

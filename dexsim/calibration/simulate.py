@@ -177,11 +177,11 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
     assert touch.raw is not None  # asked for above
-    felt = np.zeros((n, F, layout.taxels, 3))
-    felt[..., 2] = touch.raw.numpy()
+    forces = np.zeros((n, F, layout.taxels, 3))
+    forces[..., 2] = touch.raw.numpy()
     t = np.arange(n) * 2 / RATE
     load = np.zeros((n, 6))
-    load[:, 2] = felt[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
+    load[:, 2] = forces[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
     pose = np.tile(hand.pose("open"), (n, 1))
     notes = f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"
     meta = DEFAULTS | {"source": "sim", "robot": hand.robot, "joint_names": ",".join(hand.joints),
@@ -190,7 +190,7 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
     series = lambda x, topic: Series(t, x, topic, t.copy())  # noqa: E731
     states = States(series(pose, STATES), None, series(0 * pose, STATES))
     return Recording(Path("rolled.mcap"), meta, hand.joints, Series.empty(COMMANDS, len(hand.joints)), states,
-                     tactile=Series(t, felt, TACTILE),
+                     tactile=Series(t, forces, TACTILE),
                      external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
                      start_ns=1_000_000_000)  # fmt: skip
 

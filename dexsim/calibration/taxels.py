@@ -116,16 +116,16 @@ def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray
     for key in np.unique(np.stack([press[on], top[on]], 1), axis=0):
         rows = on & (press == key[0]) & (top == key[1])
         visits[int(key[0]), int(key[1])] = clean[rows].max(0)
-    heard, asked = np.zeros(2), np.zeros(2)  # beside it in column, in row: pitches differ
+    heard, expected = np.zeros(2), np.zeros(2)  # beside it in column, in row: pitches differ
     trials = np.zeros((clean.shape[1], 2))
     for (_, at), reading in visits.items():
         for k in near[at]:
             way = int(abs(k - at) == 1)
             trials[k, way] += 1
             if not silent[k]:
-                asked[way] += 1
+                expected[way] += 1
                 heard[way] += reading[k] > floor
-    rate = np.clip(heard / np.maximum(asked, 1), 0.0, 0.99)
+    rate = np.clip(heard / np.maximum(expected, 1), 0.0, 0.99)
     return np.prod((1 - rate) ** trials, axis=1)
 
 

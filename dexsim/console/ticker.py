@@ -22,6 +22,6 @@ class Ticker:
         if now - self._last < self._every and not (done >= total and self._live):
             return
         self._last = now
-        left = (now - self._start) * (total - done) / max(done, 1)
-        text = f"  {self._what} {done}/{total}  {note}  {duration(left)} left"
+        remaining = (now - self._start) * (total - done) / max(done, 1)
+        text = f"  {self._what} {done}/{total}  {note}  {duration(remaining)} left"
         print(f"\r{text:<70}" if self._live else text, end="\n" if done >= total or not self._live else "", flush=True)

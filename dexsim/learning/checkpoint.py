@@ -74,12 +74,12 @@ def write(path: str | Path, data: bytes) -> Path:
     except OSError as error:
         with contextlib.suppress(OSError):
             part.unlink()
-        kept = "; the previous file there is whole" if path.exists() else ""
+        intact = "; the previous file there is whole" if path.exists() else ""
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise SaveError(
-                f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}"
+                f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){intact}"
             ) from None
-        raise SaveError(f"cannot save {path}: {error.strerror}{kept}") from None
+        raise SaveError(f"cannot save {path}: {error.strerror}{intact}") from None
     return path
 
 

@@ -83,7 +83,7 @@ class GraphedUpdate:
         alg, st = self.alg, self.alg.storage
         self._prepare()
         group = alg.optimizer.param_groups[0]
-        kept = {name: group[name] for name in ("lr", "fused", "foreach", "capturable")}
+        options = {name: group[name] for name in ("lr", "fused", "foreach", "capturable")}
         on_gpu = self.device.type == "cuda"
         rate = self._rate32 if on_gpu else alg.learning_rate
         group.update(lr=rate, fused=on_gpu or None, foreach=None, capturable=on_gpu)
@@ -96,7 +96,7 @@ class GraphedUpdate:
                     self._run()
             totals = torch.cat([self._sums.double(), self._rate[None]]).tolist()
         finally:
-            group.update(kept)
+            group.update(options)
         alg.learning_rate = totals[3]
         for g in alg.optimizer.param_groups:
             g["lr"] = alg.learning_rate

@@ -40,10 +40,10 @@ def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: s
         allowed = ALLOWED.get(key, ())
         if value in allowed or (f"agent.{key}", value) in trusted:
             continue
-        shown = str(value)[:120]
+        text = str(value)[:120]
         known = f"dexsim takes {', '.join(allowed)} from a file" if allowed else "dexsim takes none from a file"
-        raise UserError(f"{where}: agent.{key}={shown} names code to run, and {known}; only if you trust it, type"
-                        f" agent.{key}={shown} on the command line")
+        raise UserError(f"{where}: agent.{key}={text} names code to run, and {known}; only if you trust it, type"
+                        f" agent.{key}={text} on the command line")
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

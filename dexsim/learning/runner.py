@@ -86,15 +86,15 @@ class Runner(OnPolicyRunner):
             else {"global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
         )
 
-    def _whether_worlds(self, asked: bool | None) -> bool:
+    def _whether_worlds(self, wanted: bool | None) -> bool:
         """Return whether checkpoints hold the worlds' states: as asked, else where they are small."""
         able = hasattr(self.env, "keep_worlds")
-        if asked and self.ranks.size > 1:
+        if wanted and self.ranks.size > 1:
             raise UserError("save_worlds=true: works with one process, not under torchrun; leave it out")
-        if asked and not able:
+        if wanted and not able:
             raise UserError("save_worlds=true: this task's environment has no keep_worlds(); leave it out")
-        if asked is not None or not able or self.ranks.size > 1:
-            return bool(asked)
+        if wanted is not None or not able or self.ranks.size > 1:
+            return bool(wanted)
         return sum(w.numel() * w.element_size() for w in self.env.keep_worlds().values()) <= SMALL
 
     def open_writer(self, folder: Path) -> Any:

@@ -160,7 +160,7 @@ def outside_torque(
     """Compute what `Engine.keep_outside` says; row: the constraint that is a dof's dry friction, -1: none; force: of
     all constraints."""
     w, i = wp.tid()
-    felt = smooth[w, i] - applied[w, i] - damper[w, i] + constraint[w, i]
+    load = smooth[w, i] - applied[w, i] - damper[w, i] + constraint[w, i]
     if row[w, i] >= 0:
-        felt -= force[w, row[w, i]]
-    outside[w, i] = felt
+        load -= force[w, row[w, i]]
+    outside[w, i] = load

@@ -13,7 +13,7 @@ def quiet_warp(device: str) -> None:
 
     warp.config.log_level = warp.LOG_WARNING
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved = os.dup(2)
     try:
         if device == "cpu":
             nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -21,5 +21,5 @@ def quiet_warp(device: str) -> None:
             os.close(nowhere)
         warp.init()
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)

@@ -56,7 +56,7 @@ def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
     def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
         return 256, 132  # the real one compiles the kernel to know; it decides about sizes only
 
-    kept = [
+    chosen = [
         (owner, name, getattr(owner, name))
         for owner, name in (
             (wp, "launch"),
@@ -71,5 +71,5 @@ def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
     try:
         yield
     finally:
-        for owner, name, what in kept:
+        for owner, name, what in chosen:
             setattr(owner, name, what)

@@ -103,12 +103,12 @@ class Decor:
         """Light the taxels that feel a force: yellow to dark red."""
         from dexsim.view.live_panels import colours
 
-        felt = self._arrays["taxels"][k]
+        forces = self._arrays["taxels"][k]
         for f, body in enumerate(self._bodies):
-            lit = np.flatnonzero(felt[f] > 0.01)
+            lit = np.flatnonzero(forces[f] > 0.01)
             if not len(lit):
                 continue
-            rgb = colours(felt[f][lit], FULL_TAXEL) / 255.0
+            rgb = colours(forces[f][lit], FULL_TAXEL) / 255.0
             frame = data.xmat[body].reshape(3, 3)
             points = self._arrays["taxel_point"][f][lit] + 5e-4 * self._arrays["taxel_normal"][f][lit]
             for point, colour in zip(data.xpos[body] + points @ frame.T, rgb, strict=True):

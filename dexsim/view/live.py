@@ -285,14 +285,14 @@ class LiveView:
             for body, node in self._nodes.items():
                 node.position, node.wxyz = self._data.xpos[body], self._data.xquat[body]
             if raw is not None:
-                felt = raw[w].cpu().numpy()
-                self._full_taxel = max(0.995 * self._full_taxel, FULL_TAXEL, float(felt.max()))
+                forces = raw[w].cpu().numpy()
+                self._full_taxel = max(0.995 * self._full_taxel, FULL_TAXEL, float(forces.max()))
                 for f, cloud in enumerate(self._points):
-                    cloud.colors = panels.colours(felt[f][: len(cloud.points)], self._full_taxel)
+                    cloud.colors = panels.colours(forces[f][: len(cloud.points)], self._full_taxel)
         if not panels_too:
             return
         if raw is not None:
-            self._image.image = self._map.image(felt, self._full_taxel)
+            self._image.image = self._map.image(forces, self._full_taxel)
         force = env.touch.force[w].cpu().numpy()
         self._forces.content = panels.force_bars(self.fingers, force, self._commanded(w), self._full_force)
         terms = {k: float(v[w]) for k, v in self._terms.items()}
@@ -307,9 +307,9 @@ class LiveView:
         command, full = getattr(self.env, "command", None), getattr(self.env, "f_max", None)
         if command is None or full is None or command.dim() != 1:
             return None
-        told = np.full(len(self.fingers), float(command[world]) * full)
-        told[list(self.env.hand.opposing)] = np.nan
-        return told
+        commands = np.full(len(self.fingers), float(command[world]) * full)
+        commands[list(self.env.hand.opposing)] = np.nan
+        return commands
 
     def _about(self, world: int) -> dict[str, object]:
         env = self.env
@@ -336,7 +336,7 @@ class LiveView:
         """Step and draw until Ctrl-C (or for `seconds`, or until `stop`)."""
         env, w = self.env, self.wishes
         end = None if seconds is None else time.perf_counter() + seconds
-        drawn = shown = 0.0
+        drawn = shown_at = 0.0
         due = time.perf_counter()
         with torch.no_grad():
             obs = env.get_observations()
@@ -354,9 +354,9 @@ class LiveView:
                 now = time.perf_counter()
                 last = w.pause and not w.steps
                 if last or now - drawn >= 1 / SCENE_HZ:
-                    panels_too = last or now - shown >= 1 / PANEL_HZ
+                    panels_too = last or now - shown_at >= 1 / PANEL_HZ
                     self.draw(panels_too)
-                    drawn, shown = now, now if panels_too else shown
+                    drawn, shown = now, now if panels_too else shown_at
                 if w.speed != "fastest" and not w.pause:
                     due = max(due + env.dt / SPEEDS[w.speed], time.perf_counter() - 0.2)  # too slow: do not catch up
                     time.sleep(max(due - time.perf_counter(), 0.0))
@@ -369,8 +369,8 @@ class LiveView:
             self._totals[name] = self._totals.get(name, 0.0) + float(value[w])
         if bool(done[w]):
             self.episodes += 1
-            kept = bool(extras["time_outs"][w])
-            self.ended = f"{'to the time limit' if kept else 'ended early'}, {sum(self._totals.values()):+.1f}"
+            timed_out = bool(extras["time_outs"][w])
+            self.ended = f"{'to the time limit' if timed_out else 'ended early'}, {sum(self._totals.values()):+.1f}"
             self._new_episode()
         return obs
 

@@ -77,18 +77,18 @@ def _bars(
     begin: float = 0.1,
 ) -> None:
     """Draw bars into box (left, top, width, height), in pixels; each begins at this share of its column."""
-    left, top, width, height = box
+    x, top, width, height = box
     targets = None if command is None else np.broadcast_to(np.asarray(command, float), force.shape)
     letters = font(max(8, int(0.8 * small)))
     key = "force on each fingertip" if targets is None else "force on each fingertip;"
-    draw.text((left + 0.6 * small, top + 0.35 * small), key, font=letters, fill=GREY)
+    draw.text((x + 0.6 * small, top + 0.35 * small), key, font=letters, fill=GREY)
     if targets is not None:
-        end = left + 0.6 * small + draw.textlength(key + " ", font=letters)
+        end = x + 0.6 * small + draw.textlength(key + " ", font=letters)
         draw.text((end, top + 0.35 * small), "line: commanded", font=letters, fill=TARGET)
     column = (width - small) / len(force)
     base, tall = top + height - int(1.7 * small), height - int(3.4 * small)
     for k, value in enumerate(force):
-        x0, x1 = int(left + 0.5 * small + (k + begin) * column), int(left + 0.5 * small + (k + 0.9) * column)
+        x0, x1 = int(x + 0.5 * small + (k + begin) * column), int(x + 0.5 * small + (k + 0.9) * column)
         draw.rectangle((x0, base - tall, x1, base), fill=(255, 255, 255, 30))
         draw.rectangle((x0, base - _length(value, full, tall), x1, base), fill=BAR)
         if targets is not None and np.isfinite(targets[k]):
@@ -98,19 +98,19 @@ def _bars(
         text = f"{word} {np.nan_to_num(value):.0f} N" if word else ""
         if draw.textlength(text, font=letters) > column:
             text = word
-        middle = left + 0.5 * small + (k + 0.5) * column
+        middle = x + 0.5 * small + (k + 0.5) * column
         draw.text((middle, base + 0.3 * small), text, font=letters, fill=WHITE, anchor="ma")
 
 
 def _pads(image: Image.Image, pads: Sequence[np.ndarray], box: tuple[int, int, int, int], small: int) -> None:
     """Paste the pads' pictures beside their bars."""
-    left, top, width, height = box
+    x, top, width, height = box
     column = (width - small) / len(pads)
     base, tall = top + height - int(1.7 * small), height - int(3.4 * small)
     side = min(tall, int(0.54 * column))
     for k, pad in enumerate(pads):
         picture = Image.fromarray(pad).resize((side, side), Image.Resampling.NEAREST)
-        image.paste(picture, (int(left + 0.5 * small + (k + 0.08) * column), base - side))
+        image.paste(picture, (int(x + 0.5 * small + (k + 0.08) * column), base - side))
 
 
 def _small(height: int) -> int:

@@ -256,7 +256,7 @@ def from_cylinder(
     to be further apart need no exact answer; then |g| is at least the cutoff.
     """
     s = begin(half, b, vertex, R, p, first)
-    kept = s
+    best = s
     least = float(FAR)
     for _look in range(LOOKS):
         gg = wp.dot(s.g, s.g)
@@ -274,12 +274,12 @@ def from_cylinder(
         if wp.dot(t.g, t.g) >= gg:
             if promise >= least:
                 break
-            kept = s
+            best = s
             least = promise
         s = t
     if least > DOUBT:
-        kept.g = wp.vec3(0.0)
-    return kept
+        best.g = wp.vec3(0.0)
+    return best
 
 
 @wp.func

@@ -149,7 +149,7 @@ def grown(
         pos[points] = w
         # faces that see the new point go; the edges of the hole are those that only one of them had
         edges = int(0)
-        kept = int(0)
+        count = int(0)
         for j in range(faces):
             f = face[j]
             g = at[j]
@@ -171,12 +171,12 @@ def grown(
                     else:
                         lost = int(1)
             else:
-                face[kept] = f
-                at[kept] = g
-                kept += 1
-        if lost == 1 or edges < 3 or kept + edges > FACES:
+                face[count] = f
+                at[count] = g
+                count += 1
+        if lost == 1 or edges < 3 or count + edges > FACES:
             break
-        faces = kept
+        faces = count
         for h in range(edges):
             u = edge[h] & 0xFF
             v = edge[h] >> 8

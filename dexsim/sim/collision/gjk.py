@@ -238,7 +238,7 @@ def distance(
     apart need no exact answer; then |v| is at least the cutoff.
     """
     s = begin(a, b, vertex, R, p, first)
-    kept = s
+    best = s
     least = float(DOUBT)
     for _look in range(LOOKS):
         vv = wp.dot(s.v, s.v)
@@ -261,11 +261,11 @@ def distance(
         # m. What the next corner promises tells better. Unless that gets less, it is over.
         if t.inside == 0 and wp.dot(t.v, t.v) >= vv and promise < DOUBT:
             if promise >= least:
-                s = kept
+                s = best
                 break
             if wp.length(t.v) > norm + ROUNDED:
                 break  # rounding chose the wrong edge of a flat simplex
-            kept = s
+            best = s
             least = promise
         s = t
         if s.inside != 0:

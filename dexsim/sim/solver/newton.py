@@ -78,7 +78,7 @@ class NewtonSolver:
     @contextmanager
     def in_place(self) -> Iterator[None]:
         """Let `mujoco_warp.step`, within this, solve here."""
-        kept = theirs.solve
+        original = theirs.solve
 
         @event_scope
         def solve(m: mjw.Model, d: mjw.Data) -> None:
@@ -90,7 +90,7 @@ class NewtonSolver:
         try:
             yield
         finally:
-            theirs.solve = kept
+            theirs.solve = original
 
     def launch(self) -> None:
         m, d = self.m, self.d
