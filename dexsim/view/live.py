@@ -356,7 +356,7 @@ class LiveView:
                 if last or now - drawn >= 1 / SCENE_HZ:
                     panels_too = last or now - shown_at >= 1 / PANEL_HZ
                     self.draw(panels_too)
-                    drawn, shown = now, now if panels_too else shown_at
+                    drawn, shown_at = now, now if panels_too else shown_at
                 if w.speed != "fastest" and not w.pause:
                     due = max(due + env.dt / SPEEDS[w.speed], time.perf_counter() - 0.2)  # too slow: do not catch up
                     time.sleep(max(due - time.perf_counter(), 0.0))
