@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -189,3 +190,28 @@ def test_a_driven_joint_that_follows_another_is_refused(tmp_path):
     path.write_text(text[:at] + "- {name: second0, effort: 1, speed: 1}\n  " + text[at:])
     with pytest.raises(UserError, match="'second0' follows 'first0' in the model"):
         load_hand(hand.folder)
+
+
+def test_a_diagnosis_takes_the_inertia_that_the_drive_feels():
+    from dexsim.gap.plant.mechanics import along
+
+    text = CHAIN.format('<equality><joint joint1="b" joint2="a" polycoef="0 0.5 0 0 0"/><joint joint1="c" joint2="b"/>'
+                        '</equality>')  # fmt: skip
+    m = mujoco.MjModel.from_xml_string(text)
+    t = np.linspace(0, 2, 401)
+    q = 0.6 * np.sin(3 * t)[:, None]
+    run = SimpleNamespace(
+        t=t, fine=None, qs=q, vs=1.8 * np.cos(3 * t)[:, None], as_=-5.4 * np.sin(3 * t)[:, None],
+        gravity=np.zeros(3), smooth=lambda: None)  # fmt: skip
+    times, values, _ = along(m, run, ("a",), added=False)
+    from dexsim.gap.plant.columns import SERIES_INDEX
+
+    k = len(times) // 3
+    moves = np.array([1.0, 0.5, 0.5])
+    d = mujoco.MjData(m)
+    at = 0.6 * np.sin(3 * times[k])
+    d.qpos[:] = [at, 0.5 * at, 0.5 * at]
+    mujoco.mj_forward(m, d)
+    full = np.zeros((3, 3))
+    mujoco.mj_fullM(m, d, full)
+    assert values[0, k, SERIES_INDEX["inertia"]] == pytest.approx(moves @ full @ moves, rel=1e-4)

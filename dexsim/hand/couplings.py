@@ -63,6 +63,11 @@ class Couplings:
         self._free = sorted({int(m.jnt_qposadr[j]) for j in free} & held)
         self.loose = tuple(m.joint(j).name for j in sorted(free) if int(m.jnt_qposadr[j]) not in held)
 
+    @property
+    def tied(self) -> bool:
+        """Whether some joint follows others."""
+        return bool(self._laws) or bool(self._free and self._rows)
+
     def complete(self, qpos: torch.Tensor) -> torch.Tensor:
         """qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
         m, q = self.model, qpos.clone()

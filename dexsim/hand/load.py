@@ -59,6 +59,11 @@ def _file(which: str | Path) -> Path:
         return path.resolve()
     if text in (mine := _imported()):
         return (Path(IMPORTED) / text / FILE).resolve()
+    if text.startswith("menagerie:"):
+        name = text.partition(":")[2].replace("/", "_")
+        if name in mine:
+            return (Path(IMPORTED) / name / FILE).resolve()
+        raise UserError(f"hand={text}: not imported here yet: dexsim import-hand {text} out={IMPORTED}/{name}")
     names = list(dict.fromkeys((*known(), *mine)))
     near = difflib.get_close_matches(text, names, 1)
     raise UserError(

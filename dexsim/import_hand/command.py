@@ -9,7 +9,7 @@ from typing import Any
 from dexsim import typed, yaml_text
 from dexsim.errors import UserError
 
-USAGE = """usage: dexsim import-hand MODEL out=FOLDER [key=value ...]     MODEL: a URDF or MJCF file
+USAGE = """usage: dexsim import-hand MODEL out=FOLDER [key=value ...]  MODEL: URDF or MJCF file, or menagerie:NAME
        dexsim import-hand check FOLDER [key=value ...]
 
 Make a hand of a robot's file: find its palm, fingers and tips, guess the palm's frame, an open and a cupped pose, give
@@ -70,11 +70,12 @@ def main(argv: Sequence[str]) -> int:
     model, given, said = arguments(argv)
     if "out" not in given:
         raise UserError("say where to write: out=FOLDER, e.g. out=hands/mine")
+    from dexsim.import_hand import known
     from dexsim.import_hand.importing import import_hand
 
     out = Path(given["out"]).expanduser()
     result = import_hand(
-        Path(model).expanduser(), out, settings(given, said), say=lambda text: print(text, flush=True),
+        known.model(model), out, settings(given, said), say=lambda text: print(text, flush=True),
         picture=_yes(given.get("picture", "true")),
     )  # fmt: skip
     if result.corrected:

@@ -28,6 +28,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
+from dexsim.hand.couplings import Couplings
 from dexsim.recording.mechanism import (
     BEFORE,
     HEAVY,
@@ -356,6 +357,8 @@ def _batch(
     qpos[:, address] = servo.unmeasured(up(np.stack([w.q for w in worlds]))).cpu().numpy()
     qvel[:, dofs] = np.stack([w.v for w in worlds]) / scale
     servo.home.copy_(servo.unmeasured(up(np.stack([w.q if w.home is None else w.home for w in worlds]))))
+    ties = Couplings(engine.mjm, joints)
+    qpos = ties.complete(torch.as_tensor(qpos)).numpy() if ties.tied else qpos
     engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
     now = np.stack([w.target for w in worlds])
     servo.reset(None, up(now))

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import mujoco
 import mujoco.batch
 import numpy as np
+import torch
 
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.lines import on_lines
+from dexsim.hand.couplings import Couplings
 
 if TYPE_CHECKING:
     from dexsim.gap.read import Run
@@ -75,12 +77,23 @@ def along(
     bodies = np.array([model.jnt_bodyid[i] for i in ids])
     leaves = np.array([leaf_of(model, b) for b in bodies])
     places = _places(model, mujoco.MjData(model), ids, leaves)
-    seen = _evaluated(model, qadr, dadr, q, v)
-    full = _full(model, seen["M"])
-    acc = np.zeros((n, model.nv, 1))
-    acc[:, dadr, 0] = a
-    total, diag = (full @ acc)[:, dadr, 0], full[:, dadr, dadr]
-    bias, passive = seen["qfrc_bias"][:, dadr], seen["qfrc_spring"][:, dadr]
+    ties = Couplings(model, joints)
+    if ties.tied:  # what follows moves along: inertia and forces as the drives feel them
+        every = np.tile(model.qpos0, (n, 1))
+        every[:, qadr] = q
+        every = ties.complete(torch.as_tensor(every)).numpy()
+        moves = ties.motion(every[n // 2])  # [nv, J]; of laws that bend, at the middle of the run
+        seen = _evaluated(model, np.arange(model.nq), np.arange(model.nv), every, v @ moves.T)
+        full = moves.T @ _full(model, seen["M"]) @ moves
+        total, diag = (full @ a[:, :, None])[:, :, 0], full[:, np.arange(J), np.arange(J)]
+        bias, passive = seen["qfrc_bias"] @ moves, seen["qfrc_spring"] @ moves
+    else:
+        seen = _evaluated(model, qadr, dadr, q, v)
+        full = _full(model, seen["M"])
+        acc = np.zeros((n, model.nv, 1))
+        acc[:, dadr, 0] = a
+        total, diag = (full @ acc)[:, dadr, 0], full[:, dadr, dadr]
+        bias, passive = seen["qfrc_bias"][:, dadr], seen["qfrc_spring"][:, dadr]
     axis, anchor = seen["xaxis"][:, ids], seen["xanchor"][:, ids]
     com, point, own = seen["subtree_com"][:, bodies], seen["xipos"][:, leaves], seen["xipos"][:, bodies]
     turn = seen["xmat"][:, leaves].reshape(n, J, 3, 3)
