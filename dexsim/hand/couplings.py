@@ -7,6 +7,7 @@ asked for, so that no step begins with a constraint violated.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from dexsim.errors import UserError
 
 STEP = 1e-5  # rad or m, of differences
+CLOSE = 1e-9  # of a length: met
 SWEEPS = 30
 """Of projections onto the tendons' lengths; a finger's tendons share few joints."""
 
@@ -61,6 +63,7 @@ class Couplings:
                 self._rows.append((found, low, high))
                 held |= {int(a) for a in np.flatnonzero(found)}
         self._free = sorted({int(m.jnt_qposadr[j]) for j in free} & held)
+        self._kept: dict[tuple[torch.device, torch.dtype], tuple[Any, ...]] = {}
         self.loose = tuple(m.joint(j).name for j in sorted(free) if int(m.jnt_qposadr[j]) not in held)
 
     @property
@@ -78,29 +81,39 @@ class Couplings:
                 total = total * x + float(c)
             q[..., at] = m.qpos0[at] + total
         if self._free:
-            free = torch.as_tensor(self._free, device=q.device)
-            limits = _limits(m, self._free)
-            low, high = (torch.as_tensor(x, dtype=q.dtype, device=q.device) for x in limits.T)
-            q[..., free] = torch.minimum(torch.maximum(self._rest(q, free), low), high)
-            for _ in range(SWEEPS if self._rows else 0):
-                for coefficients, least, most in self._rows:
-                    a = torch.as_tensor(coefficients, dtype=q.dtype, device=q.device)
-                    b = a[free]
-                    if not bool((b != 0).any()):
-                        continue
+            free, rest, low, high, rows = self._tensors(q)
+            q[..., free] = rest.clamp(low, high)
+            for _ in range(SWEEPS if rows else 0):
+                most = 0.0
+                for a, b, least, largest in rows:
                     length = (q * a).sum(-1)
-                    miss = length.clamp(least, most) - length
-                    moved = q[..., free] + miss[..., None] * b / (b @ b)
-                    q[..., free] = torch.minimum(torch.maximum(moved, low), high)
+                    miss = length.clamp(least, largest) - length
+                    q[..., free] = (q[..., free] + miss[..., None] * b).clamp(low, high)
+                    most = max(most, float(miss.abs().max())) if q.device.type == "cpu" else 1.0
+                if most < CLOSE:  # nobody waits for a GPU to say so
+                    break
         return q
 
-    def _rest(self, q: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-        """Where springs would have the joints that tendons hold; where they are, of those without one."""
-        m, addresses = self.model, self._free
-        joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in addresses]
-        rest = torch.as_tensor(m.qpos_spring[addresses], dtype=q.dtype, device=q.device).expand_as(q[..., at])
-        sprung = torch.as_tensor(m.jnt_stiffness[joints] > 0, device=q.device)
-        return torch.where(sprung, rest, torch.as_tensor(m.qpos0[addresses], dtype=q.dtype, device=q.device))
+    def _tensors(self, q: torch.Tensor) -> tuple[Any, ...]:
+        """Addresses, rest and limits [F] of the joints that tendons hold, and a row a tendon: its coefficients [nq],
+        how the joints [F] share what its length misses, and its least and largest length. Kept: a recorded step must
+        find them on its device."""
+        key = (q.device, q.dtype)
+        if key not in self._kept:
+            m, at = self.model, self._free
+            joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in at]
+            limits = np.where(m.jnt_limited[joints, None], m.jnt_range[joints], [-np.inf, np.inf])
+            rest = np.where(m.jnt_stiffness[joints] > 0, m.qpos_spring[at], m.qpos0[at])
+
+            def to(x: np.ndarray) -> torch.Tensor:
+                return torch.as_tensor(x, dtype=q.dtype, device=q.device)
+
+            rows = [
+                (to(a), to(a[at] / (a[at] @ a[at])), low, high) for a, low, high in self._rows if np.abs(a[at]).any()
+            ]
+            free = torch.as_tensor(at, device=q.device)
+            self._kept[key] = free, to(rest), to(limits[:, 0]), to(limits[:, 1]), rows
+        return self._kept[key]
 
     def put(self, data: mujoco.MjData, values: np.ndarray) -> None:
         """Set the driven joints' positions [J] in qpos, and those of what follows them."""
@@ -133,11 +146,6 @@ class Couplings:
 
 def _one_dof(m: mujoco.MjModel, j: int) -> bool:
     return int(m.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-
-
-def _limits(m: mujoco.MjModel, addresses: list[int]) -> np.ndarray:
-    joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in addresses]
-    return np.where(m.jnt_limited[joints, None], m.jnt_range[joints], [-np.inf, np.inf])
 
 
 def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:
