@@ -41,6 +41,12 @@ def hand_signals() -> dict[int, str]:
     return stop_signals() | {int(number): name for number, name in found.items() if number is not None}
 
 
+def leave_terminal() -> None:
+    """Take this process out of the reach of the terminal's keys."""
+    if hasattr(os, "setsid"):
+        os.setsid()
+
+
 def terminal_gone(number: int) -> bool:
     """Return whether a signal says that nobody reads what is printed any more."""
     return number in (getattr(signal, "SIGHUP", None), getattr(signal, "SIGBREAK", None))

@@ -349,8 +349,7 @@ def _child(
     make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, output: str
 ) -> None:
     """The child's process: no key of the loop's terminal reaches the one that holds the hand."""
-    if hasattr(os, "setsid"):
-        os.setsid()
+    system.leave_terminal()
     for number in system.hand_signals():
         signal.signal(number, signal.SIG_IGN)
     lives = multiprocessing.parent_process().is_alive  # type: ignore[union-attr]  # this is a child
