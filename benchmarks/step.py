@@ -1,4 +1,4 @@
-"""What a control step costs beside bare physics of the same scene, in one run.
+"""Cost of a control step beside bare physics of the same scene, in one run.
 
     python -m benchmarks.step [worlds=8192] [steps=40] [rounds=3] [any other setting of train.py]
 

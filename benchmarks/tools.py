@@ -1,4 +1,4 @@
-"""What the benchmarks share: their arguments, the environment in a closed grasp, clocks, and the printout."""
+"""Helpers of the benchmarks: their arguments, the environment in a closed grasp, clocks, and the printout."""
 
 from __future__ import annotations
 

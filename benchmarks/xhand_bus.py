@@ -1,4 +1,4 @@
-"""What the bus costs a policy: included bundles on the simulated hand by itself, and behind the xHand's own driver on
+"""Cost of the bus to a policy: included bundles on the simulated hand by itself, and behind the xHand's own driver on
 the strict fake of the vendor's package (cycles of 9.6 ms with their tail, 0.5 % CRC errors with their pauses, encoders
 that jitter, one dead taxel board), with the same seeds and objects.
 

@@ -42,7 +42,7 @@ def test_pushes_are_told_with_when_and_how_hard():
 @pytest.mark.parametrize("size", [3.0, 6.0])
 @pytest.mark.parametrize("cogging", [0.0, 0.08])
 def test_the_size_of_a_push_lies_inside_its_interval(size, cogging):
-    """Of a steady push: the largest sample is not its size. At its edges the torque's filter swings over by an eighth,
+    """For a steady push: the largest sample is not its size. At its edges the torque's filter swings over by an eighth,
     and the body is not exactly what the fit can say."""
     model, true = arm(), []
     steady = lambda t: size * np.any([(t > a) & (t < b) for a, b in SPANS], 0)  # noqa: E731

@@ -550,7 +550,7 @@ def test_what_was_held_out_surely_shows_is_doubted_only():
 
 
 def test_moments_that_nothing_follows_do_not_speak():
-    """Of 20 half seconds some are missed far beyond the noise without an effect, and nearly so with it."""
+    """Among 20 half seconds some are missed far beyond the noise without an effect, and nearly so with it."""
 
     def silent(count: int, missed: float, differs: float) -> bool:
         squares, t = np.ones(200), 0.05 * np.arange(200)
@@ -1043,7 +1043,7 @@ TESTS = {k: v for file in FILES for k, v in vars(file).items()} | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():
-    """Of 40 windows of four runs: the one that saturates is kept, and of the run that is fastest all along three."""
+    """Among 40 windows of four runs: the one that saturates is kept, and of the run that is fastest all along three."""
     count, rows = 40, 10
     sample_window = np.repeat(np.arange(count), rows)
     run = np.arange(count) // 10

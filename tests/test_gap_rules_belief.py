@@ -45,7 +45,7 @@ def test_what_holds_a_joint_gives_a_little():
 
 
 def test_sensors_have_zeros():
-    """Of encoders with counts of 1 mrad, and of a reading of the effort at a limit of 2 N.m."""
+    """For encoders with counts of 1 mrad, and of a reading of the effort at a limit of 2 N.m."""
     drive = SimpleNamespace(nominal={"torque_limit": 2.0}, tau=1.0)
     scales = SimpleNamespace(apart=True, effort_zero=Scales.effort_zero.fget(drive))
     case = SimpleNamespace(scales=scales, quantum=1e-3, sigma=1e-4, sigma_torque=0.1)

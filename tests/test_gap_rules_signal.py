@@ -95,7 +95,7 @@ def smooth(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def test_a_lead_is_told_by_a_clear_correlation():
-    """Of a joint that is 0.1 s ahead of its target: with as much, or twice as much, of another motion beside it; or
+    """For a joint that is 0.1 s ahead of its target: with as much, or twice as much, of another motion beside it; or
     swinging, where a lag of almost a period fits nearly as well as the lead does."""
     rng = np.random.default_rng(0)
     target, other = smooth(rng, 4020), smooth(rng, 4000)

@@ -68,7 +68,7 @@ def test_touch_is_or_is_not():
 
 @pytest.mark.parametrize(("pads", "commands"), [(5, 1), (0, 1), (5, 2)])
 def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
-    """Of a hand at rest that presses one taxel with 10 counts."""
+    """For a hand at rest that presses one taxel with 10 counts."""
     table, at = [], 0
     for name, width, *_ in observations.rows(12, 5, pads, commands):
         table.append({"name": name, "start": at, "stop": at + width})

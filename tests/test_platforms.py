@@ -22,7 +22,7 @@ ONLY_HERE = (
     "SIGHUP", "sched_getaffinity", "register_at_fork", "sysconf", "statvfs", "fcntl", "osmesa", "/dev/shm", "getppid",
     "os.kill(", "sys.platform", "import resource", "import pwd", "os.fork", "killpg", "setsid",
 )  # fmt: skip
-"""Of one system, or different between them."""
+"""For one system, or different between them."""
 
 
 def run(name: str, folder: Path, *commands: list[str]) -> subprocess.CompletedProcess:

@@ -444,7 +444,7 @@ def test_set_is_large_and_covers_sizes():
 
 @pytest.mark.slow
 def test_poses_hold():
-    """Of 96 saved poses, in worlds with other masses, frictions and drives, nearly all lie still for two seconds
+    """Among 96 saved poses, in worlds with other masses, frictions and drives, nearly all lie still for two seconds
     without an action; none falls."""
     env = make(worlds=96, seed=5)
     env.in_order = True

@@ -50,7 +50,7 @@ def play(env, seconds: float):
 
 
 def test_starts_are_held_by_fingertips_whatever_the_palm():
-    """Of 24 starts, each in a world of its own with its palm up, sideways or down, at least 20 hold for a second."""
+    """Among 24 starts, each in a world of its own with its palm up, sideways or down, at least 20 hold for a second."""
     env = make(*STILL, worlds=24)
     env.in_order = True
     env.grasps = env.grasps[torch.arange(0, len(env.grasps), len(env.grasps) // 24)[:24]]

@@ -126,7 +126,7 @@ def alive(group: int) -> bool:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_it_leaves_no_process_behind_where_it_is_ended(number, tmp_path):
-    """Of two parts one ends when it is asked, the other ignores it and has a child that does; what came is judged."""
+    """One of two parts ends when it is asked, the other ignores it and has a child that does; what came is judged."""
     stubborn = """
 import signal, subprocess, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

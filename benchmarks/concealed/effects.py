@@ -1,4 +1,4 @@
-"""What can be hidden in a concealed rig: how the plant gets it, what `diagnosis.json` should say of it, where it
+"""Effects that a concealed rig can hide: how the plant gets it, what `diagnosis.json` should say of it, where it
 acts."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the converters share: a recording from arrays; and what the checks by NumPy do: a fit."""
+"""Helpers of the converters: a recording from arrays; and what the checks by NumPy do: a fit."""
 
 from __future__ import annotations
 

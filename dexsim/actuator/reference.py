@@ -19,7 +19,7 @@ Numbers = float | np.ndarray
 
 @dataclass
 class Step:
-    """What a law with memory is given beside what it acts on; it writes what it will remember.
+    """Inputs of a law with memory beside what it acts on; it writes what it will remember.
 
     dt: of the step [s]; fresh [...]: nothing is remembered yet; memory: numbers [...] by their names in
     `columns.MEMORY`."""

@@ -283,7 +283,7 @@ class Servo:
 
     @property
     def at_rotor(self) -> bool:
-        """Whether some encoder reports a rotor before a play: `position` is then more than `measured` of the joints."""
+        """True if some encoder reports a rotor before a play: `position` is then more than `measured` of the joints."""
         return self._position_motor is not None and "play" in self.features
 
     def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""What is believed of a mechanism's drives: the `servo.yaml` format, read, checked, resolved per joint, written back.
+"""Nominal values of a mechanism's drives: the `servo.yaml` format, read, checked, resolved per joint, written back.
 
     drive: torque                  # or voltage
     joints:

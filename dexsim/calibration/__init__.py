@@ -1,1 +1,1 @@
-"""What a hand's currents and taxel counts mean: fits from press recordings, and the file that deployment reads."""
+"""Calibration of a hand's currents and taxel counts: fits from press recordings, and the file that deployment reads."""

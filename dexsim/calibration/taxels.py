@@ -19,7 +19,7 @@ AT_ONCE = 6  # taxels that answer together where something presses; noise wakes 
 
 @dataclass
 class Pad:
-    """What was found of one pad. threshold: a reading at or under it may be noise (readings' unit); bias [K]; rows: of
+    """Results for one pad. threshold: a reading at or under it may be noise (readings' unit); bias [K]; rows: of
     the lattice; dead, swapped; unseen: taxels that nothing pressed, of which nothing is known; gain [K] or None without
     a load; held_out: error of the load by these gains on presses that were not fitted, over the mean load (and with
     equal gains); hysteresis: of force against load. notes: in words."""

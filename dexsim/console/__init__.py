@@ -1,2 +1,2 @@
-"""What every command shares, whichever package it stands in: how it ends, what it is called, tables, progress, output
+"""Helpers of every command, whichever package it stands in: how it ends, what it is called, tables, progress, output
 folders."""

@@ -1,4 +1,4 @@
-"""What a user typed to get here, so that help pages and hints name commands that work for them."""
+"""The command that a user typed to get here, so that help pages and hints name commands that work for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the parts of a checkpoint must be: types, sizes and finite weights, told in one line where one is not."""
+"""Checks of the parts of a checkpoint: types, sizes and finite weights, told in one line where one is not."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ class Ranks:
 
     @property
     def several(self) -> bool:
-        """Whether there are others to talk to now."""
+        """True if there are others to talk to now."""
         return self._lifeline is not None
 
     def on_loss(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""What MuJoCo-Warp leaves of its forces: contact forces of named pairs, summed from its contact list, and what a dof
+"""Forces out of MuJoCo-Warp's results: contact forces of named pairs, summed from its contact list, and what a dof
 felt from outside."""
 
 from __future__ import annotations

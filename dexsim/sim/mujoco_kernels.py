@@ -1,4 +1,4 @@
-"""What C MuJoCo's batch does not hand out by itself, as Warp kernels on its arrays: poses alone, contact forces,
+"""Results that C MuJoCo's batch does not return by itself, as Warp kernels on its arrays: poses alone, contact forces,
 flags."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.

@@ -29,7 +29,7 @@ def turn_down(gravity: np.ndarray) -> np.ndarray:
 
 
 class Decor:
-    """What is drawn beside one world's model.
+    """Decoration of one world's scene.
 
     Args:
         model: compiled model; its first body below the world is the hand.

@@ -40,7 +40,7 @@ FULL_TAXEL = 0.25  # N, darkest colour until more was felt
 
 @dataclass
 class Wishes:
-    """What the page asked for; read and cleared by the loop."""
+    """Requests of the page; read and cleared by the loop."""
 
     pause: bool = False
     steps: int = 0
@@ -110,7 +110,7 @@ class LiveView:
 
     @property
     def token(self) -> str:
-        """What the address must carry as ?token=..., '' where it is served on this machine only."""
+        """The token that the address must carry as ?token=..., '' where it is served on this machine only."""
         return self.gate.token
 
     # -- the page

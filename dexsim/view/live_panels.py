@@ -1,4 +1,4 @@
-"""What the live view shows beside the scene: taxel maps as an image, forces, rewards and facts as HTML. No server in
+"""Panels of the live view beside the scene: taxel maps as an image, forces, rewards and facts as HTML. No server in
 here."""
 
 from __future__ import annotations

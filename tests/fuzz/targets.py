@@ -1,4 +1,4 @@
-"""What is done with a damaged file: read, and used as far as the program uses it before any long work."""
+"""Uses of a damaged file: read, and used as far as the program uses it before any long work."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def test_any_name_of_a_column(text):
 
 
 def test_a_crash_ends_its_case_alone(tmp_path, monkeypatch, capfd):
-    """Of eight cases in batches of four one ends its process and one raises: six are fine, and each is said."""
+    """Among eight cases in batches of four one ends its process and one raises: six are fine, and each is said."""
 
     def one(kind, seed, files, folder):
         if seed == 1:

@@ -180,7 +180,7 @@ def known(name: int, a: Core, b: Core) -> bool:
 
 @wp.struct
 class Pairs:
-    """What the broad phase found, MuJoCo-Warp's shapes, and what is kept of each pair between steps.
+    """Results of the broad phase, MuJoCo-Warp's shapes, and what is kept of each pair between steps.
 
     geom_size, geom_dataid, geom_xpos, geom_xmat: as in MuJoCo-Warp. room: most pairs. number: pairs found. geom, id,
     world: of each. hull_first, hull_count [nmesh], hull [n]: corners of each mesh's convex hull. slot [ngeom, ngeom]:

@@ -12,7 +12,7 @@ from dexsim.sim.solver.source import LANES, text
 
 @wp.struct
 class Problem:
-    """What there is to solve, in MuJoCo-Warp's arrays: N worlds of V dofs and up to R rows, C contacts in all; M has E
+    """The problem to solve, in MuJoCo-Warp's arrays: N worlds of V dofs and up to R rows, C contacts in all; M has E
     entries, a Jacobian up to Z. Units are those of a slide; a hinge has N.m, kg.m2 and rad/s2. [N or 1]: 1 where all
     worlds have the same."""
 
@@ -45,7 +45,7 @@ class Problem:
 
 @wp.struct
 class Solution:
-    """What a solve leaves behind (out), in the same."""
+    """Results of a solve (out), in the same."""
 
     qacc: wp.array2d(dtype=float)  # [N, V] m/s2
     Ma: wp.array2d(dtype=float)  # [N, V] N
