@@ -48,7 +48,8 @@ def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
 
 
 @pytest.mark.parametrize(
-    "argv, said", [(["wrlds=1,2"], "wrlds"), (["task=grsp,grasp"], "grsp"), (["seed=1,2", "out=x"], "sweep=FOLDER")]
+    "argv, said", [(["wrlds=1,2"], "wrlds"), (["task=grsp,grasp"], "grsp"), (["seed=1,2", "out=x"], "sweep=FOLDER"),
+                   (["seed=1,2", "hydra/launcher=joblib"], "on=local at_once=8"), (["seed=1", "on=x"], "must be local")]
 )
 def test_a_slip_is_one_line(argv, said, script, tmp_path):
     with pytest.raises(UserError, match=said) as error:

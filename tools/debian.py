@@ -11,10 +11,12 @@ import json
 import os
 import re
 import shutil
+import string
 import subprocess
 import sys
 from pathlib import Path
 
+CERTIFICATES = "/etc/ssl/certs/ca-certificates.crt"
 SOURCE = Path(__file__).resolve().parents[1]
 
 
@@ -47,10 +49,10 @@ def main(argv: list[str]) -> int:
                 release = re.fullmatch(r"debian:(\w+)-slim", rest)[1]
                 subprocess.run(["debootstrap", "--variant=minbase", release, root], check=True,
                                stdout=subprocess.DEVNULL)  # fmt: skip
-                for name in ("/etc/resolv.conf", "/etc/ssl/certs/ca-certificates.crt"):
-                    if Path(name).is_file():
-                        (root / name[1:]).parent.mkdir(parents=True, exist_ok=True)
-                        shutil.copy(name, root / name[1:])
+                shutil.copy("/etc/resolv.conf", root / "etc")
+                if Path(CERTIFICATES).is_file():  # whom this machine trusts: it may stand behind a proxy
+                    shutil.copy(CERTIFICATES, root / "host.crt")
+                    env |= {"PIP_CERT": "/host.crt", "SSL_CERT_FILE": "/host.crt"}
                 for place in ("proc", "dev"):
                     subprocess.run(["mount", "--rbind", f"/{place}", root / place], check=True)
                 if links:
@@ -63,7 +65,7 @@ def main(argv: list[str]) -> int:
                 env[name] = given.get(name, value)
             elif word == "ENV":
                 name, _, value = rest.partition("=")
-                env[name] = re.sub(r"\$(\w+)", lambda m: env[m[1]], value)
+                env[name] = string.Template(value).substitute(env)
             elif word == "WORKDIR":
                 folder = rest
                 (root / folder[1:]).mkdir(parents=True, exist_ok=True)

@@ -35,6 +35,8 @@ def run(argv: list[str], config_dir: Path, program: Sequence[str] = PROGRAM) -> 
     `sweep=FOLDER`.
     """
     engine, argv = jobs.taken([a for a in argv if a not in FLAGS], [] if "device=cpu" in argv else _cuda())
+    if launcher := next((a for a in argv if a.startswith(("hydra/launcher", "hydra.launcher"))), None):
+        raise UserError(f"{launcher}: jobs run by on=local at_once=8, on=slurm or on=dask (docs/howto/gpus.md)")
     for name in ("out", "run"):
         if any(a.startswith(f"{name}=") for a in argv):
             raise UserError(
