@@ -9,10 +9,10 @@ import pytest
 import recordings
 
 from dexsim.errors import UserError
+from dexsim.gap.audit import main
 from dexsim.gap.read import inputs
 from dexsim.recording import Series, audit_time, mechanism, read, write
 from dexsim.recording.audit import KINDS, audit, table
-from dexsim.recording.command import main
 from dexsim.recording.schema import COMMANDS, DUTY
 
 

@@ -39,7 +39,7 @@ COMMANDS: dict[str, Command] = {
     "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
     "record": Command("dexsim.cli.record:main", "record a robot over ROS 2"),
-    "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
+    "audit": Command("dexsim.gap.audit:main", "say what is in recordings, what is wrong with them, what they can tell"),
     "convert": Command("dexsim.recording.convert:main", "write a log (CSV, NPZ, a bag) as a recording"),
     "import-hand": Command("dexsim.import_hand.command:main", "make a hand of a robot's URDF or MJCF file"),
     "import-object": Command("dexsim.import_object:main", "make an object to grasp of a mesh file"),

@@ -137,6 +137,6 @@ def summary(r: Recording) -> str:
 
 if __name__ == "__main__":  # python -m dexsim.recording.audit FILE
     from dexsim.console.ending import guard
-    from dexsim.recording.command import main
+    from dexsim.gap.audit import main
 
     sys.exit(guard(main, sys.argv[1:]))

@@ -1,0 +1,264 @@
+"""`dexsim audit FILE ...`: what is in recordings, what is wrong with them, and what a diagnosis could tell from them,
+before a search of minutes.
+
+Beside the reader's audit of each recording: the signals that `diagnose` would find wrong, judged over all of them; of
+each joint the rate at which it was really read, its quantum, how it moves and follows; how well repeats of the same
+commands agree, by motion; and the command to run next.
+"""
+
+from __future__ import annotations
+
+import copy
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dexsim.console.tables import table as columns_of
+from dexsim.gap.plant.case import noise
+from dexsim.gap.read import Run, channels, inputs, same_commands
+from dexsim.recording.arguments import read_arguments
+from dexsim.recording.audit import KINDS, summary, table
+from dexsim.recording.audit_time import command_lead
+from dexsim.recording.mechanism import Mechanism, mechanism
+from dexsim.recording.reader import read
+from dexsim.recording.schema import STATES, Finding, Recording
+
+HELP = """usage: dexsim audit FILE ... [model=FILE] [servo=FILE] [units.QUANTITY=UNIT ...] [remap.OURS=THEIRS ...]
+                    [meta.KEY=VALUE ...]
+
+Say what is in recordings (MCAP, a ROS 2 bag's folder, CSV or NPZ with named columns, episodes of a LeRobot, Zarr or
+HDF5 data set), what is wrong with them, and what a diagnosis could tell from them. FILE may be a pattern. model=,
+servo=: of the mechanism, for its joints and their ranges.
+
+examples:
+  dexsim audit a.mcap remap./joint_states=/xhand/state
+  dexsim audit 'logs/*.csv' units.position=deg model=rig.xml
+
+kinds of findings:
+"""
+MORE = {
+    "stale": "a position that is read more seldom than it is logged, or sent again",
+    "repeats_disagree": "recordings of the same commands that differ by far more than their noise",
+}
+"""Kinds that only the diagnosis' own reading shows."""
+APART, OF_SPAN = 5.0, 0.01
+"""x the noise of a sample, and of the motion's span: repeats that differ by more disagree."""
+REVERSALS, STEPS, STILL = 4, 3, 6.0
+"""Fewer reversals, or steps of a target, tell little; a joint that moves by less than so many times its noise rests."""
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Recordings of the same commands. names: theirs; apart: by joint, rms by which two of them differ, over the square
+    root of two [rad]; noise: of a sample; worst: by joint, when they differ most [s since their start] and by how
+    much."""
+
+    names: tuple[str, ...]
+    apart: dict[str, float]
+    noise: dict[str, float]
+    worst: dict[str, tuple[float, float]]
+    span: dict[str, float]
+
+    def disagree(self, joint: str) -> bool:
+        """Whether they differ by far more than noise."""
+        return self.apart[joint] > max(APART * self.noise[joint], OF_SPAN * self.span[joint])
+
+
+def repeats(runs: Sequence[Run]) -> list[Repeats]:
+    """Recordings of the same commands, motion by motion: the floor of each."""
+    groups: list[list[Run]] = []
+    for run in runs:
+        mine = next((g for g in groups if same_commands(g[0], run)), None)
+        if mine is None:
+            groups.append([run])
+        else:
+            mine.append(run)
+    return [_apart(g) for g in groups if len(g) > 1]
+
+
+def _apart(group: Sequence[Run]) -> Repeats:
+    t = np.arange(0.2, min(r.duration for r in group) - 0.05, 0.01)
+    apart, level, worst, span = {}, {}, {}, {}
+    for j, joint in enumerate(group[0].joints):
+        lines = [np.interp(r.t[0] + t, *r.readings(j)) for r in group]
+        squares = np.mean([(a - b) ** 2 for i, a in enumerate(lines) for b in lines[i + 1 :]], 0) / 2
+        apart[joint] = float(np.sqrt(squares.mean())) if len(t) else 0.0
+        level[joint] = float(np.median([noise(*r.readings(j))[0] for r in group]))
+        k = int(np.argmax(squares)) if len(t) else 0
+        worst[joint] = (float(t[k]), float(np.sqrt(2 * squares[k]))) if len(t) else (0.0, 0.0)
+        span[joint] = float(np.ptp(lines[0])) if len(t) else 0.0
+    return Repeats(tuple(r.name for r in group), apart, level, worst, span)
+
+
+def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], dict[str, list[Finding]]]:
+    """(the recordings as a diagnosis takes them, what it would say of their signals by recording). A recording that
+    cannot be used is left out, with the reason."""
+    runs: list[Run] = []
+    out: dict[str, list[Finding]] = {r.path.name: [] for r in recordings}
+    for r in recordings:
+        try:
+            runs.append(inputs.to_run(r, m, []))
+        except inputs.Unusable as error:
+            out[r.path.name].append(Finding("damage", "", float("nan"), 1, f"{error}", "error"))
+    known = channels.spoiled(list(recordings), channels.driven_openly(runs))
+    found, _, _ = channels.inspect([copy.copy(r) for r in runs], m.spec.compile(), known)  # which takes samples out
+    for f in found:
+        kind, _, text = f["regime"].partition(": ")
+        kind = {"sign": "sign_mismatch"}.get(kind, kind)
+        severity = "warning" if kind == "stale" or f["confidence"] < 0.5 else "error"
+        for name in dict.fromkeys(w["recording"] for w in f["when"]):
+            when = [w for w in f["when"] if w["recording"] == name]
+            joint = (f["where"]["joints"] or [""])[0]
+            topic = (f["where"]["topics"] or [""])[0]
+            out[name].append(Finding(kind, topic, when[0]["start"], len(when), text, severity, joint, when[-1]["end"]))
+    for group in repeats(runs):
+        for joint in group.apart:
+            if group.disagree(joint):
+                at, by = group.worst[joint]
+                text = (
+                    f"{joint}: {len(group.names)} recordings of the same commands ({', '.join(group.names)}) differ by "
+                    f"{1e3 * group.apart[joint]:.3g} mrad, {group.apart[joint] / group.noise[joint]:.0f} x a sample's "
+                    f"noise; most at {at:.2f} s, by {1e3 * by:.3g}"
+                )
+                found_of = Finding("repeats_disagree", STATES, at, len(group.names), text, "warning", joint)
+                out[group.names[0]].append(found_of)
+    return runs, out
+
+
+def carries(recordings: Sequence[Recording], runs: Sequence[Run]) -> str:
+    """What a diagnosis could tell from recordings: a row a joint; where repeats agree, motion by motion."""
+    rows = []
+    for joint in dict.fromkeys(j for r in runs for j in r.joints):
+        mine = [(r, r.joints.index(joint)) for r in runs if joint in r.joints]
+        levels = [noise(*r.readings(j)) for r, j in mine]
+        sigma, quantum = (float(np.median([x[k] for x in levels])) for k in (0, 1))
+        slow = channels.common_rhythm(list(runs), joint)
+        logged = float(np.median([np.median(np.diff(r.readings(j)[0])) for r, j in mine]))
+        span, speed, turns, jumps = 0.0, 0.0, 0, 0
+        for r, j in mine:
+            r.smooth()
+            v = r.vs[:, j]
+            span = max(span, float(np.ptp(r.qs[:, j])))
+            speed = max(speed, float(np.quantile(np.abs(v), 0.99)))
+            fast = np.sign(v[np.abs(v) > 0.1 * max(float(np.abs(v).max()), 1e-9)])
+            turns += int((np.diff(fast) != 0).sum())
+            c = np.abs(np.diff(r.cmd[:, j]))
+            jumps += int((c > max(0.1 * float(np.ptp(r.cmd[:, j])), 0.02)).sum())
+        lags = [lead for x in recordings if joint in x.joints and (lead := command_lead(_only(x, joint))) is not None]
+        late = f"{-1e3 * float(np.median(lags)):.0f}" if lags else "-"
+        blind = []
+        if span < STILL * sigma:
+            blind = ["it hardly moves: nothing"]
+        else:
+            if turns < REVERSALS:
+                blind.append("friction, play (few reversals)")
+            if jumps < STEPS and speed * 0.005 < 2 * sigma:
+                blind.append("delay, lag (no step, and slow)")
+            if speed < 0.3:
+                blind.append("limits, viscous friction (slow)")
+        every = f"{1e3 * slow:.3g} (logged {1e3 * logged:.3g})" if slow > 1.5 * logged else f"{1e3 * logged:.3g}"
+        rows.append((joint, every, f"{1e3 * quantum:.3g}" if quantum else "-", f"{1e3 * sigma:.3g}", f"{span:.3g}",
+                     f"{speed:.3g}", str(turns), str(jumps), late, "; ".join(blind) or "-"))  # fmt: skip
+    head = ("joint", "read every ms", "quantum mrad", "noise mrad", "span rad", "speed rad/s", "reversals", "steps",
+            "lag ms", "not to be told")  # fmt: skip
+    out = columns_of("what they carry", head, rows)
+    groups = repeats(runs)
+    if groups:
+        apart = [(", ".join(g.names), j, f"{1e3 * g.apart[j]:.3g}", f"{1e3 * g.noise[j]:.3g}", f"{g.worst[j][0]:.2f}",
+                 f"{1e3 * g.worst[j][1]:.3g}") for g in groups for j in g.apart]  # fmt: skip
+        out += "\n\n" + columns_of(
+            "repeats of the same commands, motion by motion",
+            ("recordings", "joint", "apart mrad", "noise mrad", "most at s", "by mrad"), apart)  # fmt: skip
+    elif len(runs) > 1:
+        out += "\n\nno two recordings have the same commands: what repeats differ by is not known"
+    return out
+
+
+def _only(r: Recording, joint: str) -> Recording:
+    return next(p for p in r.parts() if joint in p.joints)._of([_place(r, joint)])
+
+
+def _place(r: Recording, joint: str) -> int:
+    return next(p.joints.index(joint) for p in r.parts() if joint in p.joints)
+
+
+def of_names(joints: Sequence[str]) -> Mechanism:
+    """A mechanism of joints of which nothing is known."""
+    bodies = "".join(
+        f'<body><joint name="{j}" axis="0 1 0"/><geom size=".01" mass=".1" contype="0" conaffinity="0"/></body>'
+        for j in map(_quoted, joints)
+    )
+    from dexsim.actuator.table import ServoTable
+
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    return Mechanism(spec, tuple(joints), ServoTable.from_dict({"joints": {"*": {"kp": 1.0}}}), "unknown")
+
+
+def _quoted(text: str) -> str:
+    for a, b in (("&", "&amp;"), ('"', "&quot;"), ("<", "&lt;")):
+        text = text.replace(a, b)
+    return text
+
+
+def next_command(paths: Sequence[str], own: dict[str, str], rest: Sequence[str]) -> str:
+    """The `dexsim diagnose` to run next, as it is typed."""
+    recordings = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
+    of = [f"model={own.get('model', 'MODEL.xml')}", f"servo={own.get('servo', 'SERVO.yaml')}"]
+    words = [f"recordings={recordings}", *of, *rest, "out=out/diagnosis"]
+    return "dexsim diagnose " + " ".join(shlex.quote(w) for w in words)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print what is in recordings and what is wrong with them; status 1 where a channel cannot be used as it is."""
+    if not argv or argv[0] in ("-h", "--help"):
+        print(HELP + "\n".join(f"  {kind:<20}{text}" for kind, text in (KINDS | MORE).items()))
+        return 0 if argv else 2
+    own = {k: v for k, _, v in (a.partition("=") for a in argv) if k in ("model", "servo")}
+    rest = [a for a in argv if a.partition("=")[0] not in own]
+    given, remap, meta = read_arguments(rest)
+    known = mechanism(own.get("model"), own.get("servo") or {}) if own.get("model") else None
+    recordings, worst = [], 0
+    for path in inputs.files(given, "audit"):
+        of = (None, None) if known is None else (known.joints, known.ranges)
+        recording = read(path, remap, meta, joints=of[0], limits=of[1])
+        recording.path = Path(path.name)
+        recordings.append((path, recording))
+    joints = tuple(dict.fromkeys(j for _, r in recordings for j in r.joints))
+    runs: list[Run] = []
+    said: dict[str, list[Finding]] = {}
+    if joints and any(len(r.commands) and len(r.states.position) for _, r in recordings):
+        runs, said = findings([r for _, r in recordings], known or of_names(joints))
+    for path, recording in recordings:
+        found = [*recording.findings, *_new(said.get(path.name, []), recording.findings)]
+        recording.path = path
+        print(summary(recording) + "\n")
+        print(table(_gathered(found)) + "\n")
+        worst = max(worst, int(any(f.severity == "error" for f in found)))
+    if runs:
+        print(carries([r for _, r in recordings], runs) + "\n")
+        options = [a for a in rest if a not in given]
+        print(f"next: {next_command(given, own, options)}")
+        if not own.get("model"):
+            print("  (model= and servo=: the mechanism and what is believed of its drives; the xHand's where left out)")
+    return worst
+
+
+def _new(more: Sequence[Finding], known: Sequence[Finding]) -> list[Finding]:
+    """Findings of which the reader's audit does not say the like already."""
+    there = {(f.kind, f.joint) for f in known if f.severity == "error"} | {(f.kind, "") for f in known if not f.joint}
+    return [f for f in more if (f.kind, f.joint) not in there and (f.kind, "") not in there]
+
+
+def _gathered(found: Sequence[Finding]) -> list[Finding]:
+    """Findings with the defaults that hold in one line."""
+    plain = [f for f in found if f.kind == "missing_metadata" and f.severity == "info"]
+    rest = [f for f in found if f not in plain]
+    if len(plain) < 2:
+        return list(found)
+    keys = ", ".join(f.text.split(" ")[0] for f in plain)
+    text = f"not stated, usual values are assumed: {keys} (state them with meta.KEY=...)"
+    return [*rest, Finding("missing_metadata", "", float("nan"), len(plain), text, "info")]
