@@ -55,7 +55,7 @@ _inside = False
 
 def call(function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0) -> T:
     """`function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size: bytes of
-    the file, with which the limits grow; patience: what they are multiplied with, where more than reading is done.
+    the file, with which the limits grow; patience: multiplies the processor time, where more than reading is done.
     Raises UserError."""
     return _run(function, args, what, size, True, patience)
 
@@ -74,7 +74,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     if _inside:  # within a reader's limits already
         return function(*args)
     times = _times()
-    seconds = times * patience * (SECONDS + SECONDS_A_MIB * size / 2**20)
+    seconds = times * (patience * SECONDS + SECONDS_A_MIB * size / 2**20)
     most = int(times * (BYTES + TIMES_SIZE * size))
     context: Any = multiprocessing.get_context(system.start_method())
     receive, send = context.Pipe(False)

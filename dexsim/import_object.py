@@ -11,7 +11,7 @@ import numpy as np
 
 from dexsim import files, outputs, typed
 from dexsim.assets.objects import own
-from dexsim.assets.objects.mesh import MOST_PARTS
+from dexsim.assets.objects.mesh import MOST_PARTS, surface
 from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
 
@@ -98,15 +98,13 @@ def hull_obj(points: np.ndarray) -> str:
 
 def draw(shape: Shape, mesh: Path, picture: Path) -> None:
     """The mesh, its convex parts in colours, and the distance grid cut through its middle."""
-    import trimesh
     from matplotlib import colormaps
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
     from scipy.spatial import ConvexHull
 
     assert shape.grid is not None
-    whole: trimesh.Trimesh = trimesh.load(mesh, force="mesh")  # type: ignore[assignment]  # what `force` asks for
-    triangles = (whole.triangles * shape.file_scale - shape.file_centre) @ shape.file_axes
+    triangles = (surface(mesh, shape.file_scale)[0] - shape.file_centre) @ shape.file_axes
     light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
     figure = Figure(figsize=(13, 4.6), dpi=90, layout="constrained")
 

@@ -123,10 +123,10 @@ def _said(path: Path) -> Any:
 def beside(path: Path) -> str:
     """As the metadata file beside a recording."""
     path = path.rename(path.with_name("case.mcap.yaml"))
-    stated, _, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
+    stated, units, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
     metadata.complete(stated, True, True)
     said = {key: metadata._text(value) for key, value in (_said(path) or {}).items()}
-    return silence.of_settings(said, stated)
+    return silence.of_settings(said, stated | {f"{key}_unit": unit for key, unit in units.items()})
 
 
 def config(path: Path) -> str:

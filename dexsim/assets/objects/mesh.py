@@ -44,7 +44,6 @@ def _named(scale: float) -> str:
 
 
 def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
-    """Triangles [T, 3, 3] (m) of a closed surface, outward, and notes; `UserError` names what is wrong."""
     import trimesh
 
     try:
@@ -147,10 +146,16 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
         )
     if not (np.isfinite(scale) and scale > 0):
         raise UserError(f"mesh {paths[0]}: scale={scale}, must be a positive number; 0.001 for a file in millimetres")
-    sizes = [files.check(p, MOST_BYTES, "mesh") for p in paths]
-    surfaces = [guard.call(_read, p, scale, what=f"mesh {p}", size=n) for p, n in zip(paths, sizes, strict=True)]
-    what = f"mesh {paths[0]}"
-    return guard.call(_made, paths, surfaces, scale, parts, single, what=what, size=sum(sizes), patience=PATIENCE)
+    surfaces = [surface(p, scale) for p in paths]
+    size = sum(t.nbytes for t, _ in surfaces)
+    given = paths, surfaces, scale, parts, single
+    return guard.call(_made, *given, what=f"mesh {paths[0]}", size=size, patience=PATIENCE)
+
+
+def surface(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
+    """Triangles [T, 3, 3] (m) of the closed surface in a mesh file, outward, and notes. Raises UserError for what is
+    wrong with it."""
+    return guard.call(_read, path, scale, what=f"mesh {path}", size=files.check(path, MOST_BYTES, "mesh"))
 
 
 def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: int, single: bool) -> Shape:

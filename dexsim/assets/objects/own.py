@@ -36,6 +36,11 @@ def named(objects: Mapping[str, Any]) -> dict[str, Shape]:
     from dexsim.assets.objects import library
 
     known, out = library(), {}
+    for key in ("train", "held_out"):
+        if not isinstance(objects[key], (list, tuple)) or not all(isinstance(name, str) for name in objects[key]):
+            raise UserError(f"task.objects.{key}={objects[key]}: must be a list of names, e.g. [box,sphere]")
+    if not objects["train"]:
+        raise UserError("task.objects.train=[]: must name a shape, e.g. [box,sphere]")
     settings = objects.get("own") or {}
     for name in (*objects["train"], *objects["held_out"]):
         if name in known:
