@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from dexsim import files, guard
 from dexsim.errors import UserError
@@ -41,10 +42,33 @@ def _tried(path: Path, where: str) -> list[str]:
 
 
 def step(model: mujoco.MjModel, where: str) -> None:
-    """Make a step, to see that one ends. Raises UserError for a model that is too large to be simulated."""
+    """Make a step, to see that one ends. Raises UserError for a model that is too large to be simulated, or has figures
+    that no body has."""
     if model.nv > MAX_DOFS:
         raise UserError(f"{where}: has {model.nv:,} degrees of freedom; at most {MAX_DOFS:,} are simulated")
+    _physical(model, where)
     mujoco.mj_step(model, mujoco.MjData(model))
+
+
+def _physical(m: mujoco.MjModel, where: str) -> None:
+    """Raise UserError for figures that would be fitted around in silence: MuJoCo's reader takes "nan" and -0.1."""
+    dof = [m.joint(j) for j in m.dof_jntid]
+    for what, values, low, high, whose in (
+        ("gravity", m.opt.gravity[None], -100.0, 100.0, None), ("mass", m.body_mass, 0.0, 1e6, m.body),
+        ("inertia", m.body_inertia, 0.0, 1e6, m.body), ("position", m.body_pos, -1e4, 1e4, m.body),
+        ("orientation", m.body_quat, -1e4, 1e4, m.body), ("centre of mass", m.body_ipos, -1e4, 1e4, m.body),
+        ("axis", m.jnt_axis, -1e4, 1e4, m.joint), ("range", m.jnt_range, -1e6, 1e6, m.joint),
+        ("stiffness", m.jnt_stiffness, 0.0, 1e6, m.joint), ("armature", m.dof_armature, 0.0, 1e6, dof.__getitem__),
+        ("damping", m.dof_damping, 0.0, 1e6, dof.__getitem__), ("size", m.geom_size, -1e6, 1e6, m.geom),
+        ("frictionloss", m.dof_frictionloss, 0.0, 1e6, dof.__getitem__), ("position", m.geom_pos, -1e4, 1e4, m.geom),
+    ):  # fmt: skip
+        rows = np.atleast_2d(np.asarray(values, float).T).T
+        bad = np.flatnonzero(~((rows >= low) & (rows <= high)).all(1))
+        if len(bad):
+            k = int(bad[0])
+            name = f" of '{whose(k).name or k}'" if whose else ""
+            said = " ".join(f"{x:g}" for x in rows[k])
+            raise UserError(f"{where}: {what}{name} is {said}: must be numbers from {low:g} to {high:g}")
 
 
 def parsed(path: Path) -> mujoco.MjSpec:

@@ -106,31 +106,11 @@ def _source(
     if inertia == "shapes":
         inertias.from_shapes(spec, mended, path)
     model = _compiled(spec, path, notes)
-    _finite(model, path)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             name, most = model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max())
             said.effort[name] = min(said.effort.get(name, most), most)
     return Source(path, model, said, speeds, bare, notes, ties, limits, mended, passive)
-
-
-def _finite(m: mujoco.MjModel, path: Path) -> None:
-    """UserError for a figure that is no number, or pushes a joint on: MuJoCo's reader takes "nan" and -0.1."""
-    for what, values, name in (
-        ("position", m.body_pos, m.body), ("orientation", m.body_quat, m.body), ("mass", m.body_mass, m.body),
-        ("inertia", m.body_inertia, m.body), ("centre of mass", m.body_ipos, m.body), ("axis", m.jnt_axis, m.joint),
-        ("shape's position", m.geom_pos, m.geom), ("shape's size", m.geom_size, m.geom),
-    ):  # fmt: skip
-        bad = ~np.isfinite(np.asarray(values, float).reshape(len(values), -1)).all(axis=1)
-        if bad.any():
-            k = int(np.argmax(bad))
-            raise UserError(f"model {path}: {what} of '{name(k).name or k}' is {values[k]}: must be finite numbers")
-    dofs = {"armature": m.dof_armature, "damping": m.dof_damping, "frictionloss": m.dof_frictionloss}
-    for what, values in dofs.items():
-        bad = ~(np.asarray(values) >= 0) | np.isinf(values)
-        if bad.any():
-            k = int(np.argmax(bad))  # a dof a joint: hinges and slides
-            raise UserError(f"model {path}: {what} of joint '{m.joint(k).name}' is {values[k]:g}: must be 0 or above")
 
 
 def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:

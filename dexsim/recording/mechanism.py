@@ -130,7 +130,7 @@ def mechanism(
         path = Path(model).expanduser()
         spec = model_file.read(path, f"model={model}")
         _undriven(spec)
-        _physical(spec.compile(), f"model={model}")
+        _moved(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:
             raise UserError(f"model={model}: say which servo drives it with servo=FILE (a servo.yaml)")
@@ -177,43 +177,8 @@ def _hand_folder(model: str | Path) -> Path | None:
     return path if (path / HAND_FILE).is_file() else None
 
 
-def _physical(model: mujoco.MjModel, where: str) -> None:
-    """UserError for figures that no body has: they would be fitted around in silence."""
-    checks = (
-        ("gravity", model.opt.gravity[None], -100.0, "a number from -100 to 100 m/s2", lambda k: "option"),
-        ("mass", model.body_mass, 0.0, "a number >= 0 [kg]", lambda k: f"body '{model.body(k).name}'"),
-        ("inertia", model.body_inertia, 0.0, "numbers >= 0 [kg m2]", lambda k: f"body '{model.body(k).name}'"),
-        (
-            "armature",
-            model.dof_armature,
-            0.0,
-            "a number >= 0 [kg m2]",
-            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
-        ),
-        (
-            "damping",
-            model.dof_damping,
-            0.0,
-            "a number >= 0",
-            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
-        ),
-        (
-            "frictionloss",
-            model.dof_frictionloss,
-            0.0,
-            "a number >= 0",
-            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
-        ),
-        ("stiffness", model.jnt_stiffness, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(k).name}'"),
-        ("range", model.jnt_range, -1e6, "two finite numbers", lambda k: f"joint '{model.joint(k).name}'"),
-        ("position", model.body_pos, -1e4, "three finite numbers [m]", lambda k: f"body '{model.body(k).name}'"),
-    )
-    for name, values, low, must, whose in checks:
-        rows = np.asarray(values, float).reshape(len(values), -1)
-        bad = ~(np.isfinite(rows) & (rows >= low) & (rows <= max(1e6, -low))).all(1)
-        if bad.any():
-            k = int(np.argmax(bad))
-            raise UserError(f"{where}: {whose(k)}: {name} is {' '.join(f'{x:g}' for x in rows[k])}; it must be {must}")
+def _moved(model: mujoco.MjModel, where: str) -> None:
+    """UserError for a joint that moves nothing."""
     for k in range(model.njnt):
         if not model.dof_M0[model.jnt_dofadr[k]] > 0:
             raise UserError(
