@@ -238,7 +238,7 @@ class Hour:
     def signs(self) -> Step:
         """See: one joint after the other closes a little, then opens; nothing strains."""
         step = Step("signs", "Signs and ranges, joint by joint")
-        self.s.move(lambda t: self.middle, 4.0, self.amps)
+        self.s.move(_still(self.middle), 4.0, self.amps)
         rows = {}
         for j in self.joints:
             low, high = self.hand.limits[j]
@@ -248,13 +248,13 @@ class Hour:
             up, down = goal.copy(), goal.copy()
             up[j], down[j] = goal[j] + reach, goal[j] - reach
             while True:  # at the lowest current first; what does not move at it gets twice as much
-                a = self.s.move(lambda t, g=up: g, took, self.amps)
-                c = self.s.move(lambda t, g=down: g, 2 * took, self.amps)
+                a = self.s.move(_still(up), took, self.amps)
+                c = self.s.move(_still(down), 2 * took, self.amps)
                 if a.position[-1, j] - c.position[-1, j] > reach or self.amps[j] >= self.most:
                     break
                 self.amps[j] = min(2 * self.amps[j], self.most)
-                self.s.move(lambda t, g=goal: g, took, self.amps)
-            self.s.move(lambda t, g=goal: g, took, self.amps)
+                self.s.move(_still(goal), took, self.amps)
+            self.s.move(_still(goal), took, self.amps)
             rose = a.position[-1, j] - c.position[-1, j]
             moving = np.abs(np.gradient(a.target[:, j])) > 1e-4
             push = float(np.median(a.current[moving, j])) if moving.any() else 0.0
@@ -277,7 +277,7 @@ class Hour:
     def limp(self) -> Step:
         """See: once the hand is let go, press its fingers gently: they give way."""
         step = Step("limp", "Does letting go make it limp?")
-        self.s.move(lambda t: self.middle, 1.0, self.amps)
+        self.s.move(_still(self.middle), 1.0, self.amps)
         ok, text = self.s.relax()
         t = self.s.watch(4.0)
         load, moved = float(np.abs(t.current).max()), float(np.ptp(t.position, axis=0).max())
@@ -362,13 +362,13 @@ class Hour:
         """See: each joint begins to move a little, by itself, as its current limit rises."""
         step, rows = Step("lowest", "The lowest current that moves each joint"), {}
         for j in self.joints:
-            self.s.move(lambda t: self.middle, 1.0, self.amps)
+            self.s.move(_still(self.middle), 1.0, self.amps)
             assert self.s.state is not None
             at, goal = float(self.s.state.position[j]), self.middle.copy()
             goal[j] = np.clip(at + 0.3, *self.hand.limits[j]) if at < self.hand.limits[j].mean() else at - 0.3
             found = None
             for limit in np.arange(10.0, self.most + 1, 10.0):
-                t = self.s.move(lambda t, g=goal: g, 0.12, np.where(np.arange(self.s.J) == j, limit, self.amps), 3.0)
+                t = self.s.move(_still(goal), 0.12, np.where(np.arange(self.s.J) == j, limit, self.amps), 3.0)
                 if abs(t.position[-1, j] - at) > MOVED:
                     found = float(limit)
                     break
@@ -394,7 +394,7 @@ class Hour:
         p = plan(m, names, self.given["kinds"].split(","), 0, 100.0, Limits(current=1e-3 * most))
         order = [m.joints.index(j) for j in self.hand.joints]
         value = p.value[:, order]
-        self.s.move(lambda t: value[0], 4.0, most)
+        self.s.move(_still(value[0]), 4.0, most)
         self.s.recorder, whole = self.given["recorder"]("excite.mcap"), self.s.recorder
         try:
             self.s.move(lambda t: value[min(int(t * 100), len(value) - 1)], float(p.t[-1]), most, speed=20.0)
@@ -463,18 +463,18 @@ def latency(s: Session, middle: np.ndarray, joints: Sequence[int], current: np.n
     """Steps of single joints to and fro: {"ms": joint: [ms from command to motion], "rise_ms": joint: [ms from there to
     half of the step]}. A joint moves where it has left the spread of its encoder by three times."""
     out: dict[str, Any] = {"ms": {}, "rise_ms": {}}
-    s.move(lambda t: middle, 2.0, current)
+    s.move(_still(middle), 2.0, current)
     for j in joints:
         goal, ms, rise = middle.copy(), [], []
         for k in range(LATENCY_TRIES):
             before = goal.copy()
-            rest = s.move(lambda t, g=before: g, 0.4, current)
+            rest = s.move(_still(before), 0.4, current)
             at = rest.position[-10:, j].mean()
             quiet = max(0.004, 4 * float(rest.position[-20:, j].std()))
             sign = 1.0 if k % 2 == 0 else -1.0
             goal[j] += sign * LATENCY_STEP
             after = goal.copy()
-            t = s.move(lambda t, g=after: g, 0.4, current, speed=100.0)
+            t = s.move(_still(after), 0.4, current, speed=100.0)
             went = sign * (t.position[:, j] - at)
             if went.max() > max(quiet, 0.25 * LATENCY_STEP):
                 begun = t.stamp[np.argmax(went > quiet)]
@@ -585,7 +585,7 @@ def walk(
         ok, text = session.relax()
         recorder.close()
         _write(out, hour.found, info, stopped, text, clock.now() - zero)
-        driver.close()  # type: ignore[attr-defined]
+        driver.close()
     say(f"\n{'the hand is let go: ' if ok else 'DANGER: '}{text}")
     say(f"{out / 'report.html'}")
     return int(bool(stopped) or not ok or any(s.verdict == "bad" for s in hour.found.values()))
@@ -598,6 +598,11 @@ def _recorder(path: Path, hand: Any, clock: Clock, given: dict[str, Any]) -> Any
     meta = {"source": "real" if real else "sim", "robot": hand.robot, "effort_is": "current_A", "effort_sign": "-1",
             "tactile_unit": "count", "tactile_layout": hand.robot, "notes": "first hour"}  # fmt: skip
     return Recorder(path, hand.joints, meta, None, clock.now(), most=200_000)
+
+
+def _still(goal: np.ndarray) -> Callable[[float], np.ndarray]:
+    """The same targets [J] rad at all times."""
+    return lambda t: goal
 
 
 def _sentence(work: Callable) -> str:

@@ -147,6 +147,7 @@ class Loop:
     _rest: list[np.ndarray]
     _seen: np.ndarray | None
     _seen_at: float | None
+    _poses: tuple[tuple[float, np.ndarray | None], tuple[float, np.ndarray | None]]
     _action: np.ndarray
 
     def __init__(
@@ -597,7 +598,7 @@ class Loop:
         self.measure.reset()
         self.bundle.begin()
         self._unseen, self._nonsense = None, Lasting()
-        self._poses: tuple = ((0.0, None), (0.0, None))
+        self._poses = ((0.0, None), (0.0, None))
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:

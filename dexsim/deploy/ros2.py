@@ -93,9 +93,11 @@ class Rclpy:
         )
 
     def publish(self, topic: str, names: Sequence[str], c: HandCommand, message: str = "joint_state") -> None:
-        kind = self._state
+        kind: Any = self._state
         if message == "xhand":
-            from xhand_control_interfaces.msg import XHandCommand as kind
+            from xhand_control_interfaces.msg import XHandCommand
+
+            kind = XHandCommand
         if topic not in self._publishers:
             self._publishers[topic] = self._node.create_publisher(kind, topic, 10)
         m = kind()
