@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from dexsim.gap.plant.batch import Windows
 
 REPLAY = ("mujoco", "warp", "none")
+TURNS = 2  # times that the best of each joint together is tried
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BELIEVED = "believed"  # candidate: nothing is changed
@@ -560,7 +561,9 @@ def write_best(
         count = len(windows[0].window)
         for group in groups.values():
             worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0])]
-            q = free_runs(given[group[0]][1], m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
+            spec = given[group[0]][1].copy()
+            spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # held out is what touches nothing
+            q = free_runs(spec, m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
             for k, i in enumerate(group):
                 found[i] = q[k * count : (k + 1) * count]
         pairs = [(c, ws, m.joints.index(c.joint)) for c, ws in zip(cases, windows, strict=True)]
@@ -570,20 +573,33 @@ def write_best(
     # none of them: then each is asked once more with what the others now are
     kinds = [k for k in ORDER if any(k in x for x in by.values())]
     every = [{j: k if k in x else next(iter(x)) for j, x in by.items()} for k in kinds]
-    for found, choice in zip(replayed(every), every, strict=True):
+    done = list(zip(every, replayed(every), strict=True))
+    for choice, found in done:
         for j, name in choice.items():
             errors[j][name] = found[j]
-    chosen = {j: choose(x, noise[j]) for j, x in errors.items()}
-    if len(by) > 1 and len(set(chosen.values())) > 1 and not passed():
+    here = {j: dict(x) for j, x in errors.items()}  # with what the others are by then
+    chosen = {j: choose(x, noise[j]) for j, x in here.items()}
+    while chosen not in [c for c, _ in done] and len(done) < len(every) + TURNS and not passed():
         (together,) = replayed([chosen])
-        moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * errors[j][chosen[j]] and len(by[j]) > 1]
-        swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]] if not passed() else []
+        done.append((chosen, together))
+        moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]] and len(by[j]) > 1]
+        swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
         for (j, k), found in zip(swaps, replayed([chosen | {j: k} for j, k in swaps]), strict=True):
-            errors[j][k] = found[j]
+            here[j][k] = found[j]
         for j in by:
-            errors[j][chosen[j]] = together[j]
-        chosen = {j: choose(x, noise[j]) for j, x in errors.items()}
-    return Written(candidates, errors, chosen, True)
+            here[j][chosen[j]] = together[j]
+        chosen = {j: choose(x, noise[j]) for j, x in here.items()}
+    # of all that was replayed as a whole: what nowhere follows much worse than belief or plain model alone; that choice
+    # before others that do as well
+
+    def worst(found: Mapping[str, float]) -> float:
+        plainly = {j: min(x.get(n, math.inf) for n in (BELIEVED, "plain")) for j, x in errors.items()}
+        return max(max(found[j], noise[j]) / max(x, noise[j]) if math.isfinite(x) else 1.0 for j, x in plainly.items())
+
+    fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
+    alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
+    total = lambda d: sum(math.log(max(d[1][j], JUDGE.within * noise[j])) - alike(d[0]) for j in by)  # noqa: E731
+    return Written(candidates, errors, min(fair, key=total)[0], True)
 
 
 def _start(r: Recording, start: float) -> float:
