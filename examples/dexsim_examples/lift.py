@@ -23,7 +23,7 @@ class Lift(Task):
             "baked_scales": [1.0, 1.15],
         },
         "presets": {
-            "cuda": {"worlds": 8192, "iterations": 2200, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+            "cuda": {"worlds": 8192, "iterations": 2500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
                      "agent": {"num_steps_per_env": 16, "algorithm": {"entropy_coef": 0.002}}},
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
         },
@@ -110,32 +110,32 @@ class Lift(Task):
                           self.held[:, None]], 1)  # fmt: skip
 
     # -- what is paid
-    @reward(0.1)
+    @reward(0.5)
     def reach(self, length=0.06):
         """fingertips near the object"""
         return (-(self.tips - self.object_pose[:, None, :3]).norm(dim=2) / length).exp().mean(1)
 
-    @reward(0.1)
+    @reward(0.5)
     def gripping(self):
         """thumb and fingers press"""
         return self.grip()
 
-    @reward(0.6)
+    @reward(3.0)
     def raised(self, top=0.08):
         """height over the table, in a grip"""
         return (self.height() / top).clamp(0, 1) * (0.2 + 0.8 * self.grip())
 
-    @reward(0.3)
+    @reward(1.0)
     def up(self):
         """held up"""
         return (self.height() > UP + 0.01).float()
 
-    @reward(-0.1)
+    @reward(-0.5)
     def swing(self):
         """speed of the object up there, m/s"""
         return self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0) * (self.height() > 0.02)
 
-    @reward(-0.0005)
+    @reward(-0.002)
     def change(self):
         """change of the action"""
         return (self.action - self.last_action).square().sum(1)

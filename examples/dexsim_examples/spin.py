@@ -9,7 +9,7 @@ import torch
 from dexsim import rotation
 from dexsim.tasks import Task, done, memory, metric, observe, reward
 
-RADIUS, HALF = (0.009, 0.012), (0.035, 0.045)  # m, of the stick: radius, half its length
+RADIUS, HALF = (0.008, 0.011), (0.045, 0.06)  # m, of the stick: radius, half its length
 
 
 class Spin(Task):
@@ -52,7 +52,7 @@ class Spin(Task):
         heading, zero = s.draw("start.heading"), torch.zeros(n, device=self.device)
         lay = rotation.from_vector(torch.stack([zero, zero + math.pi / 2, zero], 1))  # the capsule's z lies along x
         turn = rotation.from_vector(torch.stack([zero, zero, heading], 1))
-        where = torch.tensor([0.07, 0.0, 0.05], device=self.device).expand(n, 3).clone()
+        where = torch.tensor([0.075, 0.0, 0.052], device=self.device).expand(n, 3).clone()
         where[:, :2] += s.draw("start.aside", 2)
         self.start(mask, self.ready, torch.cat([where, rotation.multiply(turn, lay)], 1))
         self.heading = torch.where(mask, heading, self.heading)
@@ -111,27 +111,27 @@ class Spin(Task):
                           o.friction[:, None]], 1)  # fmt: skip
 
     # -- what is paid
-    @reward(0.1)
+    @reward(0.5)
     def spin(self, fastest=4.0):
         """turning about the palm's normal, rad/s"""
         return (self.moved / self.dt).clamp(-fastest, fastest)
 
-    @reward(-1.0)
+    @reward(-4.0)
     def away(self):
         """drift of its middle, m"""
         return (self.object_pose[:, :3] - self.home).norm(dim=1).clamp(max=0.15)
 
-    @reward(-0.05)
+    @reward(-0.3)
     def tilted(self):
         """out of level"""
         return self.along()[:, 2].abs()
 
-    @reward(-2.0)
+    @reward(-20.0)
     def lost(self):
         """the stick fell"""
         return self.dropped().float()
 
-    @reward(-0.0005)
+    @reward(-0.002)
     def change(self):
         """change of the action"""
         return (self.action - self.last_action).square().sum(1)

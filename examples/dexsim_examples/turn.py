@@ -18,11 +18,11 @@ class Turn(Task):
     scene = Scene(object=Hinge(at=(0.052, 0.005, 0.062), axis=(0, 0, 1), range=(-math.pi, LAST), friction=0.01))
     settings = {
         "episode_s": 10.0,
-        "evaluation": {"cap_s": 180.0},
+        "evaluation": {"cap_s": 120.0},
         "objects": {"train": ["hexprism"], "baked_scales": [1.0, 1.1, 1.2]},
         "presets": {
             "cuda": {
-                "worlds": 8192, "iterations": 3000, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+                "worlds": 8192, "iterations": 2500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
                 "agent": {"num_steps_per_env": 12, "algorithm": {"gamma": 0.99, "entropy_coef": 0.002}},
             },
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
@@ -101,17 +101,17 @@ class Turn(Task):
         return torch.cat([self.finger_force, 30 * dry[:, None], self.objects.friction[:, None], self.torque], 1)
 
     # -- what is paid
-    @reward(0.1)
+    @reward(0.5)
     def turning(self, fastest=6.0):
         """speed of the knob the way it should go, rad/s"""
         return (self.way * self.object_speed).clamp(-fastest, fastest)
 
-    @reward(-0.0005)
+    @reward(-0.002)
     def change(self):
         """change of the action"""
         return (self.action - self.last_action).square().sum(1)
 
-    @reward(-0.002)
+    @reward(-0.02)
     def on_itself(self):
         """what fingers press on the hand with, N"""
         return self.self_force.sum(1).clamp(max=20.0)
