@@ -129,7 +129,7 @@ def _overlapping(radius, half, corners, edges, triangles) -> tuple[float, np.nda
             return c * first[k] + s * second[k], c * second[k] - s * first[k]
 
         def slope(phi: np.ndarray, k) -> np.ndarray:
-            """For the depth of edge k's line, by the angle of the direction across it."""
+            """Return the slope of the depth of edge k's line, by the angle of the direction across it."""
             u, du = turned(phi, k)
             return (du * (_furthest(radius, half, u) - a[k])).sum(-1)
 

@@ -257,7 +257,7 @@ def compare(model: mujoco.MjModel, poses: Poses, want, got) -> dict[str, np.ndar
 
 
 def well_posed(model: mujoco.MjModel, poses: Poses, want) -> tuple[np.ndarray, np.ndarray]:
-    """For each pose: whether its normal, and whether its nearest points are determined to the accuracy of float32."""
+    """Return for each pose whether its normal and its nearest points are determined to the accuracy of float32."""
     dist, normal, _ = want
     rivals = np.ones(len(dist), int)
     for k, sign in ((0, 1.0), (1, -1.0)):

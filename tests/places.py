@@ -40,7 +40,7 @@ CYLINDER, CAPSULE, SPHERE, BOX = (
 
 
 def radius(kind: int, size: np.ndarray) -> float:
-    """For the surface from the core [m]."""
+    """Return the distance of the surface from the core [m]."""
     return float(size[0]) if kind in (SPHERE, CAPSULE) else 0.0
 
 
@@ -160,8 +160,8 @@ def described(model: mujoco.MjModel, poses, i: int, got: tuple) -> dict:
 
 
 def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarray) -> dict:
-    """For all contacts whose place is more than 1e-6 m from C MuJoCo's (want): how many have more than one nearest
-    point, and both are right (`equal`); how many answers are off, how many of C MuJoCo's are (`reference_off`), and how
+    """Return, of contacts whose place is more than 1e-6 m from C MuJoCo's (want), how many have several nearest
+    points, and both are right (`equal`); how many answers are off, how many of C MuJoCo's are (`reference_off`), and how
     many of the answers are no further off than the pose is ill-conditioned (`ill`). worst [m]: of all answers. exact:
     the exact places where C MuJoCo's is off, by pose. poses_off: each answer that is off, by `described`.
 

@@ -128,7 +128,7 @@ def test_the_plain_model_is_written_as_it_was_fitted(fitted):
     ],
 )
 def test_breakaway_and_friction_by_load_may_forbid_a_fall_too(columns, held):
-    """For an arm that falls without power; a share of the load of more than one holds it by itself."""
+    """An arm falls without power; a share of the load of more than one holds it by itself."""
     t, q = (x[:180] for x in falls(0.01))  # the first fall
     case = case_of(run("fall.mcap", t, q, np.full(180, 1.2), enabled=np.zeros(180)))
     fixed = {"gear_load_unit": HANGS} if any(n.startswith("gear") for n in columns) else {}
@@ -139,7 +139,7 @@ def test_breakaway_and_friction_by_load_may_forbid_a_fall_too(columns, held):
 
 
 def test_the_plain_model_is_handed_on_with_the_braking_that_it_was_judged_with(fitted):
-    """For which the servo's file says nothing: its default is another."""
+    """The servo's file says nothing of braking: its default is another."""
     case, _, plain = fitted
     servo = ServoTable.from_dict(BELIEVED)
     assert servo.value("joint", "braking_slope").value == 1.0 != case.scales.nominal["braking_slope"]

@@ -232,7 +232,7 @@ def test_of_a_joint_what_follows_best_is_written(errors, chosen):
 
 
 def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs():
-    """For a gain that each recording states itself the fit's factor is written; of the rest its value."""
+    """For a gain that each recording states itself, the fit's factor is written; of the rest its value."""
     believed = {"joints": {"*": {"kp": 5.0, "kd": 0.1, "delay": 0.01, "coulomb_friction": 0.02}}}
     m = mechanism_of(ServoTable.from_dict(believed))
     table = ServoTable.from_dict(

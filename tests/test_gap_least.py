@@ -117,7 +117,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=Fal
     ],
 )
 def test_a_name_is_doubted_by_either_interval_and_a_hint_by_both(monkeypatch, fitted, reported, least, most):
-    """For which intervals hold the size at which nothing is missing."""
+    """An interval holds the size at which nothing is missing."""
     evidence = weighed(monkeypatch, fitted, reported)
     assert least <= evidence.confidence <= most
     assert len(evidence.reasons) == (fitted or reported) and all("nothing is missing" in r for r in evidence.reasons)

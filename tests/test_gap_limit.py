@@ -126,7 +126,7 @@ def test_recordings_whose_model_would_take_too_long_are_left_out_evenly(limit, k
 
 @pytest.mark.parametrize("spent, fitted", [(0.0, 3), (1 - STANDING_IN + 0.01, 0), (0.75, 2)])
 def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
-    """Among 100 s: none is begun in the last tenth, nor one where less is left than twice what one took (6 s each)."""
+    """Out of 100 s: none is begun in the last tenth, nor one where less is left than twice what one took (6 s each)."""
 
     def fit(*_):
         clock[0] += 6.0

@@ -50,7 +50,7 @@ def test_a_readout_is_asked_for_where_there_are_two_encoders(apart):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_an_offset_of_the_effort_beyond_what_its_zero_may_be_off_by_is_found(sign):
-    """For a strong drive that hardly works, what the zero may be off by is large beside the torques that it gives: the
+    """In a strong drive that hardly works, what the zero may be off by is large beside the torques that it gives: the
     belief then stands further out than a tenth of them."""
     runs, case = built({"torque_limit": 20.0, "no_load_speed": 60.0})
     run, zero = runs[0], case.scales.effort_zero

@@ -69,7 +69,7 @@ EFFORT = {"error": "effort_rmse_Nm", "before": 2.0, "before_low": 2.0, "after": 
 
 @pytest.mark.parametrize("other", [{}, PUSH, BAD, {"effect": "current_sensor"}])
 def test_whatever_is_named_below_a_half_is_a_hint_and_not_in_the_sentence(other):
-    """For a joint, of what pushes it, of a signal, of an effort: after what is sure, unknown to the verdict."""
+    """A name of a joint, a push, a signal or an effort: after what is sure, unknown to the verdict."""
     d = decided(told("lag", 0.45) | other, told("backlash", 0.9, "b"), effort=EFFORT)
     assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
     assert d.data["verdict"] == "explained" and "Joint b" in d.sentence and "Joint a" not in d.sentence
@@ -79,7 +79,7 @@ def test_whatever_is_named_below_a_half_is_a_hint_and_not_in_the_sentence(other)
 
 
 def test_what_the_torque_whispers_decides_nothing():
-    """For the torque route, which is added after the joints: its error is the verdict's only where it names surely."""
+    """The torque route is added after the joints: its error is the verdict's only where it names surely."""
     behind = {"error": "effort_rmse_Nm", "before": 0.5, "before_low": None, "after": 0.2}
     d = SimpleNamespace(data={"findings": []}, judged=Judged({}))
     named = [SimpleNamespace(effect="stribeck_friction", before=0.5, after=0.2)]
@@ -288,7 +288,7 @@ def test_a_limit_ends_searches_and_says_which():
 
 @pytest.mark.parametrize("spent, again", [(10.0, ["b"]), (700.0, [])])
 def test_a_joint_whose_share_was_too_short_gets_what_the_others_left(spent, again, monkeypatch):
-    """Among 1,000 s, 800 for searches, each of eight joints has its share; b needed more. Where the others hardly used
+    """Out of 1,000 s, 800 for searches, each of eight joints has its share; b needed more. Where the others hardly used
     theirs b is searched again, in two thirds of what is left; where they did, a search anew would end where it did."""
     clock = [0.0]
     monkeypatch.setattr("dexsim.gap.compute.time.monotonic", lambda: clock[0])

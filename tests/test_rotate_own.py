@@ -45,7 +45,7 @@ def config(*overrides: str, worlds: int = 4) -> dict:
 
 
 def cubes(count: int) -> GraspSet:
-    """For the right xHand's own held poses those of cubes of nearly 50 mm."""
+    """Return, of the right xHand's own held poses those of cubes of nearly 50 mm."""
     known = held_poses(load_hand())
     return known[(known.edge - 0.05).abs().argsort()[:count]]
 
