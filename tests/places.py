@@ -162,8 +162,8 @@ def described(model: mujoco.MjModel, poses, i: int, got: tuple) -> dict:
 def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarray) -> dict:
     """Return, of contacts whose place is more than 1e-6 m from C MuJoCo's (want), how many have several nearest
     points, and both are right (`equal`); how many answers are off, how many of C MuJoCo's are (`reference_off`), and
-    how many of the answers are no further off than the pose is ill-conditioned (`ill`). worst [m]: of all answers. exact:
-    the exact places where C MuJoCo's is off, by pose. poses_off: each answer that is off, by `described`.
+    how many of the answers are no further off than the pose is ill-conditioned (`ill`). worst [m]: of all answers.
+    exact: the exact places where C MuJoCo's is off, by pose. poses_off: each answer that is off, by `described`.
 
     depth [n] in m: along the answers' normals. Of an overlap with two ways out of one length (to `LEVEL`) the place on
     either is right.
