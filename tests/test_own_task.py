@@ -161,12 +161,20 @@ def test_task_names_stand_in_their_own_files_only():
         if own.search(path.as_posix()):
             continue
         for k, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if literal.search(line) and not re.search(r"""task: \w+ = "grasp"|tasks"? else "grasp"|DEFAULT""", line):
+            if literal.search(line) and not re.search(ALLOWED.get(path.name, "$^"), line):
                 found.append(f"{path.relative_to(ROOT)}:{k}: {line.strip()}")
-    assert len(found) <= LEFT, "\n".join(found)
+    assert not found, "\n".join(found)
 
 
-LEFT = 20
+ALLOWED = {
+    "api.py": r'task: Task = "grasp"',  # the default
+    "demo.py": r'"policy": "grasp"',  # the default of the demo
+    "first_hour.py": r'\{"task": "grasp"\}',  # whose settings stand for the hand's
+    "sweep.py": r'"task="\)\), "grasp"',
+    "__init__.py": r'dexsim.train\("grasp"',  # an example
+    "reality.py": r'^            "(rotate|grasp)": \{',  # what each world's file holds for them
+}
+"""Lines that may know a task by name, by file."""
 
 
 # -- terms
