@@ -50,6 +50,8 @@ SEED = 3
 """Forced readings before the first command, 20 ms apart: until then the cache holds zeros."""
 LOST = 0.1
 """s without an answer of all taxel boards, or of one: silent; without an accepted command: refused."""
+FEW = 8
+"""Frames in a row: one that is late (111 ms were seen) or torn proves nothing."""
 LIMP, YIELD, WATCH = 30.0, 0.02, 0.1
 """mA that motors may draw in a limp hand; rad by which a joint that gives way shows that it is; s that a hand is
 watched for each way to let go."""
@@ -73,7 +75,7 @@ class XHandBus:
         self._frame: list[Any] = []
         self._sequence, self._fast = 0, False
         self._last_bits: tuple[list, list] = ([], [])
-        self._stirred, self._restless = clock.now(), False
+        self._stirred, self._restless, self._same, self._unfelt = clock.now(), False, 0, 0
         self._steps = np.zeros(JOINTS)
         self._boards = [b""] * TAXELS[0]
         self._touch = np.zeros(TAXELS, np.int16)
@@ -255,6 +257,7 @@ class XHandBus:
 
     def _feel(self, raw: Any, code: int, now: float) -> None:
         """The taxels of boards that answer: of all with a good code, else of those whose content changes."""
+        self._unfelt += 1
         if code == CRC:
             return
         for f in range(TAXELS[0]):
@@ -263,7 +266,7 @@ class XHandBus:
             touch = np.array(flat, np.int16).reshape(TAXELS[1:])
             content = touch.tobytes() + bytes([int(x) & 0xFF for x in getattr(board, "temperature", ())])
             if code in GOOD_TOUCH or (content != self._boards[f] and any(content)):
-                self._touch[f], self._touched[f] = touch, now
+                self._touch[f], self._touched[f], self._unfelt = touch, now, 0
             self._boards[f] = content
         self._touch_worked = self._touch_worked or code in GOOD_TOUCH
 
@@ -271,12 +274,13 @@ class XHandBus:
         """Since when no bit of the cache has changed. Encoders that go to and fro while the hand stands still show that
         its readings never stand."""
         bits = (self._frame, list(self._boards))
+        self._same += 1
         if bits != self._last_bits:
             if self._sent is None and self._last_bits[0]:
                 steps = np.array([a[0] - b[0] for a, b in zip(self._frame, self._last_bits[0], strict=True)])
                 self._restless = self._restless or int((steps * self._steps < 0).sum()) >= 3
                 self._steps = steps
-            self._last_bits, self._stirred = bits, now
+            self._last_bits, self._stirred, self._same = bits, now, 0
 
     def _dead(self) -> str:
         """What is said of a bus whose cache alone answers; empty where it lives."""
@@ -284,7 +288,7 @@ class XHandBus:
         return (
             f"no bit of the readings has changed for {1e3 * still:.0f} ms, of a hand whose encoders never stand still:"
             " the bus is dead, and the package's cache answers"
-            if self._restless and still > LOST
+            if self._restless and self._same >= FEW
             else ""
         )
 
@@ -295,7 +299,7 @@ class XHandBus:
         now = self.clock.now()
         if self._refusal and (self._refusal.startswith("a motor") or now - self._refused_at > LOST - 0.03):
             return self._refusal
-        if self._touch_worked and (now - self._touched > LOST).all():
+        if self._touch_worked and self._unfelt >= FEW and (now - self._touched > LOST).all():
             return f"no taxel board has answered for {1e3 * (now - self._touched.max()):.0f} ms"
         return self._dead()
 
