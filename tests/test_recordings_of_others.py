@@ -8,7 +8,7 @@ import recordings
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from dexsim.gap.plant.case import noise_of
+from dexsim.gap.plant.case import noise_of, refined_cases
 from dexsim.gap.read import inputs
 from dexsim.recording import read
 from dexsim.recording.audit import audit
@@ -190,6 +190,8 @@ def test_a_joint_has_a_time_axis_of_its_own(tmp_path, joints):
         run = inputs.to_run(r, m, notes := [])
         assert run.joints == joints and not notes and run.period == pytest.approx(0.01)
         sigma[kind] = [noise_of(run, j)[0] for j in range(len(joints))]
+        cases = refined_cases(m.spec.compile(), [run], "cpu", 1e-3)
+        assert [len(c.plant.windows(None).sample_row) for c in cases] == [600] * len(joints)
         for j in range(len(joints)):
             t, q = run.readings(j)
             assert len(t) == 600 and np.abs(q - follow(t, j)).max() < 5 * noise

@@ -296,10 +296,12 @@ class JointPlant:
         stride: float | None = None,
         span: dict[int, tuple[float, float]] | None = None,
         every_run: bool = False,
+        between: bool = False,
     ) -> Windows:
         """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
 
-        span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint.
+        span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint;
+        between: also samples between its readings.
         """
         window, window_t, step, part, of, run_of = [], [], [], [], [], []
         row: list[int] = []
@@ -324,7 +326,7 @@ class JointPlant:
                 if i == count - 1 and b >= stop - 1e-6:
                     hi = int(np.searchsorted(t - t[0], b + 1e-9))
                 rows = np.arange(lo, hi)
-                read = self._read[r]
+                read = None if between else self._read[r]
                 rows = rows if read is None else rows[read[rows]]
                 if len(rows) < 3:
                     continue

@@ -812,7 +812,7 @@ def _one(
 
 def fine_windows(plant: JointPlant, run: int, every: int) -> tuple[np.ndarray, Windows]:
     """Times [n] s and the window of a whole run, free from its first sample, seen at every `every`-th step."""
-    whole = plant.windows(None, [run], every_run=True)
+    whole = plant.windows(None, [run], every_run=True, between=True)
     window = whole.window[:1].copy()
     steps = np.arange(0, window[0, 1], every, dtype=np.int32)
     window[0, 3], window[0, 4] = 0, len(steps)
