@@ -395,7 +395,7 @@ MUTATIONS = (
     Mutation(
         "a name that only harms is written",
         "dexsim/gap/judge/full_model.py",
-        "    named = min(alike, max(belief, JUDGE.within * noise))",
+        "    named = min(alike, max(belief, quiet))",
         "    named = math.inf",
         "tests/test_gap_confirm.py::test_of_a_joint_what_follows_best_is_written",
     ),

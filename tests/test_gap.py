@@ -486,14 +486,19 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
         "after_low",
         "after_high",
         "not_judged",
+        "replayed",
     }
     assert data["held_out"]["not_judged"] == []
+    replayed = data["held_out"]["replayed"]
+    assert set(replayed) == {"error", "joints", "engine", "step_s", "recordings", "parts"}
+    assert set(replayed["parts"][0]) == {"recording", "start", "end"}
     plain = data["baseline"]
     assert (
         set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"}
         and plain["error"] < 0.1 * plain["error_before"]
     )
-    assert set(plain["joints"]["joint"]) == {"error_before", "error", "parameters"} and plain["handed_on"] == []
+    assert set(plain["joints"]["joint"]) == {"error_before", "error", "parameters", "at_bound"}
+    assert set(plain["handed_on"]) <= {"joint"}
     f = data["findings"][0]
     assert set(f) == FINDING and set(f["where"]) == {"joints", "taxels", "topics"}
     assert f["effect"] == "command_delay" and f["where"]["joints"] == ["joint"]

@@ -190,12 +190,13 @@ class Written:
 
 
 def choose(errors: Mapping[str, float], noise: float) -> str:
-    """The candidate that is written of a joint, by what each leaves: the least error; of those as good, to what is
-    believed of figures or to the noise, the first of `ORDER`. What was found is none of them where a belief is
-    better."""
-    alike = max((1 + BELIEF.tolerance) * min(errors.values()), JUDGE.within * noise)
+    """Choose the candidate that is written of a joint, by what each leaves: the least error; of those as good, to what
+    is believed of figures or to the noise, the first of `ORDER`. What was found is none of them where a belief is
+    better. As good as the noise: `JUDGE.within` x what the search's plant may leave, which is as much of the noise."""
+    quiet = JUDGE.within**2 * noise
+    alike = max((1 + BELIEF.tolerance) * min(errors.values()), quiet)
     belief = min((x for n, x in errors.items() if n.startswith(("refitted", BELIEVED))), default=math.inf)
-    named = min(alike, max(belief, JUDGE.within * noise))
+    named = min(alike, max(belief, quiet))
     return next(n for n in ORDER if n in errors and errors[n] <= (named if n.startswith("found") else alike))
 
 
@@ -592,13 +593,15 @@ def write_best(
     # of all that was replayed as a whole: what nowhere follows much worse than belief or plain model alone; that choice
     # before others that do as well
 
+    quiet = {j: JUDGE.within**2 * noise[j] for j in by}
+    plainly = {j: min(x.get(n, math.inf) for n in (BELIEVED, "plain")) for j, x in errors.items()}
+
     def worst(found: Mapping[str, float]) -> float:
-        plainly = {j: min(x.get(n, math.inf) for n in (BELIEVED, "plain")) for j, x in errors.items()}
-        return max(max(found[j], noise[j]) / max(x, noise[j]) if math.isfinite(x) else 1.0 for j, x in plainly.items())
+        return max(found[j] / max(x, quiet[j]) if math.isfinite(x) else 1.0 for j, x in plainly.items())
 
     fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
     alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
-    total = lambda d: sum(math.log(max(d[1][j], JUDGE.within * noise[j])) - alike(d[0]) for j in by)  # noqa: E731
+    total = lambda d: sum(math.log(max(d[1][j], quiet[j])) - alike(d[0]) for j in by)  # noqa: E731
     return Written(candidates, errors, min(fair, key=total)[0], True)
 
 

@@ -92,7 +92,7 @@ RESULTS = (
     "report.html",
 )
 """Everything that `save` and the plan of the next recording may write."""
-BEYOND = (("reason",), ("held_out", "how"), ("unexplained", "not_considered"))
+BEYOND = (("reason",), ("noise_floor", "recordings"), ("held_out", "how"), ("unexplained", "not_considered"))
 
 
 def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
