@@ -72,8 +72,8 @@ def _physical(m: mujoco.MjModel, where: str) -> None:
 
 
 def parsed(path: Path) -> mujoco.MjSpec:
-    """MuJoCo's reading of an MJCF or URDF file, whatever its name ends in: the root element says what it is. Raises
-    ValueError, as MuJoCo does. Ask for it within limits (`dexsim.guard`)."""
+    """Return MuJoCo's reading of an MJCF or URDF file, whatever its name ends in: the root element says what it is.
+    Raises ValueError, as MuJoCo does. Ask for it within limits (`dexsim.guard`)."""
     if path.suffix.lower() in (".xml", ".urdf"):
         return mujoco.MjSpec.from_file(str(path))
     included: dict[str, bytes] = {}

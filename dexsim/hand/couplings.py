@@ -63,16 +63,16 @@ class Couplings:
                 self._rows.append((found, low, high))
                 held |= {int(a) for a in np.flatnonzero(found)}
         self._free = sorted({int(m.jnt_qposadr[j]) for j in free} & held)
-        self._kept: dict[tuple[torch.device, torch.dtype], tuple[Any, ...]] = {}
+        self._on: dict[tuple[torch.device, torch.dtype], tuple[Any, ...]] = {}
         self.loose = tuple(m.joint(j).name for j in sorted(free) if int(m.jnt_qposadr[j]) not in held)
 
     @property
     def tied(self) -> bool:
-        """Whether some joint follows others."""
+        """Return whether some joint follows others."""
         return bool(self._laws) or bool(self._free and self._rows)
 
     def complete(self, qpos: torch.Tensor) -> torch.Tensor:
-        """qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
+        """Return qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
         m, q = self.model, qpos.clone()
         for at, other, law in self._laws:
             x = q[..., other] - m.qpos0[other] if other >= 0 else torch.zeros_like(q[..., at])
@@ -95,11 +95,12 @@ class Couplings:
         return q
 
     def _tensors(self, q: torch.Tensor) -> tuple[Any, ...]:
-        """Addresses, rest and limits [F] of the joints that tendons hold, and a row a tendon: its coefficients [nq],
-        how the joints [F] share what its length misses, and its least and largest length. Kept: a recorded step must
-        find them on its device."""
+        """Return addresses, rest and limits [F] of the joints that tendons hold, and a row a tendon: its coefficients
+        [nq],
+        how the joints [F] share what its length misses, and its least and largest length. Made once: a recorded step
+        must find them on its device."""
         key = (q.device, q.dtype)
-        if key not in self._kept:
+        if key not in self._on:
             m, at = self.model, self._free
             joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in at]
             limits = np.where(m.jnt_limited[joints, None], m.jnt_range[joints], [-np.inf, np.inf])
@@ -112,8 +113,8 @@ class Couplings:
                 (to(a), to(a[at] / (a[at] @ a[at])), low, high) for a, low, high in self._rows if np.abs(a[at]).any()
             ]
             free = torch.as_tensor(at, device=q.device)
-            self._kept[key] = free, to(rest), to(limits[:, 0]), to(limits[:, 1]), rows
-        return self._kept[key]
+            self._on[key] = free, to(rest), to(limits[:, 0]), to(limits[:, 1]), rows
+        return self._on[key]
 
     def put(self, data: mujoco.MjData, values: np.ndarray) -> None:
         """Set the driven joints' positions [J] in qpos, and those of what follows them."""
@@ -122,14 +123,14 @@ class Couplings:
             data.qpos[:] = self.complete(torch.as_tensor(data.qpos.copy())).numpy()
 
     def along(self, columns: np.ndarray, qpos: np.ndarray) -> np.ndarray:
-        """Columns [..., nv] of a Jacobian by dof as those [..., J] of the driven joints, at a state [nq]: what follows
-        moves along."""
+        """Return columns [..., nv] of a Jacobian by dof as those [..., J] of the driven joints, at a state [nq]: what
+        follows moves along."""
         if not self.passive:
             return columns[..., self.dof]
         return columns @ self.motion(qpos)
 
     def motion(self, qpos: np.ndarray) -> np.ndarray:
-        """How fast every dof moves with each driven joint [nv, J], at a state [nq]."""
+        """Return how fast every dof moves with each driven joint [nv, J], at a state [nq]."""
         m = self.model
         out = np.zeros((m.nv, len(self.address)))
         ends = np.repeat(np.asarray(qpos, float)[None], 2 * len(self.address), 0)
@@ -149,7 +150,7 @@ def _one_dof(m: mujoco.MjModel, j: int) -> bool:
 
 
 def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:
-    """Coefficients [nq] of a fixed tendon; None: a spatial one."""
+    """Return coefficients [nq] of a fixed tendon; None: a spatial one."""
     out = np.zeros(m.nq)
     for w in range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t]):
         if m.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT:
@@ -159,7 +160,7 @@ def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:
 
 
 def _lengths(m: mujoco.MjModel, t: int) -> tuple[float, float]:
-    """Least and largest length that a tendon may have."""
+    """Return least and largest length that a tendon may have."""
     for e in range(m.neq):
         if m.eq_type[e] == mujoco.mjtEq.mjEQ_TENDON and m.eq_obj1id[e] == t and m.eq_obj2id[e] < 0:
             length = float(m.tendon_length0[t] + m.eq_data[e, 0])

@@ -55,8 +55,8 @@ def limits(spec: mujoco.MjSpec, joints: list[str], where: str) -> np.ndarray:
 
 
 def root_body(spec: mujoco.MjSpec, joints: list[str], tip: str, palm: str) -> str:
-    """Name of the body where a finger begins: the one that its first joint moves; of a finger that is pulled by a
-    tendon, or follows another, alone, the one on the palm."""
+    """Return name of the body where a finger begins: the one that its first joint moves; of a finger that is pulled
+    by a tendon, or follows another, alone, the one on the palm."""
     if joints and not (first := spec.joint(joints[0]).parent.name).startswith(DRIVE):
         return str(first)
     body = spec.body(tip)

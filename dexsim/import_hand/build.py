@@ -157,7 +157,7 @@ def build(
 
 
 def _spring(m: mujoco.MjModel, j: int) -> str:
-    """What a joint is where the model is drawn, and its spring, where it has them."""
+    """Return what a joint is where the model is drawn, and its spring, where it has them."""
     at = int(m.jnt_qposadr[j])
     said = [("ref", m.qpos0[at]), ("stiffness", m.jnt_stiffness[j])]
     if m.jnt_stiffness[j]:
@@ -166,13 +166,13 @@ def _spring(m: mujoco.MjModel, j: int) -> str:
 
 
 def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> str:
-    """Dry friction of a joint without a drive: that of driven ones is their servo's."""
+    """Return dry friction of a joint without a drive: that of driven ones is their servo's."""
     level = m.dof_frictionloss[m.jnt_dofadr[j]]
     return f' frictionloss="{_n(level)}"' if j in tree.passive and level else ""
 
 
 def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]) -> tuple[list[str], str, str]:
-    """Lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
+    """Return lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
     names = {m.joint(j).name for j in tree.every}
     drums, tendons, ties = [], [], []
     for pull in pulls:
@@ -219,7 +219,8 @@ def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]
 
 
 def pull_range(m: mujoco.MjModel, pull: Pull) -> tuple[float, float]:
-    """Least and largest length of a pulled tendon: what its joints' limits leave, or the file's own range within."""
+    """Return least and largest length of a pulled tendon: what its joints' limits leave, or the file's own range
+    within."""
     ends = np.array([np.sort(c * m.jnt_range[m.joint(j).id]) for j, c in pull.arms.items()]).sum(0)
     low, high = (float(x) for x in ends)
     if pull.range is not None and low < pull.range[1] and pull.range[0] < high:

@@ -84,7 +84,7 @@ def lay_over(hand: dict[str, Any], fixes: Corrections) -> None:
 
 
 def _laid(node: Any, place: str, value: Any) -> bool:
-    """Whether `place` was found below `node`, and given the value; names have dots of their own."""
+    """Return whether `place` was found below `node`, and given the value; names have dots of their own."""
     if isinstance(node, list):
         named = [x for x in node if isinstance(x, dict) and place.startswith(f"{x.get('name')}.")]
         named.sort(key=lambda x: -len(str(x["name"])))

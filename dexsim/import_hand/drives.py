@@ -34,7 +34,8 @@ class Drives:
 
 
 def read(spec: mujoco.MjSpec) -> Drives:
-    """The drives of a model's joints, seen at the joint: of an actuator with gear g, torques times g, gains times g^2.
+    """Return the drives of a model's joints, seen at the joint: of an actuator with gear g, torques times g, gains
+    times g^2.
 
     Several actuators on one joint add up: `position` beside `velocity` is a PD drive.
     """
@@ -96,7 +97,7 @@ def read(spec: mujoco.MjSpec) -> Drives:
 
 
 def fixed_arms(tendon: Any) -> dict[str, float]:
-    """Coefficients by joint of a tendon; empty for one that is routed over sites and geoms."""
+    """Return coefficients by joint of a tendon; empty for one that is routed over sites and geoms."""
     out: dict[str, float] = {}
     for wrap in tendon.path:
         try:
@@ -114,7 +115,7 @@ def _degrees(spec: mujoco.MjSpec) -> bool:
 
 
 def contacts(spec: mujoco.MjSpec) -> list[str]:
-    """A line for what the file says of contact: dexsim's law of contact, and what tasks draw, take its place."""
+    """Return a line for what the file says of contact: dexsim's law of contact, and what tasks draw, take its place."""
     plain = mujoco.MjSpec().worldbody.add_geom()
     names = ("friction", "solref", "solimp", "condim", "margin", "gap")
     solid = [g for g in spec.geoms if g.contype or g.conaffinity]
@@ -123,7 +124,7 @@ def contacts(spec: mujoco.MjSpec) -> list[str]:
 
 
 def joints(spec: mujoco.MjSpec) -> list[str]:
-    """Lines for what the file says of joints and links and dexsim's hand does not have."""
+    """Return lines for what the file says of joints and links and dexsim's hand does not have."""
     plain = mujoco.MjSpec().worldbody.add_body().add_joint()
     out = []
     for what in ("margin", "solref_limit", "solimp_limit", "solref_friction", "solimp_friction", "actgravcomp"):

@@ -95,7 +95,7 @@ def check(
 
 
 def mended(source: Source, tree: Tree, inertia: str | None) -> list[str]:
-    """A line for each inertia that is none and was mended; inertia: "shapes", "balance", or None: not asked for.
+    """Return a line for each inertia that is none and was mended; inertia: "shapes", "balance", or None: not asked for.
 
     Raises UserError, which lists them, for links that move, where nobody asked. What is held has an inertia that never
     counts.
@@ -114,7 +114,7 @@ def mended(source: Source, tree: Tree, inertia: str | None) -> list[str]:
 
 
 def _moves(m: mujoco.MjModel, body: int, palm: int) -> bool:
-    """Whether a joint lies between the palm and a body."""
+    """Return whether a joint lies between the palm and a body."""
     joints = 0
     while body > palm:
         joints += int(m.body_jntnum[body])

@@ -60,8 +60,8 @@ def neutral(m: mujoco.MjModel) -> np.ndarray:
 def motions(
     m: mujoco.MjModel, fingers: list[Finger], flexion: list[list[int] | None], closes: list[list[int] | None]
 ) -> tuple[list[Motion], list[str]]:
-    """How every finger moves, and a line for each whose closing side is not sure; flexion, closes: where a person has
-    said them, else None.
+    """Return how every finger moves, and a line for each whose closing side is not sure; flexion, closes: where a
+    person has said them, else None.
 
     The joints that bend a finger have the axis of the distal one (within 37 degrees) where all joints are at 0. They
     close it together, as their axes say, towards the end that brings its tip nearer to the other fingertips; where
@@ -98,8 +98,8 @@ LEAN = 0.2  # of a joint's range, more on one side of 0 than on the other: less 
 def _closing(
     m: mujoco.MjModel, d: mujoco.MjData, fingers: list[Finger], bends: list[list[int]], tips: list[np.ndarray]
 ) -> tuple[list[list[int]], list[str]]:
-    """Which way the joints of each finger close it, and a doubt, or "", for each. d: at `neutral`; tips [F][3] m: in
-    the tips' frames."""
+    """Return which way the joints of each finger close it, and a doubt, or "", for each. d: at `neutral`; tips [F][3]
+    m: in the tips' frames."""
     together, ends, room = [], [], []
     for finger, joints, tip in zip(fingers, bends, tips, strict=True):
         sign = [int(np.sign(d.xaxis[j] @ d.xaxis[joints[-1]])) if m.jnt_type[j] == HINGE else 1 for j in joints]
@@ -144,7 +144,7 @@ def _closing(
 
 
 def _tip(m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, last: int) -> np.ndarray:
-    """The end of a finger [3] m, in its tip's frame; last: id of its last flexion joint."""
+    """Return the end of a finger [3] m, in its tip's frame; last: id of its last flexion joint."""
     distal = finger.joints[-1]
     points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0]
     world = d.xmat[finger.tip].reshape(3, 3)
@@ -163,7 +163,7 @@ def _tip(m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, last: int) -> np.n
 def _moved(
     m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, flexion: list[int], closes: list[int], position: np.ndarray
 ) -> Motion:
-    """A finger's motion; d: at `neutral`."""
+    """Return a finger's motion; d: at `neutral`."""
     distal, last = finger.joints[-1], flexion[-1]
     world = d.xmat[finger.tip].reshape(3, 3)
     tip = tip_at(d, finger.tip, position)

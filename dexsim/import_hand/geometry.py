@@ -81,7 +81,7 @@ def solid(m: mujoco.MjModel, body: int) -> list[int]:
 
 
 def solid_geoms(body: Any) -> list[Any]:
-    """As `solid`, of a body of a model that is still being edited."""
+    """Return the same as `solid`, of a body of a model that is still being edited."""
     return [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
 
 

@@ -201,7 +201,7 @@ def import_hand(
 
 
 def _driven(m: mujoco.MjModel, found: tree.Tree, pulls: Sequence[Pull]) -> list[str]:
-    """Names of what commands go to: joints with a drive of their own, and actuators that pull tendons."""
+    """Return names of what commands go to: joints with a drive of their own, and actuators that pull tendons."""
     return [m.joint(j).name for j in found.joints] + [p.name for p in pulls]
 
 
@@ -246,7 +246,7 @@ def _renamed(place: str, names: dict[str, str]) -> str:
 def _motions(
     m: mujoco.MjModel, fingers: list[tree.Finger], fixes: Corrections, pick: Callable[..., Any], pulls: list[Pull]
 ) -> tuple[list[frame.Motion], list[str]]:
-    """How each finger moves, with what a person said of it, and what is not sure of its closing side."""
+    """Return how each finger moves, with what a person said of it, and what is not sure of its closing side."""
     bends: list[list[int] | None] = []
     for finger in fingers:
         place = f"fingers.{finger.name}.flexion"
@@ -454,7 +454,8 @@ def _hand(
 def _of_drives(
     m: mujoco.MjModel, found: tree.Tree, x: frame.Motion, pulls: list[Pull]
 ) -> tuple[list[str], list[str], list[int]]:
-    """A finger's driven joints and the actuators that pull it; of these, those that bend it, and the sign that does."""
+    """Return a finger's driven joints and the actuators that pull it; of these, those that bend it, and the sign that
+    does."""
     inside = {m.joint(j).name for j in x.finger.joints}
     own = [m.joint(j).name for j in x.finger.joints if j not in found.passive]
     mine = [p for p in pulls if set(p.arms) & inside]

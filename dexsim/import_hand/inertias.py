@@ -76,7 +76,7 @@ def fill(body: Any, density: float) -> None:
 
 
 def refused(moments: dict[str, Moments], path: object) -> UserError:
-    """The error that lists all of them."""
+    """Return the error that lists all of them."""
     figures = "; ".join(f"'{name}' {' '.join(f'{x:.3g}' for x in m)}" for name, m in moments.items())
     return UserError(
         f"model {path}: {len(moments)} moving link{'s' if len(moments) > 1 else ''} with moments of inertia that no"

@@ -12,8 +12,8 @@ GET = "git clone https://github.com/google-deepmind/mujoco_menagerie, or pip ins
 
 
 def folders() -> list[Path]:
-    """Where a copy of MuJoCo Menagerie may lie: $MUJOCO_MENAGERIE, beside or below the working directory, and the cache
-    of the package robot_descriptions."""
+    """Return where a copy of MuJoCo Menagerie may lie: $MUJOCO_MENAGERIE, beside or below the working directory, and
+    the cache of the package robot_descriptions."""
     said = os.environ.get("MUJOCO_MENAGERIE")
     cache = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or "~/.cache/robot_descriptions").expanduser()
     places = [Path(said).expanduser()] if said else []
@@ -22,7 +22,8 @@ def folders() -> list[Path]:
 
 
 def model(text: str) -> Path:
-    """The model file of `menagerie:NAME` (its right hand) or `menagerie:NAME/FILE`; any other text is a path itself.
+    """Return the model file of `menagerie:NAME` (its right hand) or `menagerie:NAME/FILE`; any other text is a path
+    itself.
 
     Raises UserError, which says how to get the files, where there are none, and which there are, where the name is
     none of them.

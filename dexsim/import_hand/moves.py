@@ -134,7 +134,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def faults(table: Sequence[Move]) -> list[str]:
-    """A line for each joint that does not do what hand.yaml says of it."""
+    """Return a line for each joint that does not do what hand.yaml says of it."""
     still = [f"{m.joint} does not move its fingertip: is tip.body right?" for m in table
              if m.finger >= 0 and m.travel < 0.001]  # fmt: skip
     return still + [

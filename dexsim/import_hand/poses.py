@@ -48,7 +48,7 @@ class Search:
         self.names = [self.m.body(b).name for b in range(self.m.nbody)]
 
     def complete(self, q: np.ndarray) -> np.ndarray:
-        """Angles [nq] with those that follow where the others hold them."""
+        """Return angles [nq] with those that follow where the others hold them."""
         return self.couplings.complete(torch.as_tensor(q)).numpy() if self.passive else q
 
     def tips(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +180,7 @@ def opened(s: Search, closed: np.ndarray) -> np.ndarray:
 
 
 def gap(s: Search, q: np.ndarray) -> float:
-    """Distance [m] between the opposing fingertips, their mean, and the others'."""
+    """Return distance [m] between the opposing fingertips, their mean, and the others'."""
     tips = s.tips(q)[0]
     others = [k for k in range(len(s.motions)) if k not in s.thumbs]
     return float(np.linalg.norm(tips[s.thumbs].mean(0) - tips[others].mean(0)))

@@ -169,7 +169,7 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
 
 
 def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> tuple[list[str], set[str]]:
-    """What ties joints together, a line each, and the joints that follow others. Taken out where coupled is
+    """Return what ties joints together, a line each, and the joints that follow others. Taken out where coupled is
     "independent". moved: joints that an actuator of the file moves."""
     found, things, passive = [], [], set()
     closed: list[str] = []
