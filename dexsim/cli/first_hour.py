@@ -389,6 +389,7 @@ class Hour:
 
         step = Step("excite", "A recorded excitation, its audit and diagnosis")
         most = self.most
+        self.s.relax()
         m = mechanism(hand=self.hand)
         names = [self.hand.joints[j] for j in self.joints]
         p = plan(m, names, self.given["kinds"].split(","), 0, 100.0, Limits(current=1e-3 * most))
@@ -571,6 +572,7 @@ def walk(
                     continue
             try:
                 hour.found[name] = step = work()
+                session.relax()  # nobody turns the loop while a person reads, or a motion is planned
             except Stopped as why:
                 hour.found[name] = step = Step(name, name, "bad", [f"let go: {why}"])
                 stopped = f"step {name}: {why}"
