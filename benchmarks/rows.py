@@ -1,7 +1,8 @@
 """Rows of the paper's ablation tables, and of ours: each is trained and judged by the same commands.
 
     python -m benchmarks.rows table=rotation|grasp|fingertips [rows=full,no_touch] [seeds=1,2] [gpus=0,1]
-                              [iterations=N] [out=out/rows] [judge=KEY=VALUE,...] [any setting of train.py]
+                              [iterations=N] [out=out/rows] [judge=KEY=VALUE,...] [on=slurm|dask]
+                              [any setting of train.py]
 
 table: `rotation` and `grasp` are the paper's tables, `fingertips` asks with less help from the palm what each sense is
 worth. rows: by name (all). seeds: one training each. gpus: as many trainings at a time as there are names; none: one,
@@ -15,21 +16,15 @@ with its 95 % interval (Welch), which needs two seeds of each row. Writes OUT/TA
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 import numpy as np
 from scipy import stats
-from tqdm import tqdm
 
 from benchmarks import tools
+from dexsim.console import jobs
 from dexsim.errors import UserError
 
 OBSERVE, REWARD = "task.observe", "task.rewards"
@@ -117,31 +112,15 @@ def measured(path: Path, measure: str) -> float:
     return float("nan") if value is None else float(value)
 
 
-def train_and_judge(folder: Path, task: str, settings: list[str], judge: list[str], gpu: str | None) -> Path:
-    """Train and judge one row with one seed, unless that was done; return its metrics.json. Raises UserError."""
-    metrics, run = folder / "judged" / "metrics.json", folder / "run"
-    if metrics.is_file():
-        return metrics
-    device, env = ("cpu", {}) if gpu is None else ("cuda", {"CUDA_VISIBLE_DEVICES": gpu})
-    if (run / "last.pt").is_file():
-        begin = [f"resume={run / 'last.pt'}"]
-    else:
-        shutil.rmtree(run, ignore_errors=True)  # it ended before it had saved anything
-        begin = [f"task={task}", f"device={device}", *settings]
-    judging = [f"checkpoint={run / 'policy.pt'}", f"device={device}", "video=false", *judge]
+def job_of(folder: Path, task: str, settings: list[str], judge: list[str], device: str) -> jobs.Job:
+    """Return what trains and judges one row with one seed: judged/metrics.json in its folder."""
+    run = folder / "run"
+    judging = (f"checkpoint={run / 'policy.pt'}", f"device={device}", "video=false", *judge)
     commands = (
-        ["train", *begin, "final_episodes=0", f"out={run}"],
-        ["play", *judging, f"out={metrics.parent}"],
+        ("train", f"task={task}", f"device={device}", *settings, "final_episodes=0", f"out={run}"),
+        ("play", *judging, f"out={folder / 'judged'}"),
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    for command in commands:
-        log = folder / f"{command[0]}.log"
-        with open(log, "w", encoding="utf-8") as file:
-            done = subprocess.run([sys.executable, "-m", "dexsim", *command], cwd=tools.ROOT, env=os.environ | env,
-                                  stdout=file, stderr=subprocess.STDOUT)  # fmt: skip
-        if done.returncode:
-            raise UserError(f"{' '.join(command)} ended with status {done.returncode}: see {log}")
-    return metrics
+    return jobs.Job(commands, folder, resumes=True)
 
 
 def compare(more: list[float], fewer: list[float]) -> tuple[float, float, float, str]:
@@ -180,28 +159,25 @@ def main(argv: list[str]) -> dict[str, Any]:
     if unknown := [n for n in names if n not in table.rows]:
         raise UserError(f"rows={unknown[0]}: must be of {', '.join(table.rows)}")
     out = Path(own["out"]).expanduser().resolve()
-    free: Queue[str | None] = Queue()
-    gpus: list[str | None] = [g for g in own["gpus"].split(",") if g] or [None]
-    for gpu in gpus:
-        free.put(gpu)
-
-    def one(job: tuple[str, int]) -> float:
-        name, seed = job
-        gpu = free.get()
-        try:
-            path = train_and_judge(
-                out / own["table"] / name / f"seed_{seed}", table.task,
-                [*table.rows[name].settings, f"seed={seed}", *settings],
-                [f"seed={1000 + seed}", *(x for x in own["judge"].split(",") if x)], gpu,
-            )  # fmt: skip
-        finally:
-            free.put(gpu)
-        return measured(path, table.measure)
-
-    jobs = [(name, seed) for seed in tools.numbers(own["seeds"], "seeds") for name in names]
-    with ThreadPoolExecutor(len(gpus)) as pool:
-        values = list(tqdm(pool.map(one, jobs), "rows", len(jobs)))
-    found = {name: [v for (n, _), v in zip(jobs, values, strict=True) if n == name] for name in names}
+    gpus = [g for g in own["gpus"].split(",") if g]
+    engine, settings = jobs.taken(settings, gpus)
+    device = "cuda" if gpus or engine.on != "local" else "cpu"
+    each = [(name, seed) for seed in tools.numbers(own["seeds"], "seeds") for name in names]
+    work = [
+        job_of(
+            out / own["table"] / f"{name}_seed_{seed}", table.task,
+            [*table.rows[name].settings, f"seed={seed}", *settings],
+            [f"seed={1000 + seed}", *(x for x in own["judge"].split(",") if x)], device,
+        )
+        for name, seed in each
+    ]  # fmt: skip
+    left = [job for job in work if not (job.folder / "judged" / "metrics.json").is_file()]
+    status = jobs.run(left, engine) if left else []
+    for job, ended in zip(left, status, strict=True):
+        if ended:
+            raise UserError(f"{job.folder.name} ended with status {ended}: see {job.note.with_suffix('.txt')}")
+    values = [measured(job.folder / "judged" / "metrics.json", table.measure) for job in work]
+    found = {name: [v for (n, _), v in zip(each, values, strict=True) if n == name] for name in names}
     result = {"benchmark": "rows", "table": own["table"], "measure": table.measure, "found": found}
     (out / f"{own['table']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(show(table, found))

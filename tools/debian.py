@@ -79,7 +79,7 @@ def main(argv: list[str]) -> int:
                         shutil.copy(SOURCE / name, target)
             elif word == "RUN":
                 if links and "download.pytorch.org" in rest:  # the wheel is here already
-                    rest = re.sub(r" --index-url \S+", " --no-index --find-links /wheels", rest)
+                    rest = re.sub(r" --index-url [^\s;]+", " --no-index --find-links /wheels", rest)
                 inside(root, folder, env, ["/bin/sh", "-c", rest])
             elif word in ("ENTRYPOINT", "CMD"):
                 entry, command = (json.loads(rest), command) if word == "ENTRYPOINT" else (entry, json.loads(rest))

@@ -39,8 +39,9 @@ class Job:
     """Commands of dexsim, run in turn until one fails.
 
     commands: each the arguments behind `program`. folder: what they write into; what is said of the job, and what it
-    says, stands beside it in jobs/NAME.json and jobs/NAME.txt. program: how dexsim is called. resumes: a job that was
-    lost goes on from the folder's last.pt (`dexsim train`).
+    says, stands beside it in jobs/NAME.json and jobs/NAME.txt. program: how dexsim is called. resumes: the first
+    command is `train ... out=PLACE`, and a job that was lost goes on from PLACE/last.pt. Commands that had ended are not
+    repeated.
     """
 
     commands: tuple[tuple[str, ...], ...]
@@ -112,7 +113,7 @@ def run(jobs: Sequence[Job], engine: Engine) -> list[int]:
 def attempt(job: Job, env: Mapping[str, str] | None = None) -> int:
     """Run a job's commands here; returns the status of the one that failed, or 0. What an earlier attempt has left,
     whose machine or worker was lost, is put aside first; its process is ended where it still lives."""
-    commands, number, note = job.commands, 1, job.note
+    commands, number, note, done = job.commands, 1, job.note, 0
     note.parent.mkdir(parents=True, exist_ok=True)
     if note.is_file():
         before = json.loads(note.read_text("utf-8"))
@@ -122,22 +123,27 @@ def attempt(job: Job, env: Mapping[str, str] | None = None) -> int:
             limit = time.monotonic() + 30
             while system.lives(before["pid"]) and time.monotonic() < limit:
                 time.sleep(0.1)
-        aside = note.with_name(f"{job.folder.name}_lost_{number - 1}")
-        if job.folder.exists():
-            shutil.move(job.folder, aside)
-        if job.resumes and (aside / "last.pt").is_file():
-            commands = (("train", f"resume={aside / 'last.pt'}", f"out={job.folder}"),)
+        done = int(before["done"])
+        if not done:
+            aside = note.with_name(f"{job.folder.name}_lost_{number - 1}")
+            if job.folder.exists():
+                shutil.move(job.folder, aside)
+            if job.resumes:
+                place = Path(next(a for a in reversed(commands[0]) if a.startswith("out=")).removeprefix("out="))
+                last = aside / place.relative_to(job.folder) / "last.pt"
+                if last.is_file():
+                    commands = (("train", f"resume={last}", f"out={place}"), *commands[1:])
     job.folder.mkdir(parents=True, exist_ok=True)
     began, status = time.perf_counter(), 0
 
     def write(pid: int | None) -> None:
         about = {"commands": commands, "attempt": number, "host": files.HOST, "pid": pid, "status": status,
-                 "seconds": round(time.perf_counter() - began, 1)}  # fmt: skip
+                 "done": done, "seconds": round(time.perf_counter() - began, 1)}  # fmt: skip
         with files.beside(note) as part:
             part.write_text(json.dumps(about), "utf-8")
 
     write(None)
-    for command in commands:
+    for command in commands[done:]:
         with open(note.with_suffix(".txt"), "ab") as log:
             # a session of its own: a terminal's Ctrl-C reaches whoever waits for the job, who passes it on once
             process = subprocess.Popen([*job.program, *command], env={**os.environ, **(env or {})}, stdout=log,
@@ -151,6 +157,8 @@ def attempt(job: Job, env: Mapping[str, str] | None = None) -> int:
                 raise
         if status:
             break
+        done += 1
+        write(None)
     write(None)
     return status
 
