@@ -5,5 +5,4 @@ from setuptools import find_namespace_packages, setup
 setup(
     packages=[*find_namespace_packages(include=["dexsim*"]), "dexsim.policies"],
     package_dir={"dexsim.policies": "checkpoints"},
-    package_data={"dexsim.policies": ["*.pt"]},
 )

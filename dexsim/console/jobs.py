@@ -40,8 +40,8 @@ class Job:
 
     commands: each the arguments behind `program`. folder: what they write into; what is said of the job, and what it
     says, stands beside it in jobs/NAME.json and jobs/NAME.txt. program: how dexsim is called. resumes: the first
-    command is `train ... out=PLACE`, and a job that was lost goes on from PLACE/last.pt. Commands that had ended are not
-    repeated.
+    command is `train ... out=PLACE`, and a job that was lost goes on from PLACE/last.pt. Commands that had ended are
+    not repeated.
     """
 
     commands: tuple[tuple[str, ...], ...]
