@@ -51,7 +51,7 @@ def check(cfg: dict[str, Any]) -> None:
         value = get(cfg, key)
         if value is not None:
             if isinstance(value, str):
-                raise UserError(f"{key}='{value}': must be a number, not text")
+                raise UserError(f"{key}={value}: must be a number, not text")
             typed.number(key, value, low, high, exact=whole)
     if cfg.get("save_worlds") not in (None, True, False):
         raise UserError(f"save_worlds={cfg['save_worlds']}: must be true, false or null")
