@@ -382,7 +382,7 @@ def test_bad_files_and_arguments(tmp_path):
     (tmp_path / "text.xyzzy").write_text("not a mesh")
     good = write(trimesh.creation.box((0.05, 0.05, 0.05)), tmp_path / "good.stl")
     for path, scale, said in (
-        (tmp_path / "none.stl", 1.0, "no such file"),
+        (tmp_path / "none.stl", 1.0, "does not exist"),
         (tmp_path / "text.stl", 1.0, "text.stl"),
         (tmp_path / "text.xyzzy", 1.0, "cannot be read"),
         (good, 0.0, "must be a positive number"),
