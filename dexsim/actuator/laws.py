@@ -670,11 +670,12 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
                     now = wp.vector(memory[SETPOINT], memory[SETPOINT_SPEED])
                     if memory[SETPOINT_NEW] > type(e)(0.5):
                         now = wp.vector(target - e, (target - e - memory[SETPOINT]) / dt)
-                    now = profiled(now[0], now[1], target, of[PROFILE_SPEED], of[PROFILE_ACCELERATION], dt)
-                memory[SETPOINT] = now[0]
-                memory[SETPOINT_SPEED] = now[1]
+                    most, gains = of[PROFILE_SPEED], of[PROFILE_ACCELERATION]
+                    now = profiled(now[0], now[1], target, most, gains, dt)  # type: ignore[index]
+                memory[SETPOINT] = now[0]  # type: ignore[index]
+                memory[SETPOINT_SPEED] = now[1]  # type: ignore[index]
                 memory[SETPOINT_NEW] = wp.where(fresh, type(e)(1.0), type(e)(0.0))
-                lost += target - now[0]
+                lost += target - now[0]  # type: ignore[index]
                 left = e - lost
         if wp.static("rare" in features):
             kind = of[DEADBAND_KIND]

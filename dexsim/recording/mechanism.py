@@ -311,8 +311,8 @@ def drive(
         qvel[0, dofs] = torch.as_tensor(velocity / scale)
     lead = None
     if follow is not None:
-        joint = engine.joint(follow[0])
-        q, v = int(engine.mjm.jnt_qposadr[joint]), int(engine.mjm.jnt_dofadr[joint])
+        leading = engine.joint(follow[0])
+        q, v = int(engine.mjm.jnt_qposadr[leading]), int(engine.mjm.jnt_dofadr[leading])
         lead, lead_speed = _path(follow[1], steps, timestep)
         qpos[0, q : q + 7] = torch.as_tensor(lead[0])
     qpos = Couplings(engine.mjm, m.joints).complete(qpos) if m.hand and m.hand.couplings.passive else qpos
@@ -350,7 +350,7 @@ def drive(
             state["enabled"] += 1
         if changed and k % every == 0:
             for column, x in changed:
-                column[:] = x.value[max(np.searchsorted(x.t, t, side="right") - 1, 0)]
+                column[:] = x.value[max(int(np.searchsorted(x.t, t, side="right")) - 1, 0)]
         if led is not None:
             q_view[led_q], v_view[led_v] = held_q[k], held_v[k]
         if lead is not None:
@@ -529,7 +529,7 @@ class Led:
     """Joints that follow a path, whatever the dynamics: by name times [n] s and position, speed, acceleration [n] as
     their encoders report them."""
 
-    paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+    paths: dict[str, tuple[np.ndarray, ...]]
 
     @property
     def joints(self) -> list[str]:

@@ -463,8 +463,9 @@ class HandEnv(VecEnv):
         if graph is None:
             graph = torch.cuda.CUDAGraph()
             graph.register_generator_state(self.rng)
-            how = {"stream": torch.cuda.current_stream(), "capture_error_mode": "thread_local"}
-            with unrecordable(self.task["name"]), self._constants, torch.cuda.graph(graph, **how):
+            now = torch.cuda.current_stream()
+            recording = torch.cuda.graph(graph, stream=now, capture_error_mode="thread_local")
+            with unrecordable(self.task["name"]), self._constants, recording:
                 part()
             self._recorded[name] = graph
         graph.replay()

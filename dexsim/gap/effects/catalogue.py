@@ -76,14 +76,13 @@ def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[
         for c in vars(family).values()
         if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
     ]
-    own: list[Entry] = [*found, *_brought(kind)]
-    return in_order(own, first)
+    return in_order(found + _brought(kind), first)
 
 
 def _brought(kind: type[Entry]) -> list[Entry]:
     """Those of installed packages: entry points of the group `dexsim.effects`. Raises UserError for one that is no
     effect."""
-    out = []
+    out: list[Entry] = []
     for name, point in door.installed("dexsim.effects").items():
         made = door.load(point.value, f"effect {name} (entry point of dexsim.effects)")
         if not (isinstance(made, type) and issubclass(made, Effect | TouchEffect)):

@@ -443,7 +443,12 @@ def _stepped(
             changes.before(k)
             lead(k)
             seen[k].copy_(servo.position())
-            engine.step(1, lambda k=k: (servo.before_each(), lead(k)))
+
+            def forces(k: int = k) -> None:
+                servo.before_each()
+                lead(k)
+
+            engine.step(1, forces)
             if given is not None:
                 given[k].copy_(servo.torque)
     return seen
@@ -642,7 +647,8 @@ def replay_files(
         return None
     t = cases[0].plant.t
     written = Mechanism(spec, m.joints, table, m.robot, m.hand, m.part_of)
-    judged, parts = [c.joint for c in cases], []
+    judged = [c.joint for c in cases]
+    parts: list[tuple[str, float, float]] = []
     total = {j: np.zeros(2) for j in judged}
     each: dict[str, dict[str, np.ndarray]] = {}
     for w in range(len(ws.window)):

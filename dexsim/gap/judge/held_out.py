@@ -236,7 +236,9 @@ def by_motion(runs: list[Run], cases: list[Case]) -> dict[int, dict[str, float]]
     for i, run in enumerate(runs):
         mine = [p for p in pairs if run is p[0] or run is p[1]]
         if mine:
-            each = {c.joint: [tuple((x, x.t, x.q[:, c.index]) for x in p) for p in mine] for c in cases}
+            each = {
+                c.joint: [((a, a.t, a.q[:, c.index]), (b, b.t, b.q[:, c.index])) for a, b in mine] for c in cases
+            }
             out[i] = {c.joint: max(_apart(each[c.joint]), c.sigma) for c in cases}
     return out
 

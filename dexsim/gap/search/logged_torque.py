@@ -242,7 +242,9 @@ def told(
         if "inertia" in case.factors and "inertia_scale" not in claimed:
             ours["inertia"] = x.value["inertia"] / case.scales.inertia
         if known and (case.joint in strange or _alike(case, search, trial, ours, test, span_test)):
-            columns = {n: (case.scales.nominal[n], *case.ranges[n]) for n in known}
+            columns: dict[str, tuple[float, float, float]] = {
+                n: (case.scales.nominal[n], *case.ranges[n]) for n in known
+            }
             out[case.joint] = Told(case.joint, columns, ours.get("inertia"))
     return out
 
