@@ -22,7 +22,8 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     for names in (
         "errors paths version rotation intervals system",
         "guard door agents",
-        "console files typed",
+        "files typed",
+        "console",
         "outputs yaml_text model_file",
         "assets hand",
         "sim",

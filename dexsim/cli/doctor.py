@@ -96,7 +96,7 @@ def gpu() -> Iterator[Line]:
     if torch.cuda.is_available():
         free = system.shared_memory() if torch.cuda.device_count() > 1 else None
         if free is not None and free < SHARED_MIN:
-            yield LACKS, "/dev/shm", (
+            yield LACKS, str(system.SHARED), (
                 f"{free >> 20} MiB, which several GPUs talk through: docker run --shm-size=1g, or NCCL_SHM_DISABLE=1"
             )
         return
