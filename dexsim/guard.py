@@ -45,6 +45,7 @@ SECONDS_A_MIB, TIMES_SIZE = 3.0, 16
 """What is added for a file's size: s a MiB, and bytes a byte."""
 WAITING_S = 1.5
 """s without any processor time, asleep, after which a reader is taken to wait for a pipe or a device."""
+WAITS = "names a pipe, a device or a socket, which is no file: reading it waits without end"
 FULL = re.compile("(could not|unable to|cannot|failed to) allocate|out of memory|bad_alloc|unknown exception", re.I)
 """What libraries say where they are given no more memory; the last is MuJoCo."""
 TRUSTED = "DEXSIM_LIMITS"
@@ -76,19 +77,27 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     times = _times()
     seconds = times * (patience * SECONDS + SECONDS_A_MIB * size / 2**20)
     most = int(times * (BYTES + TIMES_SIZE * size))
-    context: Any = multiprocessing.get_context(system.start_method())
-    receive, send = context.Pipe(False)
-    child = context.Process(target=_child, args=(send, function, args, seconds, most, wanted))
-    try:
-        child.start()
-        send.close()
-        answer = _answer(receive, child.pid or 0, 10 * seconds)
-        child.join(1.0)
-    finally:
-        receive.close()
-        if child.is_alive():
-            child.kill()
-        child.join()
+    answer: Any = ""
+    for method in dict.fromkeys((system.start_method(), "spawn")):
+        context: Any = multiprocessing.get_context(method)
+        receive, send = context.Pipe(False)
+        child = context.Process(target=_child, args=(send, function, args, seconds, most, wanted))
+        try:
+            try:
+                child.start()
+            except (pickle.PicklingError, AttributeError, TypeError):  # a new process cannot be given this reader
+                break
+            send.close()
+            answer = _answer(receive, child.pid or 0, 10 * seconds)
+            child.join(1.0)
+        finally:
+            receive.close()
+            if child.pid is not None:
+                if child.is_alive():
+                    child.kill()
+                child.join()
+        if answer != WAITS:  # a fork may wait for a lock that a thread of this process held; a new process does not
+            break
     if isinstance(answer, BaseException):
         raise answer
     if isinstance(answer, tuple):
@@ -123,7 +132,7 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         if spent != used or not asleep:
             used, moved = spent, now
         if now - moved > WAITING_S:
-            return "names a pipe, a device or a socket, which is no file: reading it waits without end"
+            return WAITS
         if now - begun > wall:
             return f"takes more than {wall:.0f} s to read"
     try:

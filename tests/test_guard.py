@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import socket
+import threading
 import time
 
 import numpy as np
@@ -72,12 +74,16 @@ def test_only_regular_files_are_opened(tmp_path):
     there.close()
 
 
+def _opened_by_c(path):
+    return ctypes.CDLL(None).open(path.encode(), os.O_RDONLY)
+
+
 def test_a_library_that_waits_for_a_pipe_is_ended(tmp_path, monkeypatch):
     """As C code opens one: no hook of Python's sees it."""
-    monkeypatch.setattr(guard, "WAITING_S", 0.3)
-    read, _write = os.pipe()
+    monkeypatch.setattr(guard, "WAITING_S", 0.5)
+    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="^file x: names a pipe"):
-        guard.call(os.read, read, 1, what="file x")
+        guard.call(_opened_by_c, str(tmp_path / "pipe"), what="file x")
 
 
 def test_limits_grow_with_the_file_and_where_it_is_trusted(monkeypatch):
@@ -90,3 +96,28 @@ def test_limits_grow_with_the_file_and_where_it_is_trusted(monkeypatch):
     monkeypatch.setenv(guard.TRUSTED, "0.5")
     with pytest.raises(UserError, match="DEXSIM_LIMITS=0.5"):
         guard.call(np.ones, 1, what="file x")
+
+
+LOCK = threading.Lock()
+
+
+def _under_the_lock(x):
+    with LOCK:
+        return x + 1
+
+
+def test_a_lock_that_a_thread_held_at_the_fork_is_no_pipe():
+    """A fork copies a held lock, and nobody there lets go of it."""
+    free = threading.Event()
+
+    def hold():
+        with LOCK:
+            free.wait(30)
+
+    holder = threading.Thread(target=hold, daemon=True)
+    holder.start()
+    try:
+        assert guard.call(_under_the_lock, 1, what="file x") == 2
+    finally:
+        free.set()
+        holder.join()
