@@ -231,6 +231,20 @@ def test_of_a_joint_what_follows_best_is_written(errors, chosen):
     assert full_model.choose(errors, 0.1) == chosen
 
 
+def test_what_was_found_is_beaten_where_it_follows_worse_beyond_the_belief_and_the_noise():
+    """The plain model is written in each; plant: what was found leaves where the plain model leaves 1."""
+    for plant, noise, chosen, beaten in (
+        (1.04, 0.1, "plain", False),
+        (1.07, 0.1, "plain", True),
+        (1.07, 0.1, "found", False),
+        (1.25, 1.0, "plain", False),
+        (1.35, 1.0, "plain", True),
+    ):
+        given = [full_model.Candidate("found", plant, None), full_model.Candidate("plain", 1.0, None)]
+        written = full_model.Written({"j": given}, {}, {"j": chosen})
+        assert written.beaten("j", noise) is beaten, (plant, noise, chosen)
+
+
 def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs():
     """For a gain that each recording states itself, the fit's factor is written; of the rest its value."""
     believed = {"joints": {"*": {"kp": 5.0, "kd": 0.1, "delay": 0.01, "coulomb_friction": 0.02}}}

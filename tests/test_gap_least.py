@@ -95,7 +95,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=Fal
     answer._fitted = lambda mm, bounds: ({}, bounds)
     answer.case = SimpleNamespace(joint="j", sigma=0.1, quantum=0.0)
     answer.before = answer.after
-    answer.outcome = SimpleNamespace(confidence={"lag": 1.0}, folds={})
+    answer.outcome = SimpleNamespace(confidence={"lag": 1.0}, folds={}, best=SimpleNamespace(folds=[]))
     answer.search = SimpleNamespace(unasked=set(), r=SimpleNamespace(sigma_torque=1.0))
     answer.member.variant.params = []
     answer.member.effect.doubts, answer.member.effect.of_pose = lambda *_: [], lambda *_: False

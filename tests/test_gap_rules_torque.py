@@ -190,36 +190,6 @@ def test_a_drive_may_act_late_by_its_loops_period_or_the_readings():
         assert found == pytest.approx(BELIEF.late / 0.75 * late), (rate, apart)
 
 
-def handed(after: float, plain: float, sigma: float) -> bool:
-    """Return whether an answer with an error `after` on what was held out is handed on beside the plain model's
-    `plain`."""
-    scales = SimpleNamespace(nominal={"coulomb_friction": 1.0}, slide=False)
-    case = SimpleNamespace(joint="j", plant=None, scales=scales)
-    trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
-    block = np.repeat(np.arange(20), 10)
-    model = baseline.Baseline("j", {}, 1.0, plain, np.ones(200), np.full(200, plain**2), block)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baseline, "expand", lambda *_: np.zeros((1, 1, len(baseline.INDEX))))
-        fits = [(case, trial, np.full(200, after**2))]
-        return not baseline.refused([model], {"j": {"after": after, "sigma": sigma}}, fits, [0], 0.0)
-
-
-def test_an_answer_that_follows_worse_than_the_plain_model_is_not_handed_on():
-    assert handed(1.04, 1.0, 0.01) and not handed(1.07, 1.0, 0.01)
-
-
-def test_an_answer_within_the_noise_is_handed_on():
-    assert handed(1.25, 1.0, 1.0) and not handed(1.5, 1.0, 1.0)
-
-
-def test_an_answer_must_surely_be_worse_than_the_plain_model():
-    block = np.repeat(np.arange(20), 10)
-    for worse, sure in ((12, False), (19, True)):  # of 20 stretches, all by as much: 75 %, all bootstraps
-        squares = np.where(block < worse, 1.5, 0.5)
-        plain = baseline.Baseline("j", {}, 1.0, 1.0, np.ones(200), np.ones(200), block)
-        assert baseline._surely(squares, plain) is sure, worse
-
-
 def test_a_cutoff_is_halved_while_that_sheds_noise():
     for left, cutoff in ((0.7, 30.0), (0.9, 60.0)):  # of the misfit, by the first halving; nothing by others
         at = lambda c, left=left: (recorded(np.zeros(len(T)), 0.2 * (1.0 if c == 60.0 else left)),) * 2  # noqa: E731

@@ -555,12 +555,6 @@ class TorqueRules:
         "a sound servo's law gives all of the variance of its recorded duty (BAM's recordings)",
         "test_a_drive_is_sound_by_its_logged_duty",
     )
-    surely: float = _rule(
-        0.95,
-        "share of the bootstraps in which an answer must be worse than the plain model not to be handed on",
-        "the customary 95 %",
-        "test_an_answer_must_surely_be_worse_than_the_plain_model",
-    )
     shed: float = _rule(
         0.8,
         "of the misfit: what halving the cutoff leaves at most, where what it sheds is noise of derivatives",

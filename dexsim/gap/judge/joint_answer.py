@@ -360,7 +360,7 @@ class JointAnswer:
         """Return what each fit without one condition makes of an effect's parameters [F, P]."""
         index = [[p.key for p in self.best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
         folds = [x[index] for x in self.outcome.best.folds if len(x) == len(self.best.fit.params)]
-        return np.array(folds).reshape(-1, len(index))
+        return np.array(folds).reshape(len(folds), len(index))
 
     def floor_beyond(self) -> float:
         """What repeats differ by beyond what was found [rad or m]; inf without repeats."""

@@ -105,7 +105,7 @@ def curves(
 
 def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], unit: str, width: int = 560) -> str:
     """Horizontal bars: (name, value, low, high, colour); values share one scale."""
-    left, right, step = 118, 118, 38
+    left, right, step = 156, 118, 38
     height = step * len(rows) + 6
     top = max([*(max(r[1], r[3] or 0.0) for r in rows), 1e-12])
     x = lambda v: left + v / top * (width - left - right)  # noqa: E731
