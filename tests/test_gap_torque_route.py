@@ -65,6 +65,7 @@ def run(
         q=q + 1e-5 * rng.standard_normal(q.shape),
         torque=torque,
         torque_unit="N.m",
+        read=None,
         gravity=np.array([0, 0, -9.81]),
         duration=float(t[-1] - t[0]),
     )
