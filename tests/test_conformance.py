@@ -64,12 +64,10 @@ class Twin:
             if isinstance(value, torch.Tensor):
                 getattr(w.objects, name).copy_(value)
         for name, value in vars(c).items():
-            if (
-                isinstance(value, torch.Tensor)
-                and isinstance(getattr(w, name), torch.Tensor)
-                and not name.startswith("_")
-            ):
-                getattr(w, name).copy_(value)
+            if not name.startswith("_") and isinstance(value, torch.Tensor):
+                to = getattr(w, name)
+                if isinstance(to, torch.Tensor):
+                    to.copy_(value)
         w._episode_length.copy_(c._episode_length)
         w.rng.set_state(c.rng.get_state())
         w.engine.refresh()
