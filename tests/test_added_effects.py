@@ -205,10 +205,10 @@ def soft_dead_zone(width: Any, e: Any):
 ''',
     "@cache\ndef lost_error(",
     ((
-        "        if wp.abs(e) < width:\n            acts = type(e)(0.0)\n            if kind",
+        "        if wp.abs(left) < width:\n            acts = type(e)(0.0)\n            if kind",
         '''        if wp.static("dead_zone" in features):
             if of[DEAD_ZONE] > type(e)(0.0):
-                soft = soft_dead_zone(of[DEAD_ZONE], e)
+                soft = soft_dead_zone(of[DEAD_ZONE], left)
                 lost += soft[0]
                 slope += soft[1]
 ''',

@@ -28,7 +28,10 @@ def test_claims_name_rows_of_their_table():
 def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
     asked = []
 
-    def run(command, **_):
+    def attempt(job, env=None):
+        return max(run([*job.program, *command]) for command in job.commands)
+
+    def run(command):
         asked.append(command[3:])
         out = next(a.removeprefix("out=") for a in command if a.startswith("out="))
         if command[3] == "play":
@@ -36,9 +39,9 @@ def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
             folder = rows.Path(out)
             folder.mkdir(parents=True)
             (folder / "metrics.json").write_text(json.dumps({"consecutive_successes": {"average": value}}))
-        return type("Done", (), {"returncode": 0})
+        return 0
 
-    monkeypatch.setattr(rows.subprocess, "run", run)
+    monkeypatch.setattr(rows.jobs, "attempt", attempt)
     argv = ["table=rotation", "rows=full,no_touch", "seeds=1,2", f"out={tmp_path}", "worlds=8", "judge=episodes=4"]
     first = rows.main(argv)
     assert len(asked) == 8 and {"task=rotate", "device=cpu", "seed=1", "worlds=8"} <= set(asked[0])

@@ -625,7 +625,7 @@ def profiled(at: Any, speed: Any, target: Any, most: Any, acceleration: Any, dt:
     speed `most` [rad/s], which changes by at most acceleration [rad/s2] * dt and comes to rest at the target.
 
     A trapezoid in discrete time: in k steps of a deceleration a the setpoint goes a dt^2 k (k + 1) / 2, so that the
-    fastest from which it stops within |d| is a dt (sqrt(1/4 + 2 |d| / (a dt^2)) - 1/2)."""
+    fastest from which it stops within |d| is a dt (sqrt(1/4 + 2 |d| / (a dt^2)) - 1/2). Ours."""
     away = target - at
     size = wp.abs(away)
     fast = wp.min(most, size / dt)

@@ -28,6 +28,10 @@ Line = tuple[str, str, str]
 EXTRAS = {
     "deploy": ("onnxruntime", "dexsim export, dexsim deploy"),
     "objects": ("coacd", "hollow meshes as objects"),
+    "lerobot": ("pyarrow", "LeRobot data sets: recordings=DATASET, dexsim convert format=lerobot"),
+    "zarr": ("zarr", "recordings in Zarr: recordings=FILE.zarr"),
+    "hdf5": ("h5py", "recordings in HDF5: recordings=FILE.hdf5"),
+    "ros2": ("cyclonedds", "driver=ros2 and dexsim record where there is no ROS 2"),
     "cluster": ("submitit", "on=slurm, on=dask"),
     "hub": ("huggingface_hub", "checkpoint=hub:..."),
     "wandb": ("wandb", "agent.logger=wandb"),
