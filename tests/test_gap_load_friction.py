@@ -91,7 +91,7 @@ def test_training_is_given_a_share_of_the_torque_from_outside(searched):
 def test_the_engine_that_trains_comes_near():
     """It has no part of the joint's own inertia in that friction."""
     c = replayed("load_friction", "of the torque on the joint", gear(1.3, gear_load_unit=0.05), [1.3, 1.3])
-    assert c.errors["found"][0] < 0.5 * c.errors["believed"][0], c.errors
+    assert c.errors["joint"]["found"] < 0.5 * c.errors["joint"]["refitted"], c.errors
 
 
 def test_the_law_is_tried_in_the_place_of_others_only():
