@@ -84,7 +84,7 @@ def test_a_reward_that_the_task_does_not_know_is_one_line(name, weight, said):
     cfg["task"]["rewards"][name] = weight
     with pytest.raises(UserError, match=said) as error:
         make_env(cfg, 2, "cpu", 0)
-    assert "dexsim/configs/task/grasp.yaml" in str(error.value) and "\n" not in str(error.value)
+    assert "(dexsim.tasks.grasp)" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_every_reward_has_a_weight_and_words(env):

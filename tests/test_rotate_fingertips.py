@@ -288,6 +288,6 @@ def test_bad_settings_are_named(setting):
 def test_the_included_policy_is_not_exported_to_a_loop_without_a_camera(tmp_path):
     from dexsim.export import export
 
-    with pytest.raises(UserError, match="camera and arm the deployed loop does not read"):
+    with pytest.raises(UserError, match="camera and arm are not read by the deployed loop"):
         export(str(CHECKPOINT), tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
