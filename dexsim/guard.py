@@ -22,6 +22,7 @@ torch's own loaders of data do. Where there is no safe fork (macOS, Windows) it 
 from __future__ import annotations
 
 import faulthandler
+import gc
 import multiprocessing
 import os
 import pickle
@@ -152,6 +153,7 @@ def _child(
     """The process: works out, answers, ends."""
     global _inside
     _inside = True
+    gc.freeze()  # what a fork would collect of the program may wait for a thread that is not here
     system.limit(seconds, most)
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_RDWR)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import signal
 import socket
@@ -121,3 +122,26 @@ def test_a_lock_that_a_thread_held_at_the_fork_is_no_pipe():
     finally:
         free.set()
         holder.join()
+
+
+class _Ends:
+    """Leaves a file behind when it is collected."""
+
+    def __init__(self, mark):
+        self.me, self.mark = self, mark
+
+    def __del__(self):
+        self.mark.touch()
+
+
+def test_a_fork_collects_nothing_of_the_program(tmp_path):
+    """What a program no longer needs may end a thread, a server or a folder, which are the program's to end."""
+    gc.disable()
+    try:
+        _Ends(tmp_path / "ended")
+        guard.call(gc.collect, what="file x")
+        assert not (tmp_path / "ended").exists()
+    finally:
+        gc.enable()
+    gc.collect()
+    assert (tmp_path / "ended").exists()
