@@ -81,7 +81,7 @@ def test_reading_has_its_share_and_names_what_it_left(limit, read, clock, monkey
         clock[0] += 5.0
         return SimpleNamespace(path=path, duration=1.0, states=SimpleNamespace(position=None))
 
-    machine = SimpleNamespace(joints=("a",), hand=None)
+    machine = SimpleNamespace(joints=("a",), hand=None, ranges={})
     monkeypatch.setattr(mechanism, "mechanism", lambda *_, **__: machine)
     monkeypatch.setattr(mechanism, "stated_hand", lambda *_: None)
     monkeypatch.setattr(recording, "read", slow)
