@@ -60,9 +60,10 @@ def test_each_gpu_has_one_job_at_a_time(tmp_path):
     assert sorted((job.folder / "env.txt").read_text() for job in work) == ["5", "5", "7", "7"]
 
 
-def test_ctrl_c_reaches_what_runs_and_begins_nothing_more(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_reaches_what_runs_and_begins_nothing_more(number, tmp_path):
     work = made(tmp_path, *[(("a", "60", "0"),)] * 3)
-    threading.Timer(1.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    threading.Timer(1.5, lambda: os.kill(os.getpid(), number)).start()
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         jobs.run(work, jobs.Engine(at_once=2))

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from dexsim import files, system
+from dexsim.console.stop import Stop
 from dexsim.console.tables import duration
 from dexsim.errors import UserError
 from dexsim.typed import whole
@@ -90,9 +91,9 @@ def taken(argv: Sequence[str], devices: Sequence[str] = ()) -> tuple[Engine, lis
 
 def run(jobs: Sequence[Job], engine: Engine) -> list[int]:
     """Run all jobs, saying what ends and how long the rest will take; returns their exit statuses, LOST of one that was
-    lost for good. Ctrl-C ends those that run. Raises UserError for an engine that is not here."""
+    lost for good. Ctrl-C, SIGTERM and SIGHUP end those that run. Raises UserError for an engine that is not here."""
     status, began = [LOST] * len(jobs), time.perf_counter()
-    with _ENGINES[engine.on.partition("=")[0]](engine, jobs) as begin:
+    with Stop(), _ENGINES[engine.on.partition("=")[0]](engine, jobs) as begin:
         waiting = {begin(job): k for k, job in enumerate(jobs)}
         ended = 0
         while waiting:
