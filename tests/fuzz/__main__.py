@@ -1,14 +1,16 @@
 """`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [processes=1] [out=FOLDER]`:
 damaged files without end.
 
-Each case has a limit of 20 s of processor time and 2 GiB of memory; one that is taken must be taken as it stands, or
-something said of it (`silence.py`). What breaks is kept in out= (out/fuzz) with its
+Each case has a limit of 20 s and 2 GiB of memory, what its readers take included; one that is taken must be taken as it
+stands, or something said of it (`silence.py`). What breaks is kept in out= (out/fuzz) with its
 seed; `python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke.
-kind=ci: every third a recording, as continuous integration runs it.
+kind=ci: every third a recording, as continuous integration runs it. from=source: a seed that is read off the code of
+dexsim and of these tests, new after each change and nobody's choice.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -30,6 +32,8 @@ from . import corpus, mutate, targets
 OTHERS = [k for k in targets.TARGETS if k != "recording"]
 OUTCOMES = ("fine", "refused", "traceback", "message", "silent", "over 20 s", "over 2 GB", "crash")
 SECONDS, BYTES = 20.0, 2 << 30
+KIB = 1024 if sys.platform == "linux" else 1
+"""Bytes that `ru_maxrss` counts in."""
 BATCH = 200
 CI = [k for a, b in zip(OTHERS[::2], OTHERS[1::2], strict=True) for k in ("recording", a, b)]
 """Kinds in turn."""
@@ -47,10 +51,12 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
     def stop(*_):
         raise TooLong
 
-    signal.signal(signal.SIGVTALRM, stop)
-    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
+    signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         answer = targets.verdict(kind, path)
+        if KIB * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss > BYTES:  # the largest reader yet
+            raise MemoryError
         if answer in ("fine", "refused"):
             return answer, "", path
         return "silent" if answer.startswith("silent: ") else "message", answer, path
@@ -61,7 +67,7 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
     except Exception:
         return "traceback", traceback.format_exc(limit=-4), path
     finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 def work(kinds: list[str], first: int, count: int, files: dict[str, list[Path]], out: Path, send) -> None:
@@ -105,6 +111,7 @@ class Run:
         self.counts: Counter[str] = Counter()
         self.broken: dict[str, list[str]] = {}
         self._batches: dict[Connection, Batch] = {}
+        self._begun = self._said = time.monotonic()
 
     def go(self, processes: int, until: float) -> None:
         """Until the seeds or the time (of `time.monotonic`) are over; batches under way are finished."""
@@ -117,6 +124,15 @@ class Run:
                 return
             for receive in wait(list(self._batches)):
                 self._hear(receive)
+            if time.monotonic() > self._said + 20:
+                self._said = time.monotonic()
+                done = sum(self.counts.values())
+                rate = done / (self._said - self._begun)
+                print(f"{json.dumps(self.said())}  {rate:.1f} cases/s", flush=True)
+
+    def said(self) -> dict[str, int]:
+        """Cases by outcome, and the seed that is next."""
+        return {"cases": sum(self.counts.values()), **{k: self.counts[k] for k in OUTCOMES}, "next": self.next}
 
     def _start(self, first: int, last: int) -> None:
         receive, send = multiprocessing.Pipe(False)
@@ -155,6 +171,15 @@ class Run:
         self.broken.setdefault(line, []).append(f"{kind} {seed}")
 
 
+def source_seed() -> int:
+    """A seed below 10^9 from the text of every module of dexsim and of these tests."""
+    read = hashlib.sha256()
+    for folder in ("dexsim", "tests/fuzz"):
+        for path in sorted((corpus.ROOT / folder).rglob("*.py")):
+            read.update(path.read_bytes())
+    return int(read.hexdigest(), 16) % 10**9
+
+
 def main(argv: list[str]) -> int:
     given = dict(a.split("=", 1) for a in argv if "=" in a)
     if set(given) - {"minutes", "cases", "kind", "from", "processes", "out"} or any("=" not in a for a in argv):
@@ -165,11 +190,11 @@ def main(argv: list[str]) -> int:
     until = time.monotonic() + 60 * float(given.get("minutes", 60))
     with tempfile.TemporaryDirectory() as folder:
         files = corpus.build(Path(folder))  # once, and with it what reading them needs is loaded before the forks
-        run = Run(kinds, int(given.get("from", 0)), int(given.get("cases", 10**12)), Path(given.get("out", "out/fuzz")),
-                  files)  # fmt: skip
+        first = source_seed() if given.get("from") == "source" else int(given.get("from", 0))
+        print(f"from={first}", flush=True)
+        run = Run(kinds, first, int(given.get("cases", 10**12)), Path(given.get("out", "out/fuzz")), files)
         run.go(int(given.get("processes", 1)), until)
-    said = {"cases": sum(run.counts.values()), **{k: run.counts[k] for k in OUTCOMES}, "next": run.next}
-    print(json.dumps(said))
+    print(json.dumps(run.said()))
     return int(bool(run.broken))
 
 
