@@ -283,6 +283,7 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
     """Everything that a robot must know, as plain data."""
     from dexsim.deploy import bundle, measure
     from dexsim.deploy.manifests import floats
+    from dexsim.learning.ppo import action_noise
     from dexsim.tactile.layout import touch_shape
 
     hand, (pads, taxels) = env.hand, touch_shape(env.hand)
@@ -299,12 +300,11 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
                       "source": source})  # fmt: skip
         at += width
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
-              "lead": float(task["action"]["lead"]),
+              "lead": floats(env.lead()) if task["action"]["lead"] is None else float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
               "speed_limit_rad_s": floats(hand.speeds), "order": "joints"}  # fmt: skip
-    spread = {k.rsplit(".", 1)[-1]: v for k, v in data["actor"].items() if k.startswith("distribution.")}
-    if "log_std_param" in spread or "std_param" in spread:  # of the actions while training, for noise=
-        action["std"] = floats(spread["log_std_param"].exp() if "log_std_param" in spread else spread["std_param"])
+    if (spread := action_noise(data["actor"])) is not None:  # for noise=
+        action["std"] = floats(spread)
     return {
         "format": bundle.FORMAT, "version": bundle.VERSION, "task": task["name"],
         "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",

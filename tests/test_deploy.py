@@ -35,8 +35,9 @@ def made(tmp_path_factory):
     """Return a bundle whose training had quiet sensors and kept every taxel."""
     folder = tmp_path_factory.mktemp("deploy")
     source = make_checkpoint(
-        folder / "policy.pt", *QUIET, "tactile.raw=true", "task.command.low=0.6", "task.command.high=0.6"
-    )
+        folder / "policy.pt", *QUIET, "tactile.raw=true", "task.command.low=0.6", "task.command.high=0.6",
+        "task.action.lead=null",
+    )  # fmt: skip
     return export.export(str(source), folder / "out", steps=4), source
 
 
@@ -113,6 +114,12 @@ def test_a_replay_with_wrong_calibration_is_seen(made, episode):
     want = observations[: len(got)]
     np.testing.assert_allclose(got[:, 12:24], want[:, 12:24] / 2, atol=1e-5)
     np.testing.assert_allclose(np.delete(got, np.s_[12:24], 1), np.delete(want, np.s_[12:24], 1), atol=1e-5)
+
+
+def test_a_bundle_has_the_lead_that_follows_from_the_torque(made):
+    action = bundle.load(made[0]).manifest["action"]
+    np.testing.assert_allclose(action["lead"][4], 1.1 / 4.0, atol=1e-6)
+    np.testing.assert_allclose(action["lead"][3], 0.4 / 1.5, atol=1e-6)
 
 
 # -- limits

@@ -496,6 +496,7 @@ def edits():
         ("action.scale", nan),
         ("action.scale", "0.1"),
         ("action.lead", -1.0),
+        ("action.lead", [0.1]),
         ("action.low", [0.0]),
         ("action.low.3", nan),
         ("action.low.3", -9.0),

@@ -22,7 +22,7 @@ from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.gym_env import GymVectorEnv
 from dexsim.learning.meter import Meter
-from dexsim.learning.ppo import load_policy, plain_policy
+from dexsim.learning.ppo import action_noise, load_policy, plain_policy
 from dexsim.learning.runner import Runner
 from dexsim.paths import CONFIGS
 
@@ -221,6 +221,18 @@ def test_checkpoint_round_trip(saved, trained):
     with torch.no_grad():
         assert torch.equal(policy(obs), trained.policy()(obs))
     trained.alg.train_mode()
+
+
+def test_a_policy_is_played_with_the_noise_of_its_training(saved, trained):
+    data, obs = checkpoint.load(saved), trained.env.get_observations()
+    still = load_policy(data, trained.env, "last.pt")
+    with torch.no_grad():
+        for share in (0.5, 1.0):
+            noisy = load_policy(data, trained.env, "last.pt", noise=share)
+            off = torch.cat([noisy(obs) - still(obs) for _ in range(400)])
+            torch.testing.assert_close(off.std(0), share * action_noise(data["actor"]), rtol=0.1, atol=0)
+            assert off.mean(0).abs().max() < 0.1 * off.std()
+    assert action_noise({k: x for k, x in data["actor"].items() if "distribution" not in k}) is None
 
 
 def test_policy_file_is_small_and_plays(saved, trained, tmp_path):

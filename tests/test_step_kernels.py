@@ -9,6 +9,7 @@ import torch
 from worlds import grasp_env
 
 from dexsim import rotation
+from dexsim.actuator.columns import INDEX
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.tasks.grasp import CENTRE_LENGTH
 
@@ -198,6 +199,22 @@ def test_actions_become_targets(env, mode):
         torch.testing.assert_close(env.target, target, rtol=0, atol=2e-7)
     finally:
         setting["mode"] = kept
+        env.reset_all()
+
+
+def test_a_lead_that_follows_from_the_torque_loses_none_of_it(env):
+    """Targets run ahead to where the drive is at its limit, and no further: the drive pushes as hard as it can."""
+    env.task["action"]["lead"], kept = None, env.task["action"]["lead"]
+    try:
+        limit, kp = (env.servo.nominal[:, INDEX[k]] for k in ("torque_limit", "kp"))
+        torch.testing.assert_close(env.lead(), (limit / kp).float())
+        env.q.copy_(env.q_low.expand(N, -1)), env.target.copy_(env.q)
+        for _ in range(40):
+            env.act(torch.ones(N, 12))
+        ahead = torch.minimum((limit / kp).float(), env.q_high - env.q_low)
+        torch.testing.assert_close(env.target - env.q, ahead.expand(N, -1))
+    finally:
+        env.task["action"]["lead"] = kept
         env.reset_all()
 
 

@@ -22,6 +22,7 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "view_port": (1, 65535, True),
     "view_seconds": (1, 1e9, False),
     "seed": (0, 2**31 - 1, True),
+    "noise": (0, 2, False),
     "save_interval": (1, 10**9, True),
     "final_episodes": (0, 10**7, True),
     "sim.timestep": (1e-5, 0.02, False),

@@ -25,7 +25,7 @@ def run(start: Start, env: Any, policy: Policy) -> int:
         if name in files:
             data = checkpoint.load(files[name], str(env.device))
             checkpoint.check_layout(data, checkpoint.layout_of(env), str(files[name]))
-            return load_policy(data, env, str(files[name]), start.typed)
+            return load_policy(data, env, str(files[name]), start.typed, float(start.play["noise"]))
         return plain_policy(name, env, start.cfg["seed"])
 
     choices = [*files, *(n for n in PLAIN if n != "scripted" or hasattr(env, "scripted_policy"))]

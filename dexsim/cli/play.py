@@ -28,7 +28,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if start.data is not None:
         checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))
         print(f"policy   {checkpoint.provenance(start.data)}", flush=True)
-        policy = load_policy(start.data, env, str(start.source), start.typed)
+        policy = load_policy(start.data, env, str(start.source), start.typed, float(play["noise"]))
         about = {
             "checkpoint": str(start.source),
             "iteration": start.data["iteration"],

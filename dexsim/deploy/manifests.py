@@ -42,12 +42,15 @@ class Row(msgspec.Struct):
     unit: str
 
 
+Lead = Annotated[float, msgspec.Meta(gt=0, le=10)]
+
+
 class Action(msgspec.Struct):
     """See `dexsim.deploy.action.ActionRule`."""
 
     mode: Literal["relative", "absolute"]
     scale: Annotated[float, msgspec.Meta(gt=0, le=10)]
-    lead: Annotated[float, msgspec.Meta(gt=0, le=10)]
+    lead: Lead | list[Lead]
     low: Joints
     high: Joints
     speed_limit_rad_s: JointsAbove
@@ -228,6 +231,8 @@ def _limits(m: Manifest, source: object, hand: Hand) -> None:
         checks += [("grip.target", m.grip.target, low, high)]
     sizes = [(key, len(values)) for key, values, *_ in checks]
     sizes += [("normalization.tau_max", len(m.normalization.tau_max)), ("policy.action_size", m.policy.action_size)]
+    if isinstance(m.action.lead, list):
+        sizes += [("action.lead", len(m.action.lead))]
     if m.grip is not None:
         sizes += [("grip.hand", len(m.grip.hand))]
     for key, count in sizes:

@@ -72,7 +72,9 @@ def scale_first_actions(actor: torch.nn.Module, factor: object) -> None:
         last.bias.mul_(factor)
 
 
-def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> Any:
+def load_policy(
+    data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset(), noise: float = 0.0
+) -> Any:
     """Return the trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:
@@ -80,6 +82,7 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
         env: the environment rebuilt from its config; gives observation sizes.
         path: the file's name, for messages.
         typed: settings that the user typed (see :func:`agent_config`).
+        noise: of the actions, over the noise of training.
     """
     agent = agent_config(data["config"], str(env.device), typed, path)
     with agent_errors():
@@ -97,7 +100,19 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
                 f"{path}: its policy's actions are not finite in this environment; its weights are out of range, use an"
                 " earlier checkpoint of its run folder"
             )
-    return by_episode(actor, env)
+    policy = by_episode(actor, env)
+    if not noise:
+        return policy
+    if (spread := action_noise(data["actor"])) is None:
+        raise UserError(f"noise={noise:g}: the policy in {path} has no noise of its own; leave noise= out")
+    rng, std = torch.Generator(env.device).manual_seed(env.cfg["seed"]), noise * spread.to(env.device)
+    return lambda obs: (a := policy(obs)) + std * torch.randn(a.shape, generator=rng, device=env.device)
+
+
+def action_noise(actor: dict[str, torch.Tensor]) -> torch.Tensor | None:
+    """Standard deviation [A] of a trained actor's actions, by its state; None where it depends on what it sees."""
+    own = {k.rsplit(".", 1)[-1]: v for k, v in actor.items() if k.startswith("distribution.")}
+    return own["log_std_param"].exp() if "log_std_param" in own else own.get("std_param")
 
 
 def by_episode(actor: Any, env: Any) -> Any:

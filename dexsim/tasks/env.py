@@ -476,11 +476,11 @@ class HandEnv(VecEnv):
         the joint's range."""
         act, reach = self.task["action"], self._reach
         reach.relative = act["mode"] == "relative"
-        moves = float(act.get("scale", 0.0)), float(act.get("lead", 0.0))
+        moves = float(act.get("scale", 0.0)), act.get("lead", 0.0)
         if moves != self._moves:
             self._moves = moves
-            for own, value in zip(self._reaches, moves, strict=True):
-                own[: len(self.hand.joints)] = value
+            self._reaches[0, : len(self.hand.joints)] = moves[0]
+            self._reaches[1, : len(self.hand.joints)] = self.lead()
         inputs = [wp.from_torch(actions.to(torch.float32)), reach, *self._act_args]
         wp.launch(state_kernels.act, dim=actions.shape, inputs=inputs, device=self.device)
         if self.reality is None:
@@ -488,6 +488,15 @@ class HandEnv(VecEnv):
         else:
             late, arrives = self.reality.late(self.num_envs)
             self.servo.send(self.target, arrives, self.engine.t.time + late)
+
+    def lead(self) -> torch.Tensor:
+        """How far targets may run ahead of the measured angles [J] rad: what the task says, or, where that is null, to
+        where the drive's torque reaches its limit. A target that is farther away pushes no harder in simulation; on a
+        hand that is stiffer than its model it does, and unwinding it takes time everywhere."""
+        said, J = self.task["action"].get("lead", 0.0), len(self.hand.joints)
+        if said is not None:
+            return torch.full((J,), float(said), device=self.device)
+        return torch.minimum(self.servo.saturation[:J].float(), (self.q_high - self.q_low)[:J])
 
     def reset_all(self) -> None:
         """Begin an episode in every world."""
@@ -701,7 +710,7 @@ class HandEnv(VecEnv):
             state.xmat, at, seen,
         ]  # fmt: skip
         base = self.scene.base
-        self._moves = 0.0, 0.0
+        self._moves: tuple[float, float | None] = (0.0, 0.0)
         self._reaches = torch.zeros(2, self.num_actions, device=self.device)
         if base is not None:
             far = [[x[0]] * 3 + [x[1]] * 3 for x in (base.scale, base.lead)]
