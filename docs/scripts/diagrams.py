@@ -91,10 +91,42 @@ def task() -> str:
     return svg(boxes, arrows, "Data flow of a control step")
 
 
+def reality() -> str:
+    """Return how a policy is judged in a reality that its training has not seen."""
+    boxes = {
+        "believed": (0, 0, "believed simulator|training's physics"),
+        "training": (1, 0, "training|randomized worlds"),
+        "policy": (2, 0, "policy|a checkpoint"),
+        "play": (3, 0, "play|reality=NAME"),
+        "judged": (4, 0, "judged|held, force, turns"),
+        "real": (3, 1, "reality|other physics, drawn|once from a seed"),
+        "record": (2, 1, "recordings|as the bus reads"),
+        "diagnose": (1, 1, "diagnose|names what differs"),
+        "fit": (0, 1, "servo.yaml|what was found"),
+    }
+    arrows = [("believed", "training"), ("training", "policy"), ("policy", "play"), ("play", "judged"),
+              ("real", "play"), ("real", "record"), ("record", "diagnose"), ("diagnose", "fit"),
+              ("fit", "believed")]  # fmt: skip
+    return svg(boxes, arrows, "A reality: judged in it, diagnosed from it")
+
+
+def assumptions() -> str:
+    """Return where the figures of the simulated hand come from."""
+    boxes = {
+        "read": (0, 0, "published|xHand v1.3: masses,|limits, efforts"),
+        "measured": (1, 0, "one read-back|a real finger: kp, kd"),
+        "ours": (2, 0, "chosen by us|rubber, friction, noise,|PPO, weights"),
+        "model": (0, 1, "hand model"),
+        "servo": (1, 1, "servo table"),
+        "ranges": (2, 1, "randomized ranges|each world its own"),
+    }
+    return svg(boxes, [("read", "model"), ("measured", "servo"), ("ours", "ranges")], "Where the figures come from")
+
+
 def main(argv: Sequence[str]) -> int:
     """Write the diagrams; return the exit status."""
     out = Path(argv[0].removeprefix("out=")) if argv else ROOT / "docs" / "media"
-    for name, text in (("servo", servo()), ("task", task())):
+    for name, text in (("servo", servo()), ("task", task()), ("reality", reality()), ("assumptions", assumptions())):
         (out / f"{name}.svg").write_text(text, encoding="utf-8")
     return 0
 

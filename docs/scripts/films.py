@@ -137,7 +137,7 @@ def touch(out: Path) -> None:
     clip.model.geom_rgba[clip.model.geom_bodyid == body, 3] = 0.25
     for name in ("qpos", "force", "command", "push", "taxels"):
         setattr(clip, name, getattr(clip, name)[-2:])
-    camera = {"lookat": [0.065, 0.0, 0.06], "distance": 0.23, "azimuth": 200.0, "elevation": -38.0}
+    camera = {"lookat": [0.07, 0.0, 0.095], "distance": 0.25, "azimuth": 150.0, "elevation": -25.0}
     film = out / ".touch.mp4"
     render([clip], film, 0.05, env.hand.finger_names, 1.2 * env.f_max, (1280, 720), camera)
     still(film, 0, out / "touch.png")
