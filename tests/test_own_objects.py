@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import ConvexHull
 
 from dexsim import import_object
 from dexsim.assets.objects import decompose, library, mesh, own, parts
@@ -83,6 +86,38 @@ def test_a_hollow_mesh_is_split_and_its_notch_stays_open(tmp_path, monkeypatch):
     assert len(hull.hulls) == 1 and hull.grid.sample(middle)[0] < 0
 
 
+def mug_of_bodies() -> trimesh.Trimesh:
+    """A mug as CAD programs write it: wall, bottom and handle closed each, with faces in common."""
+    wall = trimesh.creation.annulus(r_min=0.03, r_max=0.035, height=0.08, sections=32)
+    bottom = trimesh.creation.cylinder(0.03, 0.005, sections=32)
+    bottom.apply_translation((0, 0, -0.0375))
+    handle = trimesh.creation.box((0.02, 0.008, 0.05))
+    handle.apply_translation((0.045, 0, 0))
+    return trimesh.util.concatenate([wall, bottom, handle])
+
+
+def test_a_mug_of_bodies_that_share_faces_is_split_body_by_body(tmp_path, monkeypatch):
+    taken = []
+
+    def run_coacd(given, max_convex_hull, **_):
+        taken.append((trimesh.Trimesh(*given), max_convex_hull))
+        return [given]
+
+    monkeypatch.setitem(sys.modules, "coacd", SimpleNamespace(
+        Mesh=lambda v, f: (v, f), run_coacd=run_coacd, set_log_level=lambda _: None))  # fmt: skip
+    monkeypatch.setattr(decompose, "available", lambda: True)
+    mug = mug_of_bodies()
+    mug.merge_vertices()
+    hulls = decompose.decompose(mug.vertices, np.asarray(mug.faces), 8, "mug.stl")
+    ((wall, room),) = taken
+    assert wall.is_watertight and wall.volume == pytest.approx(np.pi * (0.035**2 - 0.03**2) * 0.08, rel=0.01)
+    assert room == 6 and len(hulls) == 3  # bottom and handle are convex, the wall has the rest
+    volumes = sorted(ConvexHull(h).volume for h in hulls)
+    assert volumes[0] == pytest.approx(0.02 * 0.008 * 0.05) and volumes[1] == pytest.approx(1.4e-5, rel=0.02)
+    with pytest.raises(UserError, match="mug.stl: is made of 3 closed bodies.*object_hulls=12"):
+        decompose.decompose(mug.vertices, np.asarray(mug.faces), 2, "mug.stl")
+
+
 def test_what_was_worked_out_is_kept_and_a_broken_cache_is_made_anew(tmp_path, monkeypatch):
     path = tmp_path / "u.stl"
     u_mesh().export(path)
@@ -146,8 +181,10 @@ def _plain(**given):
         ({"objects": ["box"], "object_scale": 0}, "object_scale=0: must be a positive number"),
         ({"objects": ["box"], "object_hulls": 99}, "object_hulls=99: must be a whole number from 1 to 32"),
         ({"objects": ["box"], "task": {"name": "press"}}, "task=press: no such task; task can be grasp"),
-        ({"kept_out": ["m.stl"], "task": {"name": "rotate"}, "choices": {"task": "rotate_fingertips"}},
-         "kept_out=.*task=rotate_fingertips.*kept_out= is for tasks that take others"),
+        (
+            {"kept_out": ["m.stl"], "task": {"name": "rotate"}, "choices": {"task": "rotate_fingertips"}},
+            "kept_out=.*task=rotate_fingertips.*kept_out= is for tasks that take others",
+        ),
     ],
 )
 def test_wrong_settings(given, said):

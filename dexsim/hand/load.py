@@ -5,6 +5,9 @@ from __future__ import annotations
 import copyreg
 import difflib
 import os
+import re
+import subprocess
+import sys
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,6 +23,8 @@ HANDS = Path(__file__).parents[1] / "assets"
 """Folders of the hands that come with dexsim."""
 IMPORTED = "hands"
 """Folder of a user's own, in the working directory."""
+NAMED = ("menagerie:", "robot_descriptions:")
+"""Begin names of hands that others describe: imported once, below `hands/`."""
 SCALES = (0.2, 5.0)
 
 
@@ -59,11 +64,11 @@ def _file(which: str | Path) -> Path:
         return path.resolve()
     if text in (mine := _imported()):
         return (Path(IMPORTED) / text / FILE).resolve()
-    if text.startswith("menagerie:"):
-        name = text.partition(":")[2].replace("/", "_")
-        if name in mine:
-            return (Path(IMPORTED) / name / FILE).resolve()
-        raise UserError(f"hand={text}: not imported here yet: dexsim import-hand {text} out={IMPORTED}/{name}")
+    if text.startswith(NAMED):
+        folder = Path(IMPORTED) / re.sub(r"\W+", "_", text.partition(":")[2])
+        if folder.name not in mine:
+            _import(text, folder)
+        return (folder / FILE).resolve()
     names = list(dict.fromkeys((*known(), *mine)))
     near = difflib.get_close_matches(text, names, 1)
     raise UserError(
@@ -71,6 +76,16 @@ def _file(which: str | Path) -> Path:
         + (f"; did you mean {near[0]}?" if near else "")
         + (f"; {path} has no {FILE}: write one, {schema.SEE}" if os.path.isdir(path) else "")
     )
+
+
+def _import(text: str, folder: Path) -> None:
+    """Import a named hand as its user would, in a process of its own."""
+    print(f"hand={text}: imported once, into {folder} ...", flush=True)
+    words = [sys.executable, "-m", "dexsim", "import-hand", text, f"out={folder}"]
+    done = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"import-hand ended with {done.returncode}"]
+        raise UserError(f"hand={text}: {lines[-1].removeprefix('error: ')}")
 
 
 @lru_cache(maxsize=16)

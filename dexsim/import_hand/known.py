@@ -1,14 +1,30 @@
-"""Hands of MuJoCo Menagerie by name: `menagerie:leap_hand`, where its files are on this machine."""
+"""Hands by name: `menagerie:leap_hand` of MuJoCo Menagerie, `robot_descriptions:allegro_hand_mj_description`."""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import os
 from pathlib import Path
 
 from dexsim.errors import UserError
 
-PREFIX = "menagerie:"
-GET = "git clone https://github.com/google-deepmind/mujoco_menagerie, or pip install robot_descriptions and load one"
+EXTRA = "pip install dexsim[hands] fetches it by name"
+
+
+def model(text: str) -> Path:
+    """Return the model file of `menagerie:NAME` (its right hand), `menagerie:NAME/FILE` or `robot_descriptions:NAME`,
+    fetched by those packages where it is not on this machine yet; any other text is a path itself.
+
+    Raises UserError, which says how to get the files, where there are none, and which there are, where the name is
+    none of them.
+    """
+    source, colon, name = text.partition(":")
+    if colon and source == "menagerie":
+        return _of_menagerie(text, *name.partition("/")[::2])
+    if colon and source == "robot_descriptions":
+        return _described(text, name)
+    return Path(text).expanduser()
 
 
 def folders() -> list[Path]:
@@ -21,23 +37,22 @@ def folders() -> list[Path]:
     return [*places, cache / "mujoco_menagerie"]
 
 
-def model(text: str) -> Path:
-    """Return the model file of `menagerie:NAME` (its right hand) or `menagerie:NAME/FILE`; any other text is a path
-    itself.
-
-    Raises UserError, which says how to get the files, where there are none, and which there are, where the name is
-    none of them.
-    """
-    if not text.startswith(PREFIX):
-        return Path(text).expanduser()
-    name, _, file = text.removeprefix(PREFIX).partition("/")
+def _of_menagerie(text: str, name: str, file: str) -> Path:
     roots = [f for f in folders() if f.is_dir()]
-    if not roots:
+    robot = next((r / name for r in roots if (r / name).is_dir()), None) if name and ".." not in name else None
+    if robot is None and importlib.util.find_spec("mujoco_menagerie"):
+        import mujoco_menagerie  # it fetches one robot, a few megabytes, and keeps it
+
+        try:
+            robot = mujoco_menagerie.get(name).path()
+        except (mujoco_menagerie.MenagerieError, OSError) as error:
+            raise UserError(f"{text}: {error}") from None
+    if robot is None and not roots:
         raise UserError(
             f"{text}: no copy of MuJoCo Menagerie here (looked in {', '.join(map(str, folders()))}; the environment"
-            f" variable MUJOCO_MENAGERIE says where one is): {GET}"
+            f" variable MUJOCO_MENAGERIE says where one is): {EXTRA}, or git clone"
+            " https://github.com/google-deepmind/mujoco_menagerie"
         )
-    robot = next((r / name for r in roots if (r / name).is_dir()), None) if name and ".." not in name else None
     if robot is None:
         there = sorted({p.name for r in roots for p in r.iterdir() if p.is_dir() and list(p.glob("*hand*.xml"))})
         raise UserError(f"{text}: no such robot in {roots[0]}; hands there: {', '.join(there) or 'none'}")
@@ -48,3 +63,18 @@ def model(text: str) -> Path:
     if not right:
         raise UserError(f"{text}: no model in {robot}")
     return right[0]
+
+
+def _described(text: str, name: str) -> Path:
+    if importlib.util.find_spec("robot_descriptions") is None:
+        raise UserError(f"{text}: the package robot_descriptions is not here: {EXTRA}")
+    if not name.isidentifier() or importlib.util.find_spec(f"robot_descriptions.{name}") is None:
+        raise UserError(f"{text}: no such description; `robot_descriptions list` names them, e.g. leap_hand_v1")
+    try:
+        found = importlib.import_module(f"robot_descriptions.{name}")  # clones its repository, where it has none yet
+    except Exception as error:  # of git, the network, or the file system
+        raise UserError(f"{text}: {type(error).__name__}: {str(error).strip().splitlines()[-1]}") from None
+    path = getattr(found, "MJCF_PATH", None) or getattr(found, "URDF_PATH", None)
+    if path is None:
+        raise UserError(f"{text}: has neither an MJCF nor a URDF file")
+    return Path(path)

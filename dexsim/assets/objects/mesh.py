@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dexsim import files, guard
 from dexsim.assets.objects.baking import MARGIN, shape_from_hulls
+from dexsim.assets.objects.decompose import CONVEX
 from dexsim.assets.objects.geometry import mass_properties, principal_axes, simplify_hull, union_boundary
 from dexsim.assets.objects.shape import Shape
 from dexsim.assets.objects.shapes import MAX_HULLS, MAX_VERTICES
@@ -24,7 +25,6 @@ MOST_BYTES = 256 << 20
 PATIENCE = 40.0
 """Times the usual limits for a sound surface: CoACD splits a hollow one by a search, and a distance grid is baked."""
 MOST_PARTS = 32  # convex parts of one object
-_CONVEX = 0.99  # share of its hull that a mesh fills to pass for convex
 
 
 def _scale_hint(extent: float, scale: float) -> str:
@@ -170,14 +170,14 @@ def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: i
             corners, inside, outside = simplify_hull(points, MAX_VERTICES)
         except QhullError as error:
             raise UserError(f"mesh {file}: too flat for a convex hull; give it a thickness") from error
-        filled = mass_properties(triangles)[0] / hull_volume
-        if filled < _CONVEX and single and parts > 1:
+        share = mass_properties(triangles)[0] / hull_volume
+        if share < CONVEX and single and parts > 1:
             hulls, said = _split(file, triangles, parts)
             notes, split = notes + said, True
             break
-        if filled < _CONVEX:
+        if share < CONVEX:
             advice = "; pass a list of up to three files of convex parts to keep its hollows" if single else ""
-            notes.append(f"{file.name}: not convex ({100 * filled:.0f} % of its hull); its convex hull is used{advice}")
+            notes.append(f"{file.name}: not convex ({100 * share:.0f} % of its hull); its convex hull is used{advice}")
         if inside > 0 or outside > 0:
             notes.append(
                 f"{file.name}: convex hull simplified to {len(corners)} corners of the same volume, at most "

@@ -1,0 +1,175 @@
+"""Large effects hidden in the transmission of one drive of a coupled hand, and what `dexsim diagnose` says of them.
+
+    python -m benchmarks.hidden_drives hands=hands/inspire,hands/shadow [cases=20] [seed=1] [jobs=1] [limit=600]
+    [out=out/hidden_drives]
+
+Each case draws a hand, a drive that other joints follow (by mimic, equality or tendon; any drive where none does), and
+play, dry friction or elasticity between that drive and its joints. Three drives move, the one with the effect among
+them. The hand is C MuJoCo's model with all of its coupled joints, which the diagnosis does not simulate; its gains,
+limits and friction are each up to 3 % off what is believed; readings come as a bus gives them (rate, jitter, counts,
+milliamperes). seed: a number, or `source`: read off the sources. Named: the first finding is this effect of this drive
+and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case, and one of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.foreign import seed_of_sources
+from benchmarks.options import options
+from dexsim.console.ending import guard
+from dexsim.errors import UserError
+
+SETTINGS = {"hands": "", "cases": 20, "seed": "1", "jobs": 1, "limit": 600, "out": "out/hidden_drives"}
+KINDS = {"play": "backlash", "friction": "coulomb_friction", "elasticity": "compliance"}
+"""What is hidden, and the effect of the catalogue that it is."""
+OFF = 0.03  # how far off each believed figure may be
+MOVED = 3  # drives that a recording moves
+RECORDINGS = {"a": ("triangles", "ladder", "steps"), "b": ("chirp", "random", "holds"), "c": ("random", "triangles")}
+"""Kinds of motion of each; the last is held out."""
+
+
+def drives(hand: Any) -> list[str]:
+    """Return names of a hand's drives that other joints follow; all of them where none does."""
+    moves = hand.couplings.motion(hand.compiled.qpos0)
+    others = np.ones(hand.compiled.nv, bool)
+    others[hand.couplings.dof] = False
+    led = [j for k, j in enumerate(hand.joints) if np.abs(moves[others, k]).max(initial=0.0) > 1e-3]
+    return led or list(hand.joints)
+
+
+def size(kind: str, rng: np.random.Generator, span: float, limit: float) -> dict[str, float]:
+    """Return the column of the servo that has the effect, and its value: added to what is there. Play: 4 to 10 % of the
+    drive's range; friction: 15 to 35 % of its torque limit; elasticity: 6 to 15 % of its range at the torque limit."""
+    if kind == "play":
+        return {"backlash": float(rng.uniform(0.04, 0.10) * span)}
+    if kind == "friction":
+        return {"coulomb_friction": float(rng.uniform(0.15, 0.35) * limit)}
+    return {"softness": float(rng.uniform(0.06, 0.15) * span / limit)}
+
+
+def make(folder: Path, which: Path, kind: str, rng: np.random.Generator) -> dict[str, Any]:
+    """Write the recordings of a hand with a hidden effect into a folder; return the truth."""
+    from dexsim.hand import load_hand
+    from dexsim.recording import write
+    from dexsim.recording.excitation import plan
+    from dexsim.recording.mechanism import drive, of_hand, recorded
+    from dexsim.recording.realistic import realistic
+    from dexsim.recording.schema import COMMANDS, Series
+    from dexsim.sim.quiet import quiet_warp
+
+    quiet_warp("cpu")
+    hand = load_hand(which)
+    believed, true = of_hand(hand), of_hand(hand)
+    hidden = str(rng.choice(drives(hand)))
+    others = [j for j in hand.joints if j != hidden]
+    moved = [hidden, *(str(j) for j in rng.permutation(others)[: MOVED - 1])]
+    moved.sort(key=hand.joints.index)
+    for joint in hand.joints:
+        for column in ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction"):
+            if (value := true.table.value(joint, column).value) is not None:
+                true.table.set(joint, column, value * (1 + rng.uniform(-OFF, OFF)))
+    k = hand.joints.index(hidden)
+    changed = size(kind, rng, float(np.ptp(hand.limits[k])), float(hand.efforts[k]))
+    for column, value in changed.items():
+        true.table.set(hidden, column, value + (true.table.value(hidden, column).value or 0.0))
+    folder.mkdir(parents=True, exist_ok=True)
+    seconds = 0.0
+    for name, kinds in RECORDINGS.items():
+        p = plan(believed, moved, kinds, seed=int(rng.integers(1 << 30)))
+        run = drive(true, Series(p.t, p.value), hand.joints, float(p.t[-1]), initial=p.home)
+        dense = recorded(run, believed, Series(p.t, p.value, COMMANDS), hand.joints, rate=500.0)
+        seen = realistic(dense, seed=int(rng.integers(1 << 30)))
+        seen.meta["source"] = "real"
+        write(folder / f"{name}.mcap", seen)
+        seconds += float(p.t[-1])
+    return {"hand": str(which), "kind": kind, "effect": KINDS[kind], "joint": hidden, "moved": moved, **changed,
+            "seconds": round(seconds, 1)}  # fmt: skip
+
+
+def score(truth: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
+    """Return what the first finding says, and whether it is the hidden effect alone, at its drive alone."""
+    found = diagnosis.get("findings") or []
+    first = found[0] if found else None
+    right = bool(first) and first["effect"] == truth["effect"] and first["where"]["joints"] == [truth["joint"]]
+    said = [f"{f['effect']} of {', '.join(f['where']['joints'])} ({f['confidence']:.2f})" for f in found]
+    return {"right": right, "verdict": diagnosis["verdict"], "said": said}
+
+
+def case(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
+    """Return a case's row: made, diagnosed in a process of its own, and scored; or read, where that was done."""
+    folder = out / str(number)
+    done = folder / "result.json"
+    if done.is_file():
+        return json.loads(done.read_text(encoding="utf-8"))
+    rng = np.random.default_rng([seed, number])
+    kind = list(KINDS)[int(rng.integers(len(KINDS)))]
+    truth = make(folder, hands[int(rng.integers(len(hands)))], kind, rng)
+    row = {"number": number, **truth, **diagnosed(folder, truth, limit)}
+    done.write_text(json.dumps(row), encoding="utf-8")
+    return row
+
+
+def diagnosed(folder: Path, truth: dict[str, Any], limit: int) -> dict[str, Any]:
+    """Return the score of `dexsim diagnose` on a folder of recordings, as a user would run it."""
+    fit, held = [[str(folder / f"{n}.mcap") for n in names] for names in (list(RECORDINGS)[:-1], list(RECORDINGS)[-1:])]
+    words = [f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", f"hand={truth['hand']}",
+             f"out={folder / 'diagnosis'}", "next=false", f"limit={limit}"]  # fmt: skip
+    began = time.perf_counter()
+    with open(folder / "log.txt", "w", encoding="utf-8") as log:
+        subprocess.run([sys.executable, "-m", "dexsim", "diagnose", *words], stdout=log, stderr=subprocess.STDOUT,
+                       env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False)  # fmt: skip
+    file = folder / "diagnosis" / "diagnosis.json"
+    answer = {"verdict": "failed", "findings": []}  # counted, not dropped: no answer is a wrong one
+    if file.is_file():
+        answer = json.loads(file.read_text(encoding="utf-8"))
+    return {**score(truth, answer), "diagnosis_s": round(time.perf_counter() - began, 1)}
+
+
+def main(argv: list[str]) -> int:
+    """Run the cases; print a line of each, and how many were named."""
+    s = options(argv, SETTINGS)
+    hands = [Path(h).resolve() for h in s["hands"].split(",") if h]
+    if not hands:
+        raise UserError("say which hands: hands=FOLDER,FOLDER (of dexsim import-hand)")
+    seed = seed_of_sources() if s["seed"] == "source" else int(s["seed"])
+    out = Path(s["out"]).resolve() / f"seed_{seed}"
+    rows = []
+    with ThreadPoolExecutor(max(1, s["jobs"])) as pool:
+        if s["jobs"] > 1:  # each case in a process of its own, to be made beside the others
+            ask = lambda n: _apart(n, hands, seed, s["limit"], out)  # noqa: E731
+        else:
+            ask = lambda n: case(n, hands, seed, s["limit"], out)  # noqa: E731
+        for row in pool.map(ask, range(s["cases"])):
+            rows.append(row)
+            print(f"{row['number']:>3} {'right' if row['right'] else 'WRONG'} {Path(row['hand']).name:<16}{row['kind']}"
+                  f" of {row['joint']}: {'; '.join(row['said']) or row['verdict']} ({row['diagnosis_s']:.0f} s)",
+                  flush=True)  # fmt: skip
+    line = {"benchmark": "hidden_drives", "seed": seed, "cases": len(rows), "right": sum(r["right"] for r in rows)}
+    line |= {kind: f"{sum(r['right'] for r in mine)} of {len(mine)}" for kind in KINDS
+             if (mine := [r for r in rows if r["kind"] == kind])}  # fmt: skip
+    print(json.dumps(line))
+    (out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    return 0
+
+
+def _apart(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
+    """Return the same as `case`, made in another process."""
+    code = (f"from pathlib import Path; from benchmarks.hidden_drives import case; case({number},"
+            f" [Path(h) for h in {[str(h) for h in hands]!r}], {seed}, {limit},"
+            f" Path({str(out)!r}))")  # fmt: skip
+    subprocess.run([sys.executable, "-c", code], check=True)
+    return case(number, hands, seed, limit, out)
+
+
+if __name__ == "__main__":
+    sys.exit(guard(main, sys.argv[1:], __doc__))
