@@ -15,8 +15,7 @@ import pytest
 import yaml
 
 from benchmarks.concealed import __main__ as command
-from benchmarks.concealed import effects, generate, plant, rigs, same_cases, score, touch
-from dexsim.errors import UserError
+from benchmarks.concealed import effects, generate, plant, rigs, score, touch
 from dexsim.hand import load_hand
 from dexsim.recording import read
 from tests.made_hand import made_hand
@@ -505,29 +504,6 @@ def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, mon
     assert not (tmp_path / "diagnoses" / "late" / "seconds").exists()
     assert json.loads((tmp_path / "diagnoses" / "slow" / "diagnosis.json").read_text())["status"] == "out of time"
     assert command._room(s, begun - 1.5) <= 1.0 and command._room({"until": 0, "limit": 9}, begun) == 9
-
-
-def test_two_runs_of_the_same_cases_are_compared_case_by_case(tmp_path):
-    """Only what both answered counts; another name is shown; other cases under the same name are refused."""
-    published = "benchmarks/concealed/published/seed_32005.tgz"
-    before = same_cases.load(published)
-    some = [json.loads(json.dumps(r)) for r in list(before.values())[:40]]
-    assert {r["group"] for r in some} > {"effect", "none"}
-    effect = next(r for r in some if r["group"] == "effect" and r["right"])
-    effect["said"], effect["right"], effect["alone"] = [["backlash", "joint0", 0.7, []]], False, False
-    file = tmp_path / "results.json"
-    file.write_text(json.dumps({"results": some}))
-    text = same_cases.show(*same_cases.compared(before, same_cases.load(str(file))))
-    assert "| 40 cases |" in text and "the same verdict and\nnames" not in text
-    assert "in 39 of 40; the same verdict and names in 39" in text
-    assert f"- {effect['name']} (effect" in text and "backlash@joint0 0.70" in text
-    effect["tier"] = "none"
-    file.write_text(json.dumps({"results": some}))
-    with pytest.raises(UserError, match=f"case {effect['name']}: .* not the same cases"):
-        same_cases.compared(before, same_cases.load(str(file)))
-    file.write_text("{}")
-    with pytest.raises(UserError, match=r"results.json: must be a results.json"):
-        same_cases.load(str(file))
 
 
 def test_the_first_cases_of_a_set_are_those_of_the_whole(monkeypatch, tmp_path):

@@ -5,8 +5,8 @@
 
 Of each set (a part of one: a gain, a finger, a joint) `diagnose` is run, then `play replay=` on every recording that
 was held out with the files that it wrote, and a least squares of our own (`baseline.py`) is fitted to the same
-recordings. By joint: rms of what was held out as believed, by our own least squares (in its own simulation), by the
-tool's plain fit (as written, in the engine that trains), as reported (`held_out.replayed`) and as `play` prints it.
+recordings. By joint: rms of what was held out as believed, by our own least squares (written and replayed likewise,
+all joints together), by the tool's plain fit (likewise), as reported (`held_out.replayed`) and as `play` prints it.
 Passed where the last is within a tenth of what was reported, and at most 1.05 x the better of belief and plain. limit:
 seconds a diagnosis may take (0: none). Results of each part in out/NAME.json, all in out/written.json.
 """
@@ -129,6 +129,9 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
             limit=limit,
         ),
         say=lambda text: print(f"{time.perf_counter() - begun:6.0f} s  {text}", file=log),
+        progress=lambda done, of, name: print(
+            f"{time.perf_counter() - begun:6.0f} s  searching {name}, {done:.3f} of {of}", file=log
+        ),
     )
     save(d, folder)
     took = time.perf_counter() - begun
@@ -214,6 +217,40 @@ def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, 
     return found
 
 
+def hand_replayed(job: tuple[Part, Path, dict[str, dict[str, Any]], Sequence[dict[str, Any]]]) -> dict[str, Any]:
+    """Write our own least squares of all joints of a part as `diagnose` writes its answer, and replay it as `play`
+    does."""
+    from dexsim.actuator.columns import INDEX
+    from dexsim.gap.effects.body import add_armature
+    from dexsim.gap.judge.handed_on import save_model
+    from dexsim.recording import mechanism
+    from dexsim.sim.quiet import quiet_warp
+
+    part, out, hand, parts = job
+    quiet_warp("cpu")
+    m = mechanism.mechanism(str(part.model), str(part.servo))
+    table, folder = m.table, out / part.name / "by_hand"
+    table.fitted = {}
+    for joint, found in hand.items():
+        x, row = found["figures"], m.table.nominal([joint])[0]
+        table.fitted[joint] = {"kp": x["kp"], "torque_limit": x["limit"]}
+        if row[INDEX["kd"]] > 0:
+            table.fitted[joint]["kd"] = x["kd"]
+        else:
+            table.set(joint, "kd", x["kd"])
+        for name, factor in table.fitted[joint].items():
+            table.set(joint, name, factor * min(float(row[INDEX[name]]), 1e9))
+        for name, column in (("coulomb", "coulomb_friction"), ("viscous", "viscous_friction"), ("delay", "delay"),
+                             ("lag", "lag"), ("offset", "standin_constant")):  # fmt: skip
+            table.set(joint, column, x[name])
+        add_armature(m.spec, joint, x["inertia"])
+    folder.mkdir(parents=True, exist_ok=True)
+    table.save(folder / "servo.yaml")
+    save_model(m.spec, folder / "model.xml")
+    return {"part": part.name, "by_hand": play(part, folder, {p.name: p for p in (*part.recordings, *part.held_out)},
+                                               parts)}  # fmt: skip
+
+
 def judged(row: dict[str, Any]) -> dict[str, bool | None]:
     """Return the two criteria of a joint; None where neither can be said."""
     replayed, reported, plain, believed = (row.get(k) for k in ("replayed", "reported", "plain", "believed"))
@@ -272,23 +309,33 @@ def main(argv: list[str]) -> int:
         waiting = {pool.submit(diagnosed, (p, out, limit)) for p in parts}
         early = [(p, j) for p in parts if p.held_out and p.judged for j in p.judged]
         waiting |= {pool.submit(by_hand, (p, out, j, [])) for p, j in early}
-        hand: dict[tuple[str, str], float] = {}
+        hand: dict[str, dict[str, dict[str, Any]]] = {p.name: {} for p in parts}
         while waiting:
             done = next(as_completed(waiting))
             waiting.discard(done)
             r = done.result()
-            if "joint" in r:
-                hand[r["part"], r["joint"]] = r["error"]
-                continue
-            results[r["part"]] = r
-            print(f"{r['part']}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
-            late = [j for j in r["joints"] if r["parts"] and (by[r["part"]], j) not in early]
-            waiting |= {pool.submit(by_hand, (by[r["part"]], out, j, r["parts"])) for j in late}
+            name = r["part"]
+            if "by_hand" in r:
+                for joint, error in r["by_hand"].items():
+                    results[name]["joints"][joint]["by_hand"] = error
+            elif "joint" in r:
+                hand[name][r["joint"]] = r
+            else:
+                results[name] = r
+                print(f"{name}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
+                late = [j for j in r["joints"] if r["parts"] and (by[name], j) not in early]
+                waiting |= {pool.submit(by_hand, (by[name], out, j, r["parts"])) for j in late}
+            if name in results and "by_hand" not in r:
+                joints = results[name]["joints"]
+                if results[name]["parts"] and set(joints) == set(hand[name]):
+                    for joint, found in hand[name].items():
+                        joints[joint]["by_hand_alone"] = found["error"]
+                    waiting.add(pool.submit(hand_replayed, (by[name], out, hand[name], results[name]["parts"])))
             (out / "written.json").write_text(json.dumps(list(results.values()), default=float), encoding="utf-8")
     ordered = [results[p.name] for p in parts]
     for r in ordered:
-        for joint, row in r["joints"].items():
-            row |= {"by_hand": hand.get((r["part"], joint)), "passed": judged(row)}
+        for row in r["joints"].values():
+            row["passed"] = judged(row)
     (out / "written.json").write_text(json.dumps(ordered, default=float), encoding="utf-8")
     print("\n" + text_of(ordered))
     return 0

@@ -1,0 +1,68 @@
+"""Two versions of `diagnose` on the same cases: which names agree, which are right, and what is told of the time."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks import same_names
+from dexsim.errors import UserError
+
+
+def said(*findings, verdict="explained", seconds=10.0, times=()):
+    return {"verdict": verdict, "findings": [list(f) for f in findings], "seconds": seconds, "times": list(times)}
+
+
+def row(before, after, hidden=("backlash",), kind="effect", which="concealed", number=0):
+    return {"set": which, "number": number, "kind": kind, "hidden": list(hidden), "before": before, "after": after}
+
+
+PLAY = ("backlash", ["elbow"], 0.9, [])
+
+
+def test_a_name_is_the_same_where_effect_and_joint_are():
+    assert same_names.first(said(PLAY)) == same_names.first(said((*PLAY[:2], 0.6, []))) == ("backlash", ("elbow",))
+    assert same_names.first(said(("backlash", ["elbow"], 0.4, []))) == ("none", ())  # a hint is no name
+    other = row(said(PLAY), said(("backlash", ["wrist"], 0.9, [])))
+    text = same_names.text_of([other, row(said(PLAY), said(PLAY), number=1)])
+    assert "concealed 0 (effect; hidden: backlash): explained: backlash@elbow 0.90 -> explained: backlash@wrist" in text
+    assert "concealed 1" not in text
+
+
+def test_right_and_sure():
+    lag = ("lag", ["elbow"], 0.9, [])
+    case = row(said(PLAY), said(lag))
+    assert same_names.right(case, "before") and not same_names.right(case, "after")
+    assert same_names.sure_and_wrong(case, "after") and not same_names.sure_and_wrong(case, "before")
+    # a set of one class that holds it is right and not sure
+    both = row(said(("coulomb_friction", ["elbow"], 0.9, ["coulomb_friction", "backlash"])), said())
+    assert same_names.right(both, "before") and not same_names.sure_and_wrong(both, "before")
+    nothing = row(said(), said(lag), hidden=(), kind="none")
+    assert same_names.right(nothing, "before") and not same_names.right(nothing, "after")
+    # what is in no catalogue: named with doubt is no error, named confidently is one
+    odd = row(said((*lag[:2], 0.6, [])), said(lag), hidden=("cable",), kind="outside")
+    assert same_names.right(odd, "before") and not same_names.right(odd, "after")
+
+
+def test_the_time_left_is_held_against_what_was_left():
+    lines = [(2.0, "  searching elbow (1/1), 20 % done, about 9 s left"),
+             (8.0, "  searching elbow (1/1), 50 % done, about 9 s left"), (12.0, "  searched 1 in 12 s")]  # fmt: skip
+    times = same_names.times_of(lines)
+    assert times == [(2.0, 0.2, 9.0), (8.0, 0.5, 9.0), (12.0, 1.0, 0.0)]
+    assert same_names.told_right([row(said(times=times), said())], "before") == "1 of 2"
+    assert same_names.times_of(lines[:2]) == []  # nobody knows how long it would have taken
+
+
+def test_what_both_have_answered_is_not_run_again(tmp_path, monkeypatch, capsys):
+    (tmp_path / "diagnose.py").write_text("")
+    with pytest.raises(UserError, match="before=nowhere: must be a folder of code"):
+        same_names.main(["before=nowhere"])
+    out = tmp_path / "out" / "seed_5"
+    out.mkdir(parents=True)
+    done = [row(said(PLAY), said(PLAY)), row(said(), said(), (), "none", "planted")]
+    (out / "pairs.jsonl").write_text("".join(json.dumps(r) + "\n" for r in done))
+    asked = ["concealed=1", "planted=1", "seed=5", f"out={tmp_path / 'out'}"]
+    assert same_names.main([f"before={tmp_path}", *asked]) == 0
+    assert [line.split()[:3] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")][1:] == [
+        ["concealed", "1", "1"], ["planted", "1", "1"]]  # fmt: skip
