@@ -30,8 +30,10 @@ KINDS = f"""<mujoco><option timestep="0.005" {OPTION}/>
 <body pos="-0.4 0 0.049"><freejoint/><geom type="box" size="0.05 0.05 0.05" condim="3" friction="0.4"/></body>
 <body pos="0 0.4 0.049"><freejoint/><geom type="sphere" size="0.05" condim="4" friction="1 0.01"/></body>
 <body pos="0 -0.4 0.049"><freejoint/><geom type="sphere" size="0.05" condim="6" friction="1 0.01 0.001"/></body>
-</worldbody></mujoco>"""
-"""A limit, dry friction, and contacts of every number of directions; 25 dofs."""
+<body pos="0 0 1"><joint name="lead" axis="0 1 0" frictionloss="0.02"/><geom size="0.02" pos=".1 0 0"/>
+  <body pos="0.1 0 0"><joint name="follow" axis="0 1 0"/><geom size="0.02" pos=".1 0 0"/></body></body>
+</worldbody><equality><joint joint1="follow" joint2="lead" polycoef="0.1 0.5 0.1 0 0"/></equality></mujoco>"""
+"""An equality, a limit, dry friction, and contacts of every number of directions; 27 dofs."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -151,8 +153,8 @@ def kinds(fibers):
 
 
 def test_every_kind_of_row(kinds):
-    """A limit, dry friction, contacts of 1, 3, 4 and 6 directions; 25 dofs (not a multiple of what a lane reads at
-    once)."""
+    """An equality, a limit, dry friction, contacts of 1, 3, 4 and 6 directions; 27 dofs (not a multiple of what a lane
+    reads at once)."""
     mjm, m, d = kinds
     assert unsupported(mjm, "cpu", d.njmax) is None
     rng, seen = np.random.default_rng(2), set()
@@ -166,6 +168,7 @@ def test_every_kind_of_row(kinds):
         mjw.step(m, d)
     state, row = mujoco.mjtConstraintState, mujoco.mjtConstraint
     for kind, how in (
+        (row.mjCNSTR_EQUALITY, state.mjCNSTRSTATE_QUADRATIC),
         (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARNEG),
         (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARPOS),
         (row.mjCNSTR_LIMIT_JOINT, state.mjCNSTRSTATE_QUADRATIC),
@@ -203,6 +206,9 @@ def test_a_world_without_rows_takes_its_smooth_acceleration():
     assert (e.d.qfrc_constraint.numpy() == 0).all()
 
 
+SWING = "<joint joint='swing' coef='1'/>"
+
+
 def changed(**options) -> mujoco.MjModel:
     model = mujoco.MjModel.from_xml_string(KINDS)
     for name, value in options.items():
@@ -224,8 +230,8 @@ def model_with(end: str, more: str) -> mujoco.MjModel:
         (changed(integrator=mujoco.mjtIntegrator.mjINT_RK4), "integrator"),
         (changed(enableflags=mujoco.mjtEnableBit.mjENBL_SLEEP), "sleep"),
         (changed(disableflags=mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), "nothing"),
-        (model_with("</worldbody>", 2 * "<body><freejoint/><geom size='.1'/></body>"), "37 dofs"),
-        (model_with("</mujoco>", "<equality><joint joint1='swing'/></equality>"), "equality"),
+        (model_with("</worldbody>", 2 * "<body><freejoint/><geom size='.1'/></body>"), "39 dofs"),
+        (model_with("</mujoco>", f"<tendon><fixed frictionloss='1'>{SWING}</fixed></tendon>"), "tendon"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_serve_it_says(model, says):

@@ -64,7 +64,7 @@ class WarpEngine(Engine):
         no_solver = newton.unsupported(model, device, self.njmax)
         if solver == "hand" and no_solver:
             raise UserError(f"sim.solver=hand: {no_solver}; use sim.solver=mujoco")
-        if solver == "auto" and no_solver and model.neq and device.startswith("cuda"):  # a hand of coupled joints
+        if solver == "auto" and no_solver and (model.neq or model.ntendon) and device.startswith("cuda"):  # a hand of coupled joints
             print(f"contact forces by MuJoCo-Warp's own solver: of dexsim's, {no_solver}", flush=True)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()

@@ -26,7 +26,8 @@ class Problem:
     qacc_smooth: wp.array2d(dtype=float)  # [N, V] m/s2
     qfrc_smooth: wp.array2d(dtype=float)  # [N, V] N
     dof_frictionadr: wp.array2d(dtype=int)  # [N, V] row of the dof's dry friction
-    nf: wp.array(dtype=int)  # [N] rows of dry friction, which come first, and
+    ne: wp.array(dtype=int)  # [N] rows of equalities, which come first,
+    nf: wp.array(dtype=int)  # [N] of dry friction, which come next, and
     nefc: wp.array(dtype=int)  # [N] all that there are
     nacon: wp.array(dtype=int)  # [1] contacts of all worlds
     contact_friction: wp.array(dtype=vec5)  # [C]

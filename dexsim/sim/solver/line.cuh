@@ -75,10 +75,10 @@ auto cone_point = [&](const Cone& o, float alpha) {
     }
     return Point{cost, o.dm * r * r1, o.dm * (r1 * r1 + r * (-o.mu * T2))};
 };
-auto single_point = [&](int k, float alpha) {  // a limit, or a contact without friction
+auto single_point = [&](int k, float alpha) {  // an equality, a limit, or a contact without friction
     const float a = jar[k], v = jv[k], d = D[k];
-    const float quad0 = 0.5f * d * a * a, cost0 = a < 0.0f ? quad0 : 0.0f;
-    if (a + alpha * v < 0.0f) {
+    const float quad0 = 0.5f * d * a * a, cost0 = k < ne || a < 0.0f ? quad0 : 0.0f;
+    if (k < ne || a + alpha * v < 0.0f) {
         const float vD = v * d, curve = v * vD, ah = alpha * curve;
         return Point{alpha * (vD * a + 0.5f * ah) + (quad0 - cost0), vD * a + ah, curve};
     }
@@ -119,7 +119,7 @@ for (;; ++iteration) {
         for (int i = lane; i < items; i += 32) {
             const int k = item[i], dim = kind[k];
             if (dim == 1) {
-                if (jar[k] < 0.0f) {
+                if (k < ne || jar[k] < 0.0f) {
                     const float vD = jv[k] * D[k];
                     p_cost += 0.5f * D[k] * jar[k] * jar[k];
                     p_slope += vD * jar[k];
@@ -308,8 +308,8 @@ if (dry) {
 }
 #pragma unroll 1
 for (int k = lane; k < rows; k += 32) {
-    wp::index(solution.force, world, nf + k) = force[k];
-    wp::index(solution.state, world, nf + k) = state[k];
+    wp::index(solution.force, world, row_of(k)) = force[k];
+    wp::index(solution.state, world, row_of(k)) = state[k];
 }
 if (lane == 0) {
     wp::index(solution.niter, world) = iteration;

@@ -12,7 +12,7 @@ auto update_constraint = [&]() {
     for (int i = lane; i < items; i += 32) {
         const int k = item[i], dim = kind[k];
         if (dim == 1) {
-            const bool on = jar[k] < 0.0f;
+            const bool on = k < ne || jar[k] < 0.0f;
             force[k] = on ? -D[k] * jar[k] : 0.0f;
             state[k] = on ? QUADRATIC : SATISFIED;
             continue;

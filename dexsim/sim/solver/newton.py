@@ -35,8 +35,8 @@ def unsupported(model: mujoco.MjModel, device: str, njmax: int) -> str | None:
         return "it reads a sparse Jacobian, and the model asks for another"
     if model.nv > LANES:
         return f"the model has {model.nv} dofs, and {LANES} is the most it takes"
-    if model.neq or model.nflex:
-        return "it knows no equality constraints and no flexible bodies, and the model has some"
+    if model.nflex:
+        return "it knows no flexible bodies, and the model has some"
     if model.ntendon and (model.tendon_frictionloss > 0).any():
         return "it knows dry friction of joints only, and a tendon of the model has some"
     if opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
@@ -116,7 +116,7 @@ def _problem(m: mjw.Model, d: mjw.Data) -> Problem:
     for name in ("tolerance", "ls_tolerance", "impratio_invsqrt"):
         setattr(out, name, getattr(m.opt, name))
     out.M_rowind, out.M_colind = m.M_hinit_i, m.M_colind
-    for name in ("M", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "dof_frictionadr", "nf", "nefc", "nacon"):
+    for name in ("M", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "dof_frictionadr", "ne", "nf", "nefc", "nacon"):
         setattr(out, name, getattr(d, name))
     for name in ("friction", "dim", "efc_address"):
         setattr(out, f"contact_{name}", getattr(d.contact, name))

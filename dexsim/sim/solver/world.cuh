@@ -1,7 +1,7 @@
 // Part 1 of 3 of the function that solves one world (see source.py): the lanes' exchange, and what the world is.
 //
 // Lane j < NV has dof j: column j of the inertia matrix, its dry friction (a row of the constraints by itself), its
-// entries of all vectors. The other rows, limits and contacts, lie in shared memory, their Jacobian dense.
+// entries of all vectors. The other rows, equalities, limits and contacts, lie in shared memory, their Jacobian dense.
 
 constexpr int NV = $NV, STRIDE = $STRIDE, ROWS = $ROWS, SIZE = $SIZE;
 constexpr int SATISFIED = $SATISFIED, QUADRATIC = $QUADRATIC, LINEARNEG = $LINEARNEG, LINEARPOS = $LINEARPOS;
@@ -56,9 +56,12 @@ auto larger = [](float x, float y) { return x > y ? x : y; };
 
 const int nefc_all = wp::index(problem.nefc, world);
 const int nefc = nefc_all < njmax ? nefc_all : njmax;
+const int ne_all = wp::index(problem.ne, world);
+const int ne = ne_all < nefc ? ne_all : nefc;  // rows of equalities, which come first, before those of dry friction
 const int nf_all = wp::index(problem.nf, world);
-const int nf = nf_all < nefc ? nf_all : nefc;
-const int rows = nefc - nf;  // limits and contacts; the rows of dry friction are the lanes' own
+const int nf = nf_all < nefc - ne ? nf_all : nefc - ne;
+const int rows = nefc - nf;  // equalities, limits and contacts; the rows of dry friction are the lanes' own
+auto row_of = [&](int k) { return k < ne ? k : nf + k; };
 if (rows <= above || rows > ROWS) return;
 
 float* J = memory[thread >> 5];
@@ -126,7 +129,7 @@ sync();
 const int nacon = wp::index(problem.nacon, 0);
 #pragma unroll 1
 for (int k = lane; k < rows; k += 32) {
-    const int row = nf + k;
+    const int row = row_of(k);
     const int nnz = wp::index(problem.J_rownnz, world, row), adr = wp::index(problem.J_rowadr, world, row);
     float product = 0.0f;
 #pragma unroll 1
