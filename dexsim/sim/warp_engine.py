@@ -64,7 +64,8 @@ class WarpEngine(Engine):
         no_solver = newton.unsupported(model, device, self.njmax)
         if solver == "hand" and no_solver:
             raise UserError(f"sim.solver=hand: {no_solver}; use sim.solver=mujoco")
-        if solver == "auto" and no_solver and (model.neq or model.ntendon) and device.startswith("cuda"):  # a hand of coupled joints
+        coupled = model.neq or model.ntendon  # a hand's joints that follow others
+        if solver == "auto" and no_solver and coupled and device.startswith("cuda"):
             print(f"contact forces by MuJoCo-Warp's own solver: of dexsim's, {no_solver}", flush=True)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
