@@ -62,6 +62,23 @@ def test_a_joint_that_follows_the_negative_of_its_target_is_named():
     assert wrong(r, 9.0, sign=-0.6) == "" and wrong(r, 9.0, sign=-0.8) == "sign"
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sweep_beyond_the_resonance_is_no_other_sign(sign):
+    """A joint on a weak spring, swept from 0.2 to 8 Hz in six recordings, 60 ms late: from 1 Hz on it lags by more than
+    half a period, and follows the negative of its target more closely than its target of the last 0.2 s."""
+    t = np.arange(0, 60, 0.005)
+    target = np.sin(2 * np.pi * (0.2 * t + 0.5 * (7.8 / 60) * t**2))
+    q, v, way = 0.0, 0.0, []
+    for x in np.r_[np.zeros(12), target][: len(t)]:
+        v += 0.005 * ((2 * np.pi) ** 2 * (sign * x - q) - 2 * 0.3 * 2 * np.pi * v)
+        q += 0.005 * v
+        way.append(q)
+    parts = [slice(k, k + 2000) for k in range(0, 12000, 2000)]
+    runs = [run(np.array(way)[p], target[p], 0.005) for p in parts]
+    ways = channels.directions(runs, [channels.Targets(r) for r in runs], "j")
+    assert sign * ways[0] == 1 and all(w > -1 for w in ways[1:]) and sum(w == -1 for w in ways) == (sign < 0)
+
+
 def test_a_joint_that_hardly_moves_has_no_direction():
     wave = np.sin(0.1 * np.arange(400))
     assert wrong(run(0.15 * wave, wave), 9.0, sign=-1.0) == "" and wrong(run(0.25 * wave, wave), 9.0, sign=-1.0)

@@ -32,6 +32,7 @@ from dexsim.recording.schema import COMMANDS, STATES, Finding, Recording
 # kinds of the audit's errors after which a position or a target cannot be used
 SPOILS = ("joint_order", "wrap", "unit")
 LAGS = np.arange(0.0, 0.201, 0.02)  # s by which a joint may follow its target
+SLUGGISH, LONG_LAGS = 0.8, np.arange(0.0, 0.501, 0.02)  # and where it goes less far than so much of its target's way
 EDGE, EDGES = 0.3, 3  # s before and after an edge of a target that are looked at, and edges that tell
 PAUSE = 1.0  # s without a sample, over which no lag is measured
 STEP, BEFORE, AFTER = 0.005, 120, 80  # s of the grid on which a lag is measured, and steps of it on either side
@@ -405,13 +406,22 @@ def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
 
 def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
     """(largest correlation of the position with its target of up to `LAGS` s before, and with the target's negative).
-    In a narrow band both are large: a lag of half a period looks like another sign."""
-    each = [0.0]
-    on = targets.run.t >= targets.run.cmd_t[0] + LAGS[-1]  # from where on all of them are known
-    if on.sum() > 10 and q[on].std() > 0:
-        at = [targets.before(delay)[on, j] for delay in LAGS]
-        each += [correlation(c, q[on]) for c in at if c.std() > 0]
-    return max(each), max(-x for x in each)
+    In a narrow band both are large: a lag of half a period looks like another sign. A joint beyond its resonance lags
+    by more than a quarter period, and goes less far than its target for that: its own target may be `LONG_LAGS`
+    before."""
+
+    def most(lags: np.ndarray) -> tuple[float, float]:
+        on = targets.run.t >= targets.run.cmd_t[0] + lags[-1]  # from where on all of them are known
+        each = [0.0]
+        if on.sum() > 10 and q[on].std() > 0:
+            at = [targets.before(delay)[on, j] for delay in lags]
+            each += [correlation(c, q[on]) for c in at if c.std() > 0]
+        return max(each), max(-x for x in each)
+
+    along, against = most(LAGS)
+    if against > along and np.ptp(q) < SLUGGISH * np.ptp(targets.before()[:, j]):
+        along = max(along, most(LONG_LAGS)[0])
+    return along, against
 
 
 def directions(runs: Sequence[Run], targets: Sequence[Targets], joint: str) -> list[float]:
