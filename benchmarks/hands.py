@@ -89,7 +89,7 @@ def one(model: Path, s: dict[str, Any]) -> dict[str, Any]:
         row = json.loads(file.read_text(encoding="utf-8"))
     place.mkdir(parents=True, exist_ok=True)
     commands = {
-        "import": ["import-hand", str(model), f"out={hand}", f"drops={s['drops']}"],
+        "import": ["import-hand", str(model), f"out={hand}", f"drops={s['drops']}", "picture=false"],
         "check": ["import-hand", "check", str(hand)],
         "excite": ["excite", f"hand={hand}", f"out={place / 'excite'}"],
         "train": ["train", *TRAIN, f"hand={hand}", f"out={place / 'run'}"],

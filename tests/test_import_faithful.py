@@ -283,6 +283,15 @@ def test_what_moves_the_base_is_left_out_with_a_note(tmp_path, kind):
     assert len(hand.joints) == 6
 
 
+def test_what_fastens_the_base_or_is_switched_off_ties_no_joints(tmp_path):
+    hand, said, _ = imported(
+        tmp_path, jaws(after='<equality><weld body1="disc"/><joint joint1="first0" joint2="second0" active="false"/>'
+                             '</equality>'))  # fmt: skip
+    assert "left out: what fastens 'disc' to the world: the hand's base is held" in said
+    assert "left out: equality 'first0', which the file switches off" in said
+    assert len(hand.joints) == 6
+
+
 def test_a_floating_joint_of_a_urdf_is_left_out_too(tmp_path):
     def floats(text: str) -> str:
         return text.replace(

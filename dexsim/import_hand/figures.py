@@ -20,6 +20,7 @@ BODY = 3.0  # m within which a hand's joints lie
 REACH = (0.015, 0.6)  # m from a finger's root to its tip
 LINK_MASS = (1e-4, 3.0)  # kg
 TORQUE = (0.005, 50.0)  # N m
+FORCE, MOVE_SPEED = (0.1, 500.0), (0.002, 2.0)  # N, m/s, of a slide
 TURN_SPEED = (0.05, 100.0)  # rad/s
 # Order of magnitude of a small motor's rotor seen at the joint (g cm2 times a gear ratio of 100 to 200 squared), per
 # N m of its largest torque; without one, the light links of a hand are stiffer than a physics step can follow.
@@ -65,10 +66,13 @@ def check(
             out.armature[name], out.damping[name] = float(m.dof_armature[dof]), float(m.dof_damping[dof])
             if j in tree.passive:
                 continue
-            out.effort[name] = _stated(source.drives.effort, name, effort, out.guessed_effort, PRESS * x.reach)
-            out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, SPEED)
+            slides = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+            guess = (PRESS, SPEED * x.reach) if slides else (PRESS * x.reach, SPEED)
+            out.effort[name] = _stated(source.drives.effort, name, effort, out.guessed_effort, guess[0])
+            out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, guess[1])
             for what, value, (low, high), unit in (
-                ("effort", out.effort[name], TORQUE, "N m"), ("speed", out.speed[name], TURN_SPEED, "rad/s"),
+                ("effort", out.effort[name], FORCE if slides else TORQUE, "N" if slides else "N m"),
+                ("speed", out.speed[name], MOVE_SPEED if slides else TURN_SPEED, "m/s" if slides else "rad/s"),
             ):  # fmt: skip
                 if not low <= value <= high:
                     out.warnings.append(

@@ -103,7 +103,8 @@ def _closing(
     together, ends, room = [], [], []
     for finger, joints, tip in zip(fingers, bends, tips, strict=True):
         sign = [int(np.sign(d.xaxis[j] @ d.xaxis[joints[-1]])) if m.jnt_type[j] == HINGE else 1 for j in joints]
-        lean = [s * m.jnt_range[j].sum() / max(np.ptp(m.jnt_range[j]), 1e-9) for s, j in zip(sign, joints, strict=True)]
+        lean = [s * m.jnt_range[j].sum() / max(np.ptp(m.jnt_range[j]), 1e-9) if m.jnt_type[j] == HINGE else 0.0
+                for s, j in zip(sign, joints, strict=True)]  # fmt: skip  # a slide's 0 is either end
         moved = []
         for way in (1, -1):
             q = neutral(m)

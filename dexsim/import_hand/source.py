@@ -19,6 +19,7 @@ from dexsim.import_hand.drives import Drives
 from dexsim.import_hand.inertias import Moments
 
 ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+FASTENED = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
 @dataclass
@@ -87,6 +88,7 @@ def _source(
         _meshes_there(spec, path)
     notes: list[str] = []
     _one_tree(spec, path, notes)
+    _not_in_force(spec, notes)
     said = drives.read(spec)
     ties, passive = _coupled(spec, path, coupled, said.moved)
     if coupled == "independent":
@@ -166,6 +168,27 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     for geom in list(spec.worldbody.geoms):
         notes.append(f"left out: geom '{geom.name or 'unnamed'}' of the world (a floor?)")
         spec.delete(geom)
+
+
+def _not_in_force(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Take out equalities that the file switches off, and what fastens the hand's base to the world: it is held."""
+    whole = _hinges(spec.worldbody)
+    for equality in list(spec.equalities):
+        ends = [_body_of(spec, n) for n in (equality.name1, equality.name2)]
+        free = [b for b in ends if b is not None and b.name != "world"]
+        if not equality.active:
+            notes.append(f"left out: equality '{equality.name or equality.name1}', which the file switches off")
+        elif equality.type in FASTENED and len(free) == 1 and _hinges(free[0]) == whole:
+            notes.append(f"left out: what fastens '{free[0].name}' to the world: the hand's base is held")
+        else:
+            continue
+        spec.delete(equality)
+
+
+def _body_of(spec: mujoco.MjSpec, name: str) -> Any:
+    """Return the body of this name, or that a site of this name is on; None: there is none."""
+    site = spec.site(name) if name else None
+    return site.parent if site is not None else spec.body(name) if name else None
 
 
 def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> tuple[list[str], set[str]]:
