@@ -4,6 +4,7 @@ place and renamed, so that a kill leaves what was; what it leaves unfinished goe
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -30,8 +31,8 @@ MAX_YAML = 4 << 20
 
 
 def check(path: Path, most: int, what: str) -> int:
-    """The file's size in bytes. Raises UserError where it is missing, not a plain file (a device or a pipe never ends),
-    or larger than `most`."""
+    """The bytes that a file takes on its disk, without the holes of a sparse one. Raises UserError where it is missing,
+    not a plain file (a device or a pipe never ends), or larger than `most`."""
     try:
         about = os.stat(path)
     except FileNotFoundError:
@@ -43,7 +44,7 @@ def check(path: Path, most: int, what: str) -> int:
         raise UserError(f"{what} {path} is {kind}, not a file")
     if about.st_size > most:
         raise UserError(f"{what} {path} has {about.st_size} bytes; at most {most} ({most / 2**20:g} MiB) are read")
-    return about.st_size
+    return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 
 def text(path: Path, most: int, what: str) -> str:
@@ -57,6 +58,17 @@ def text(path: Path, most: int, what: str) -> str:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise UserError(f"{what} {path} is not UTF-8 text (byte {error.start})") from None
+
+
+def mapping(path: Path, most: int, what: str) -> dict[str, Any]:
+    """A JSON file that maps keys to values. Raises UserError as `text` does, and where it is another."""
+    try:
+        out = json.loads(text(path, most, what))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{what} {path}: not JSON ({error})") from None
+    if not isinstance(out, dict):
+        raise UserError(f"{what} {path}: is a {type(out).__name__}, must map keys to values")
+    return out
 
 
 def place(text: Any) -> Path:

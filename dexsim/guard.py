@@ -15,8 +15,9 @@ takes the same time and memory again::
 The reader's own UserError comes through as it is; any other error, a signal (a fault in the library), and a limit
 passed are a UserError that begins with `what`. Files that come with dexsim are read without (`ours`).
 
-The process is a fork, which costs some 10 ms and needs no imports; it touches no GPU and starts no threads of torch, as
-torch's own loaders of data do. Where there is no safe fork (macOS, Windows) it is spawned, once a call.
+The process is a fork, which costs some 10 ms and needs no imports: the readers touch no GPU, and torch works on one
+thread there, since a fork has none of its threads. Where there is no safe fork (macOS, Windows) it is spawned, once a
+call.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ SECONDS_A_MIB, TIMES_SIZE = 3.0, 16
 """What is added for a file's size: s a MiB, and bytes a byte."""
 WAITING_S = 1.5
 """s without any processor time, asleep, after which a reader is taken to wait for a pipe or a device."""
+LOCKED = "waits without end for another thread of its reader"
 WAITS = "names a pipe, a device or a socket, which is no file: reading it waits without end"
 FULL = re.compile("(could not|unable to|cannot|failed to) allocate|out of memory|bad_alloc|unknown exception", re.I)
 """What libraries say where they are given no more memory; the last is MuJoCo."""
@@ -82,7 +84,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     for method in dict.fromkeys((system.start_method(), "spawn")):
         context: Any = multiprocessing.get_context(method)
         receive, send = context.Pipe(False)
-        child = context.Process(target=_child, args=(send, function, args, seconds, most, wanted))
+        child = context.Process(target=_child, args=(send, _here(), function, args, seconds, most, wanted))
         try:
             try:
                 child.start()
@@ -97,7 +99,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
                 if child.is_alive():
                     child.kill()
                 child.join()
-        if answer != WAITS:  # a fork may wait for a lock that a thread of this process held; a new process does not
+        if answer != LOCKED:  # a fork may wait for a lock that a thread of this process held; a new process does not
             break
     if isinstance(answer, BaseException):
         raise answer
@@ -133,26 +135,31 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         if spent != used or not asleep:
             used, moved = spent, now
         if now - moved > WAITING_S:
-            return WAITS
+            return LOCKED if system.at_lock(pid) else WAITS
         if now - begun > wall:
             return f"takes more than {wall:.0f} s to read"
     try:
-        parts = [receive.recv_bytes()]
-        buffers = []
-        for size in pickle.loads(parts[0]):
-            buffers.append(bytearray(size))
-            receive.recv_bytes_into(buffers[-1]) if size else receive.recv_bytes()
-        return pickle.loads(receive.recv_bytes(), buffers=buffers)
+        return pickle.loads(receive.recv_bytes())
     except EOFError:
         return ""
 
 
+def _here() -> str:
+    """The working folder, "" where it is gone."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
 def _child(
-    send: Connection, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
+    send: Connection, here: str, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
 ) -> None:
     """The process: works out, answers, ends."""
     global _inside
     _inside = True
+    if here:  # a process that is begun anew has that of the program's start
+        os.chdir(here)
     gc.freeze()  # what a fork would collect of the program may wait for a thread that is not here
     system.limit(seconds, most)
     faulthandler.disable()
@@ -168,23 +175,17 @@ def _child(
     sys.addaudithook(_opened)
     answer: Any
     try:
-        answer = (function(*args) if wanted else function(*args) and None,)
+        answer = pickle.dumps((function(*args) if wanted else function(*args) and None,), 5)
     except BaseException as error:  # a reader of a stranger's file raises whatever it likes
         text = " ".join(str(error).split())[:200]
         full = isinstance(error, MemoryError) or FULL.search(text) is not None
-        answer = error if isinstance(error, UserError) and not full else (
-            f"needs more than {most / 2**30:.3g} GiB of memory to read" if full
+        answer = pickle.dumps(
+            error if isinstance(error, UserError) and not full
+            else f"needs more than {most / 2**30:.3g} GiB of memory to read" if full
             else "is nested too deeply to be read" if isinstance(error, RecursionError)
             else f"cannot be read ({type(error).__name__}{': ' * bool(text)}{text})"
-        )
-    buffers: list[pickle.PickleBuffer] = []
-    data = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
-    raw = [b.raw() for b in buffers]
-    send.send_bytes(pickle.dumps([len(r) for r in raw]))
-    for r in raw:
-        send.send_bytes(r)
-    send.send_bytes(data)
-    send.close()
+        )  # fmt: skip
+    send.send_bytes(answer)
     os._exit(0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -16,26 +16,33 @@ from dexsim.errors import UserError
 
 MAX_MODEL = 64 << 20
 """Bytes of a model file."""
+Edit = Callable[[mujoco.MjSpec], None] | None
 MAX_DOFS = 1000
 """Degrees of freedom of a model."""
 
 
-def read(path: Path, where: str) -> mujoco.MjSpec:
-    """The model of an MJCF or URDF file, which compiles. where: what the file is, for messages. Raises UserError."""
+def read(path: Path, where: str, edit: Edit = None) -> mujoco.MjSpec:
+    """The model of an MJCF or URDF file, as `edit` changes it, which compiles. where: what the file is, for messages.
+    Raises UserError."""
     if not guard.ours(path):
-        size = files.check(path, MAX_MODEL, f"{where}:")
-        for text in guard.call(_tried, path, where, what=where, size=size):
+        files.check(path, MAX_MODEL, f"{where}:")
+        for text in guard.call(_tried, path, where, edit, what=where):
             print(f"warning: {where}: {text}", file=sys.stderr)
     with warned():
-        return parsed(path)
+        spec = parsed(path)
+    if edit is not None:
+        edit(spec)
+    return spec
 
 
-def _tried(path: Path, where: str) -> list[str]:
+def _tried(path: Path, where: str, edit: Edit) -> list[str]:
     """MuJoCo's warnings of a model that compiles and of its first step."""
     try:
         with warned() as said:
-            model = parsed(path).compile()
-            step(model, where)
+            spec = parsed(path)
+            if edit is not None:
+                edit(spec)
+            step(spec.compile(), where)
     except ValueError as error:
         raise UserError(error if isinstance(error, UserError) else f"{where}: {error}") from None
     return list(dict.fromkeys(said))

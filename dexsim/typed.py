@@ -73,7 +73,7 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
         raise UserError(f"{source}: {place or 'its contents'}{shown}: {what[0].lower()}{what[1:]}{fix}") from None
     except RecursionError:
         raise UserError(f"{source}: nested too deeply{f'; {fix}' if fix else ''}") from None
-    _finite(data, source, fix)
+    finite(data, source, fix)
     return out
 
 
@@ -153,16 +153,18 @@ def _instance(kind: type, value: Any) -> Any:
     raise TypeError(f"Expected `{kind.__name__}`, got `{type(value).__name__}`")
 
 
-def _finite(node: Any, source: object, fix: str, place: str = "") -> None:
-    """No NaN anywhere: it passes every comparison with a bound."""
+def finite(node: Any, source: object, fix: str = "", place: str = "") -> None:
+    """Raise UserError for NaN, which passes every comparison with a bound, and for a whole number of more than 64 bits,
+    which no double may hold, anywhere in plain data."""
     if isinstance(node, dict):
         for key, value in node.items():
-            _finite(value, source, fix, f"{place}.{key}" if place else str(key))
+            finite(value, source, fix, f"{place}.{key}" if place else str(key))
     elif isinstance(node, (list, tuple)):
         for k, value in enumerate(node):
-            _finite(value, source, fix, f"{place}[{k}]")
-    elif isinstance(node, float) and node != node:
-        raise UserError(f"{source}: {place} (nan): expected a number{f'; {fix}' if fix else ''}")
+            finite(value, source, fix, f"{place}[{k}]")
+    elif isinstance(node, float) and node != node or isinstance(node, int) and node.bit_length() > 64:
+        what = "nan" if node != node else "a whole number of more than 64 bits"
+        raise UserError(f"{source}: {place or 'its value'} ({what}): expected a number{f'; {fix}' if fix else ''}")
 
 
 def _shown(data: Any, place: str) -> str:

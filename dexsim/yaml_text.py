@@ -49,7 +49,7 @@ def parse(text: str | bytes, source: object) -> Any:
         raise UserError(f"{source}: {len(text) / 2**20:.1f} MiB of YAML, allowed {MOST_BYTES >> 20} MiB")
     if len(text) <= SMALL:
         return _parse(text, source)
-    return guard.call(_parse, text, source, what=str(source), size=len(text))
+    return guard.call(_parse, text, source, what=str(source))
 
 
 def _parse(text: str | bytes, source: object) -> Any:
@@ -77,6 +77,6 @@ def _plain(node: Any, rest: list[int]) -> Any:
         return {_plain(k, rest): _plain(v, rest) for k, v in node.items()}
     if isinstance(node, list):
         return [_plain(v, rest) for v in node]
-    if isinstance(node, str):
-        node.encode()
+    if isinstance(node, (str, int)):
+        str(node).encode()  # halves of characters, and numbers of more than 4,300 digits (0xff...), are none
     return node

@@ -213,9 +213,10 @@ def test_what_cannot_be_said_is_one_line(tmp_path):
         with pytest.raises(UserError, match="m.json") as error:
             bam.read(path)
         assert said in str(error.value) and "\n" not in str(error.value)
-    path.write_text("{")
-    with pytest.raises(UserError, match="not JSON"):
-        bam.read(path)
+    for text, said in (("{", "not JSON"), ("[" * 100_000, "not JSON"), ("[]", "is a list, must map keys to values")):
+        path.write_text(text)
+        with pytest.raises(UserError, match=said):
+            bam.read(path)
     table = ServoTable.from_dict(yaml.safe_load((CONFIGS / "servo" / "xc330_m288.yaml").read_text()))
     assert bam.to_bam(table, "*", 0.002)["kt"] == pytest.approx(5.0 / 8.48)
     with pytest.raises(UserError, match="actuator=unitree_go1"):

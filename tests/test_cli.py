@@ -207,6 +207,8 @@ def test_cfg_prints_the_settings_and_does_nothing(configs, place, capfd):
     ("worlds=2.5", "worlds=2.5: must be a whole number"),
     ("seed=-1", "seed=-1"),
     ("seed=abc", "seed=abc: must be a number"),
+    (f"seed={'9' * 400}", "seed: its value (a whole number of more than 64 bits)"),
+    ("seed=${seed}", "seed=${seed}: Recursive interpolation"),
     ("sim=5", "sim is a group of settings (sim.engine"),
     ("+sim=5", "+sim: is there already, a group of settings (sim.engine"),
     ("+task=true", "+task: is there already"),

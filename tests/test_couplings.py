@@ -215,3 +215,11 @@ def test_a_diagnosis_takes_the_inertia_that_the_drive_feels():
     full = np.zeros((3, 3))
     mujoco.mj_fullM(m, d, full)
     assert values[0, k, SERIES_INDEX["inertia"]] == pytest.approx(moves @ full @ moves, rel=1e-4)
+
+
+def test_a_joint_without_a_name_is_one_that_nobody_drives():
+    m = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="a"/><geom size=".1"/><body><joint/><geom size=".1"/></body></body>'
+        "</worldbody></mujoco>"
+    )
+    assert Couplings(m, ["a"]).passive == ("",) and not Couplings(m, ["a"]).tied

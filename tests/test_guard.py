@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from dexsim import guard
+from dexsim import files, guard
 from dexsim.errors import UserError
 
 
@@ -83,8 +83,26 @@ def test_a_library_that_waits_for_a_pipe_is_ended(tmp_path, monkeypatch):
     """As C code opens one: no hook of Python's sees it."""
     monkeypatch.setattr(guard, "WAITING_S", 0.5)
     os.mkfifo(tmp_path / "pipe")
+    begun = time.monotonic()
     with pytest.raises(UserError, match="^file x: names a pipe"):
         guard.call(_opened_by_c, str(tmp_path / "pipe"), what="file x")
+    assert time.monotonic() - begun < 3, "not tried again in a new process, as a lock is"
+
+
+def test_a_process_begun_anew_works_in_the_folder_of_now(tmp_path, monkeypatch):
+    """Its own would be that in which the program began."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(guard.system, "start_method", lambda: "spawn")
+    assert guard.call(os.getcwd, what="file x") == str(tmp_path)
+
+
+def test_the_holes_of_a_sparse_file_give_no_limits(tmp_path):
+    path = tmp_path / "sparse"
+    path.write_bytes(b"x")
+    os.truncate(path, 1 << 40)
+    assert files.check(path, 1 << 41, "file") < 1 << 20
+    path.write_bytes(bytes(3000))
+    assert files.check(path, 1 << 20, "file") == 3000
 
 
 def test_limits_grow_with_the_file_and_where_it_is_trusted(monkeypatch):

@@ -601,6 +601,26 @@ def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp
     assert "xhand_right.xml" in (text := one_line(error)), text
 
 
+def test_what_is_taken_out_of_a_model_is_taken_out_within_limits(tmp_path, monkeypatch):
+    """MuJoCo looks for a keyframe among all of them, to take it out."""
+    from dexsim import guard
+    from dexsim.recording.mechanism import mechanism
+
+    monkeypatch.setattr(guard, "SECONDS", 1.0)
+    keys = "".join(f'<key name="{k}"/>' for k in range(30_000))
+    body = '<worldbody><body><joint name="a"/><geom size=".1"/></body></worldbody>'
+    (tmp_path / "m.xml").write_text(f"<mujoco>{body}<keyframe>{keys}</keyframe></mujoco>")
+    with pytest.raises(UserError, match="m.xml: takes more than 1 s"):
+        mechanism(tmp_path / "m.xml", {"drive": "torque", "joints": {"*": {"kp": 1.0}}})
+
+
+def test_an_object_that_is_named_twice_is_said():
+    from dexsim.assets.objects import own
+
+    with pytest.raises(UserError, match="train: 'box' stands twice"):
+        own.named({"train": ["box", "sphere", "box"], "held_out": []})
+
+
 NAMES = ("a" * 5000, "a/" * 3000, "~nobody_of_this_name/x.obj", "x\0y.obj", "/proc/1/map_files", "\x1b[2J\u202e\ud800")
 
 

@@ -12,12 +12,13 @@ import pytest
 import recordings
 import yaml
 
+from dexsim import guard
 from dexsim.actuator.table import ServoTable
 from dexsim.calibration.file import Calibration
 from dexsim.calibration.rubber import read_curve
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
-from dexsim.recording import Recording, Series, States, Writer, container, read, write
+from dexsim.recording import Recording, Series, States, Writer, read, write
 from dexsim.recording.schema import COMMANDS, STATES
 from dexsim.tactile import file as tactile_file
 
@@ -86,20 +87,21 @@ def test_devices_and_pipes_are_no_files(tmp_path, reader, kind):
 
 def test_a_chunk_that_unpacks_to_more_than_is_allowed_is_lost_and_said(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
-    with Writer(path, ("a",), chunk_bytes=1 << 24, chunk_s=1e9) as w:
+    with Writer(path, ("a",), chunk_bytes=1 << 30, chunk_s=1e9) as w:
         for i in range(3):
             w.add_state(0.01 * i, np.zeros(1))
         w.flush()
-        w.add_state(1.0, np.zeros(200_000))  # packs to next to nothing
-    monkeypatch.setattr(container, "MAX_CHUNK", 1 << 20)
+        w.add_state(1.0, np.zeros(20_000_000))  # packs to next to nothing
+    monkeypatch.setattr(guard, "BYTES", 100 << 20)
     r = read(path)
-    assert len(r.states.position) == 3 and any(f.kind == "damage" and "unpacks to" in f.text for f in r.findings)
+    assert len(r.states.position) == 3 and any(f.kind == "damage" and "a chunk of" in f.text for f in r.findings)
 
 
-def test_more_messages_than_are_read_are_refused(tmp_path, monkeypatch):
-    write(tmp_path / "a.mcap", recordings.signal(1.0))
-    monkeypatch.setattr(container, "MAX_MESSAGES", 50)
-    with pytest.raises(UserError, match="50 of them; cut it"):
+def test_more_messages_than_memory_holds_are_refused(tmp_path, monkeypatch):
+    write(tmp_path / "a.mcap", recordings.signal(60.0))
+    monkeypatch.setattr(guard, "BYTES", 1 << 20)
+    monkeypatch.setattr(guard, "TIMES_SIZE", 1)
+    with pytest.raises(UserError, match="a.mcap: needs more than .* GiB of memory"):
         read(tmp_path / "a.mcap")
 
 

@@ -103,12 +103,8 @@ def read(path: str | Path) -> Bam:
     """Return a BAM parameter file. Raises UserError: not JSON, a parameter unknown, missing or impossible, a motor
     that is not driven by voltage."""
     path = Path(path).expanduser()
-    text = files.text(path, files.MAX_YAML, "BAM file")
-    try:
-        raw = json.loads(text)
-    except ValueError as error:
-        raise UserError(f"BAM file {path}: not JSON ({error})") from None
-    motor = raw.get("actuator") if isinstance(raw, dict) else None
+    raw = files.mapping(path, files.MAX_YAML, "BAM file")
+    motor = raw.get("actuator")
     if isinstance(motor, str) and motor.startswith(NOT_BY_VOLTAGE):
         raise UserError(
             f"BAM file {path}: actuator ('{motor}'): BAM drives it by current or torque; must be a motor driven by"

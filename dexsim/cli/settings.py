@@ -21,10 +21,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from dexsim.errors import UserError
 from dexsim.tasks import registry
+from dexsim.typed import finite
 
 WORDS = ("auto", "unknown", "inf", "null")  # strings that a number's place may hold
 
@@ -166,13 +167,17 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
             node.pop(last)
             continue
         value = item.value()
+        finite(value, key)
         if item.type != OverrideType.CHANGE and isinstance(group := cfg.get(key), DictConfig):
             raise UserError(
                 f"+{key}: is there already, a group of settings ({', '.join(f'{key}.{k!s}' for k in group)}): give"
                 " those one by one, or choose another group without the +"
             )
         if item.type == OverrideType.CHANGE or _there(cfg, key):
-            _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
+            try:
+                _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
+            except InterpolationResolutionError as error:
+                raise UserError(f"{key}={value}: {_first_line(error)}") from None
         try:
             OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
         except (ValueError, TypeError):  # a name where a list has numbers

@@ -124,11 +124,11 @@ def _last(job: jobs.Job) -> str:
 def read(folder: Path) -> dict[str, Any]:
     """A machine's diagnosis.json. Raises UserError for a damaged one."""
     try:
-        data = json.loads(files.text(folder / RESULT, MOST_BYTES, "diagnosis"))
+        data = files.mapping(folder / RESULT, MOST_BYTES, "diagnosis")
         cells_of(data)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{folder / RESULT}: damaged ({type(error).__name__}: {error}); diagnose it again") from None
-    return dict(data)
+    return data
 
 
 def cells_of(data: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:

@@ -39,8 +39,8 @@ class Couplings:
         self.address = [int(m.jnt_qposadr[m.joint(name).id]) for name in order]
         self.dof = [int(m.jnt_dofadr[m.joint(name).id]) for name in order]
         tied = {int(m.eq_obj1id[e]): e for e in range(m.neq) if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT}
-        self.passive = tuple(m.joint(j).name for j in range(m.njnt) if _one_dof(m, j) and m.joint(j).name not in names)
-        free = {m.joint(name).id for name in self.passive}
+        free = {j for j in range(m.njnt) if _one_dof(m, j) and m.joint(j).name not in names}
+        self.passive = tuple(m.joint(j).name for j in sorted(free))
         self._laws: list[tuple[int, int, np.ndarray]] = []  # qpos of the follower, of the other or -1, coefficients
         waiting = [j for j in tied if j in free]
         while waiting:

@@ -6,11 +6,13 @@ person took out of `guessed` without changing it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from dexsim import files
+from dexsim.errors import UserError
 
 NOTE = ".import.json"
 ORDER = "joint order"
@@ -108,11 +110,7 @@ def _laid(node: Any, place: str, value: Any) -> bool:
 def written(folder: Path) -> dict[str, Any] | None:
     """What the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no note."""
     try:
-        data = json.loads((folder / NOTE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        data = files.mapping(folder / NOTE, files.MAX_YAML, "note")
+    except UserError:
         return None
-    return (
-        data
-        if isinstance(data, dict) and isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict)
-        else None
-    )
+    return data if isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict) else None

@@ -105,8 +105,7 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     checkpoint, another format version, a missing part, one of the wrong type, weights that are not finite.
     """
     path = policies.place(path)
-    _check_whole(path)
-    guard.rehearse(_load, path, "cpu", what=f"{path}", size=path.stat().st_size)
+    guard.rehearse(_load, path, "cpu", what=f"{path}", size=_check_whole(path))
     return _load(path, device)
 
 
@@ -143,14 +142,14 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _check_whole(path: Path) -> None:
-    """Tell a missing, truncated, damaged or pickled file apart before torch gets it."""
+def _check_whole(path: Path) -> int:
+    """Tell a missing, truncated, damaged or pickled file apart before torch gets it; return its bytes."""
     if not path.exists():
         names = ", ".join(policies.included())
         raise UserError(f"{path}: no such checkpoint{_nearby(path)}; dexsim comes with {names}")
     if path.is_dir():
         raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
-    files.check(path, MOST_BYTES, "checkpoint")
+    size = files.check(path, MOST_BYTES, "checkpoint")
     try:
         with open(path, "rb") as file:
             head = file.read(2)
@@ -178,6 +177,7 @@ def _check_whole(path: Path) -> None:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     if bad:
         raise UserError(f"{path}: damaged, its part {bad} fails its checksum; use another checkpoint of its run folder")
+    return size
 
 
 def _nearby(path: Path) -> str:

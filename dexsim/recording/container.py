@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import mmap
+import os
 import sqlite3
 import struct
 import zlib
@@ -19,22 +20,13 @@ import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import CRCValidationError
 
-from dexsim import files
 from dexsim.errors import UserError
 
 MAX_FILE = 64 << 30
 """Bytes of a file; only what its records need is read of it."""
-MAX_CHUNK = 256 << 20
-"""Bytes of a chunk, unpacked."""
-MAX_UNPACKED = 4 << 30
-"""Bytes of all messages of a file, unpacked; and MAX_PACKED times the file's own size, beyond a chunk's."""
-MAX_PACKED = 200
-MAX_MESSAGES = 5_000_000
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -42,22 +34,6 @@ BAGS = ("*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
 """What the files of a bag's folder are called."""
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _MESSAGE = struct.Struct("<HIQQ")  # how a message's record begins: channel, sequence, log and publish time
-_BROKEN = (
-    McapError,
-    CRCValidationError,
-    ValueError,
-    OverflowError,
-    struct.error,
-    EOFError,
-    zstandard.ZstdError,
-    RuntimeError,
-    MemoryError,
-)
-
-
-class TooMuch(UserError):
-    """A file beyond a limit: refused, not damaged."""
-
 
 @dataclass
 class Container:
@@ -70,8 +46,6 @@ class Container:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: dict[str, bytes] = field(default_factory=dict)
     damage: list[tuple[int | None, int, str]] = field(default_factory=list)
-    most: int = MAX_UNPACKED  # bytes that its messages may come to
-    unpacked: int = 0
 
     def channel(self, message: Message) -> Channel | None:
         """The channel of a message; None where its record is lost."""
@@ -80,18 +54,17 @@ class Container:
 
 def open_container(path: Path) -> Container:
     """Read every record that can be read. Raises UserError for what is not a bag's file at all."""
-    size = files.check(path, MAX_FILE, "recording")
     try:
         with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
             data: Any = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
     out = Container(path)
-    out.most = min(MAX_UNPACKED, MAX_CHUNK + MAX_PACKED * size)
     if data[: len(ZSTD)] == ZSTD:
         try:
-            data = _unzip(data, out.most)
-        except _BROKEN as error:
+            data = _unzip(data)
+        except Exception as error:
             raise UserError(
                 f"recording {path}: compressed as a whole, and cannot be unpacked here ({error}); `zstd -d {path.name}`"
             ) from None
@@ -111,10 +84,8 @@ def open_container(path: Path) -> Container:
         if m.data[: len(ZSTD)] == ZSTD:  # plain CDR begins with a zero
             try:
                 m.data = _unzip(m.data)
-            except _BROKEN:
+            except Exception:
                 continue  # its decoder says that it cannot be read
-            out.unpacked += len(m.data)
-            _limit(out)
     return out
 
 
@@ -137,8 +108,6 @@ def _sqlite(data: Any, out: Container) -> None:
                                                metadata={}, schema_id=number)  # fmt: skip
             for k, (number, t, content) in enumerate(db.execute("select topic_id, timestamp, data from messages")):
                 out.messages.append(Message(number, int(t), bytes(content), int(t), k))
-                out.unpacked += len(content)
-                _limit(out)
     except (sqlite3.Error, TypeError, ValueError) as error:
         if not out.messages:
             raise UserError(f"recording {out.path}: its SQLite file cannot be read: {error}") from None
@@ -229,39 +198,19 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
             out.channels.setdefault(record.id, record)
         elif opcode == Opcode.MESSAGE:
             out.messages.append(Message.read(stream, length))
-            out.unpacked += length
         elif opcode == Opcode.METADATA:
             out.metadata.append(Metadata.read(stream))
         elif opcode == Opcode.ATTACHMENT:
             record = Attachment.read(stream)
             out.attachments[record.name] = record.data
-    except _BROKEN as error:
+    except Exception as error:
         out.damage.append((None, 1, f"a record (opcode {opcode}) cannot be read: {error or type(error).__name__}"))
-    _limit(out)
 
 
-def _limit(out: Container) -> None:
-    """Raises TooMuch where there are more messages than are read."""
-    if out.unpacked > out.most or len(out.messages) > MAX_MESSAGES:
-        raise TooMuch(
-            f"recording {out.path}: its messages come to more than {out.most / 2**20:.0f} MiB or {MAX_MESSAGES} of "
-            "them;"
-            " cut it into several files, or leave cameras out"
-        )
-
-
-def _unzip(packed: Any, most: int = MAX_CHUNK) -> bytes:
-    """What zstd packed, as far as it is there. Raises ValueError beyond `most` bytes."""
-    if not len(packed):
-        return b""
-    parts, size = [], 0
+def _unzip(packed: Any) -> bytes:
+    """What zstd packed, as far as it is there."""
     with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
-        while part := reader.read(1 << 20):
-            size += len(part)
-            if size > most:
-                raise ValueError(f"it unpacks to more than {most >> 20} MiB")
-            parts.append(part)
-    return b"".join(parts)
+        return b"".join(iter(lambda: reader.read(1 << 20), b""))
 
 
 def _chunk(body: bytes, cut: bool, out: Container) -> None:
@@ -280,14 +229,10 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
         else:
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
             span = chunk.message_start_time
-            if chunk.uncompressed_size > MAX_CHUNK:
-                raise ValueError(
-                    f"it unpacks to {chunk.uncompressed_size / 2**20:.0f} MiB; at most {MAX_CHUNK >> 20} are read"
-                )
             if chunk.compression == "zstd":
                 data = _unzip(chunk.data)
             elif chunk.compression == "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, MAX_CHUNK) if chunk.data else b""
+                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data) if chunk.data else b""
             elif chunk.compression == "":
                 data = chunk.data
             else:
@@ -303,14 +248,10 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
                 channel, sequence, logged, published = _MESSAGE.unpack_from(data, at + _HEAD.size)
                 content = data[at + _HEAD.size + _MESSAGE.size : at + _HEAD.size + length]
                 out.messages.append(Message(channel, logged, content, published, sequence))
-                out.unpacked += length
-                _limit(out)
             else:
                 _plain(opcode, data[at + _HEAD.size : at + _HEAD.size + length], length, out)
             at += _HEAD.size + length
-    except TooMuch:
-        raise
-    except _BROKEN as error:
+    except Exception as error:
         text = " ".join(str(error).split()) or type(error).__name__
         out.damage.append((span, 0, f"a chunk of {len(body)} bytes is lost: {text}"))
     if cut:

@@ -128,8 +128,7 @@ def mechanism(
     else:
         assert model is not None  # else the folder is the xHand's
         path = Path(model).expanduser()
-        spec = model_file.read(path, f"model={model}")
-        _undriven(spec)
+        spec = model_file.read(path, f"model={model}", _undriven)
         _moved(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:

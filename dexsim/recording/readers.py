@@ -31,9 +31,8 @@ from dexsim.recording.schema import TACTILE, Finding, shown
 
 GROUP = "dexsim.readers"
 MAX_META = 64 << 20  # bytes of a file that describes a data set
-MAX_VALUES = 50_000_000  # numbers in an episode
 MAX_EPISODES = 100_000
-MAX_TORCH = 1 << 30
+MAX_FILE = 64 << 30
 PICKLES = (".pkl", ".pickle", ".joblib", ".npy")
 NOMINAL = "times are nominal, frame / rate: what a reading or a command was late by is not in them"
 
@@ -101,9 +100,8 @@ def ready(reader: Reader, path: Path) -> int:
             import_module(name)
         except ImportError:
             raise UserError(f"recording {path}: needs {name}: pip install {reader.needs}") from None
-    if path.is_file():
-        return path.stat().st_size
-    return sum(p.stat().st_size for p in path.rglob("*") if p.is_file() and "videos" not in p.parts)
+    inside = [path] if path.is_file() else (p for p in path.rglob("*") if p.is_file() and "videos" not in p.parts)
+    return sum(files.check(p, MAX_FILE, "recording") for p in inside)
 
 
 def expanded(path: Path) -> list[Path]:
@@ -126,7 +124,7 @@ def expanded(path: Path) -> list[Path]:
 def _count(path: Path) -> int:
     reader = reader_of(path)
     assert reader is not None  # `expanded` has looked
-    return int(_tried(reader, path, lambda: reader.count(path)))
+    return int(reader.count(path))
 
 
 def numbers(text: str, count: int, where: str) -> list[int]:
@@ -145,34 +143,13 @@ def numbers(text: str, count: int, where: str) -> list[int]:
 
 def read_episode(path: Path, reader: Reader, part: str) -> Episode:
     """The episode that `path#part` names; the only one where nothing is named. Raises UserError."""
-    count = _tried(reader, path, lambda: reader.count(path))
+    count = reader.count(path)
     if not part and count > 1:
         raise UserError(f"recording {path}: holds {count} episodes; say which: {path.name}#0 to #{count - 1}")
     (episode, *rest) = numbers(part or "0", count, f"recording {path}")
     if rest:
         raise UserError(f"recording {path}#{part}: names {len(rest) + 1} episodes; one is read at a time")
-    out = _tried(reader, path, lambda: reader.read(path, episode))
-    if sum(x.size for x in [*out.columns.values(), *out.arrays.values()]) > MAX_VALUES:
-        raise UserError(f"recording {path}#{episode}: more than {MAX_VALUES} values; cut it into several")
-    return out
-
-
-def _tried(reader: Reader, path: Path, do: Any) -> Any:
-    """What a reader gives, its errors in one line."""
-    try:
-        return do()
-    except UserError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in a library
-        text = shown(str(error)) or type(error).__name__
-        raise UserError(f"recording {path}: cannot be read as {type(reader).__name__}: {text}") from None
-
-
-def _json(path: Path) -> dict[str, Any]:
-    found = json.loads(files.text(path, MAX_META, "data set"))
-    if not isinstance(found, dict):
-        raise UserError(f"data set {path}: must be a mapping")
-    return found
+    return reader.read(path, episode)
 
 
 # -- arrays by name ---------------------------------------------------------------------------------------------------
@@ -257,12 +234,12 @@ class LeRobot:
         return (path / "meta" / "info.json").is_file()
 
     def count(self, path: Path) -> int:
-        return int(_json(path / "meta" / "info.json")["total_episodes"])
+        return int(files.mapping(path / "meta" / "info.json", MAX_META, "data set")["total_episodes"])
 
     def read(self, path: Path, episode: int) -> Episode:
         from pyarrow import parquet
 
-        info = _json(path / "meta" / "info.json")
+        info = files.mapping(path / "meta" / "info.json", MAX_META, "data set")
         place = {"episode_index": episode, "episode_chunk": episode // int(info.get("chunks_size") or 1000)}
         if str(info.get("codebase_version", "")).startswith("v3"):
             place |= self._place(path, episode)
@@ -364,7 +341,7 @@ class Zarr:
             source = group[several[episode]] if several else group["data"] if "data" in group else group
         arrays, names = {}, {}
         for key, x in source.arrays():
-            if quantity_of(key)[0] and x.ndim and int(np.prod(x.shape)) <= MAX_VALUES:
+            if quantity_of(key)[0] and x.ndim:
                 arrays[key] = x[part]
                 names[key] = _texts(x.attrs.get("joint_names") or x.attrs.get("names"))
         about = dict(group.attrs) | dict(source.attrs)
@@ -397,7 +374,7 @@ class Hdf5:
             found: dict[str, Any] = {}
             for group in (root, *(root[k] for k in ("obs", "observations") if k in root)):
                 arrays = {k: x for k, x in group.items() if isinstance(x, h5py.Dataset)}
-                found |= {k: x for k, x in arrays.items() if x.ndim and x.size <= MAX_VALUES}
+                found |= {k: x for k, x in arrays.items() if x.ndim}
             if demos and "actions" in found and "joint_actions" in found:
                 found.pop("actions")
             arrays = {k: x[()] for k, x in found.items() if quantity_of(k)[0]}
@@ -422,7 +399,6 @@ class Torch:
 
     def read(self, path: Path, episode: int) -> Episode:
         torch = import_module("torch")
-        files.check(path, MAX_TORCH, "recording")
         try:
             found = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:

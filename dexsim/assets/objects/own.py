@@ -39,10 +39,13 @@ def named(objects: Mapping[str, Any]) -> dict[str, Shape]:
     for key in ("train", "held_out"):
         if not isinstance(objects[key], (list, tuple)) or not all(isinstance(name, str) for name in objects[key]):
             raise UserError(f"task.objects.{key}={objects[key]}: must be a list of names, e.g. [box,sphere]")
+    names = list(objects["train"])
     if not objects["train"]:
         raise UserError("task.objects.train=[]: must name a shape, e.g. [box,sphere]")
+    if twice := [n for n in names if names.count(n) > 1]:
+        raise UserError(f"task.objects.train: '{twice[0]}' stands twice; name each once")
     settings = objects.get("own") or {}
-    for name in (*objects["train"], *objects["held_out"]):
+    for name in (*names, *objects["held_out"]):
         if name in known:
             out[name] = known[name]
         elif is_own(name):
