@@ -4,7 +4,9 @@ that jitter, one dead taxel board), with the same seeds and objects.
 
     python -m benchmarks.xhand_bus checkpoint=checkpoints/grasp.pt episodes=20 seconds=6 seed=5000 out=FILE.json
 
-way: direct, bus (virtual time), process (in real time, the driver's child process with it).
+way: direct, bus (virtual time), process (in real time, the driver's child process with it). noise: of the actions, over
+that of training. camera: s that what is seen of the object is older than in training; ahead: s that the loop carries it
+on for that (`dexsim deploy ahead=`).
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +30,31 @@ from dexsim.deploy.simulated_hand import SimulatedXHand, faked
 
 FAULTS = "crc=0.005,board=2"
 DEFAULTS = {"checkpoint": "checkpoints/grasp.pt", "episodes": "20", "seconds": "6", "seed": "5000", "out": "",
-            "ways": "direct,bus", "faults": FAULTS, "noise": "0"}  # fmt: skip
+            "ways": "direct,bus", "faults": FAULTS, "noise": "0", "camera": "0", "ahead": "0"}  # fmt: skip
 
 
-def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, noise: float) -> dict:
+class Later:
+    """What sees the object, `delay` s later than the hand's own eye."""
+
+    def __init__(self, eye: object, delay: float):
+        self.eye, self.delay, self.past = eye, delay, []
+
+    def __getattr__(self, name: str) -> Callable:
+        look = getattr(self.eye, name)
+
+        def seen(now: float) -> tuple | None:
+            if (new := look(now)) is not None and (not self.past or new[1] > self.past[-1][1][1]):
+                self.past.append((now + self.delay, new))
+            there = [x for at, x in self.past if at <= now + 1e-9]
+            self.past = self.past[max(len(there) - 1, 0) :]
+            return there[-1] if there else self.past[0][1] if self.past else None
+
+        return seen
+
+
+def episode(
+    b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, noise: float, camera: float, ahead: float
+) -> dict:
     """One run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
     c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
     objects, grip = b.config["task"]["objects"], b.manifest.get("grip")
@@ -43,7 +67,8 @@ def episode(b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, 
     else:
         text = f"{faults},seed={seed}"
         hand = faked(b.config, c, text, seed, False, shape, grip, 1.0, clock=None if way == "process" else clock)
-    loop = Loop(b, hand, hand, c, LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5, noise=noise, **slack), clock)
+    settings = LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5 + camera, noise=noise, ahead=ahead, **slack)
+    loop = Loop(b, hand, Later(hand, camera) if camera else hand, c, settings, clock)
     try:
         report = loop.run()
         place = hand.place(clock.now())[0]
@@ -68,8 +93,8 @@ def main(argv: list[str]) -> int:
             began = time.perf_counter()
             rows[way] = []
             for k in range(n):
-                rows[way].append(episode(b, way, first + k, float(given["seconds"]), given["faults"],
-                                         float(given["noise"])))
+                more = (float(given[x]) for x in ("noise", "camera", "ahead"))
+                rows[way].append(episode(b, way, first + k, float(given["seconds"]), given["faults"], *more))
             held = sum(r["held"] for r in rows[way])
             low, high = intervals.share(held, n)
             goals = np.array([r["goals"] for r in rows[way]])

@@ -98,6 +98,15 @@ def test_the_lowest_current_is_the_one_that_moves_it(tmp_path):
     assert found["steps"]["lowest"]["figures"]["mA"] == {"thumb_bend_joint": 160.0, "index_joint1": 160.0}
 
 
+@pytest.mark.parametrize("dead", [pytest.param(-1, marks=pytest.mark.slow), 37])
+def test_the_calibration_of_touch_finds_a_dead_taxel(tmp_path, monkeypatch, dead):
+    monkeypatch.setattr(first_hour, "PRESSES", 30)
+    _, found, _, said = walk(tmp_path, LaggingHand, ["taxels", "calibrate"], dead=dead)
+    step, right = found["steps"]["calibrate"], "0 dead" if dead < 0 else f"dead: [{dead}]"
+    assert (tmp_path / "calibration" / "calibration.yaml").is_file(), said
+    assert all(right in text for text in step["figures"]["pads"].values()), said
+
+
 @pytest.mark.parametrize("fault", [{"refuse_s": 3.0}, {"freeze_s": 3.0}, {"silent_s": 3.0}])
 def test_a_fault_in_a_step_lets_go_and_keeps_the_report(tmp_path, fault):
     status, found, fake, said = walk(tmp_path, **fault)

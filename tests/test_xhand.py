@@ -21,7 +21,7 @@ from dexsim.deploy import bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, VirtualClock
 from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
 from dexsim.deploy.loop import Loop, LoopSettings
-from dexsim.deploy.vendor import VendorXHand, XHandBus
+from dexsim.deploy.vendor import VendorXHand, VendorXHands, XHandBus
 from dexsim.deploy.vision import FixedPlace
 from dexsim.errors import UserError
 
@@ -398,3 +398,84 @@ def test_an_object_of_this_process_can_stand_for_the_package():
     assert fake.trips[-1][1][0] == POSITION and d.read().sequence > 5
     d.close()
     assert fake.trips[-1][1][0] == PASSIVE
+
+
+# -- two hands on a bus
+# --------------------------------------------------------------------------------------------------------------------
+def two(clock=None, sides=("right", "left"), serials=(None, None), hang=0.15, **faults):
+    package = partial(FakeXHand, faults=Faults(**{"outlier": 0.0, "second": "FAKE0002"} | faults))
+    return VendorXHands(serials, sides, "auto", clock or VirtualClock(1.0), package, hang)
+
+
+def turn(d, seconds, goals):
+    """The newest states, after both hands were told their goals [rad] (None: nothing) for a while."""
+    seen = []
+    end = d.clock.now() + seconds
+    while d.clock.now() < end:
+        for hand, goal in zip(d.hands, goals, strict=True):
+            if goal is not None:
+                hand.send(HandCommand(np.full(12, goal), np.full(12, 300)))
+        d.clock.sleep_until(d.clock.now() + 0.005)
+        seen.append([hand.read() for hand in d.hands])
+    return seen
+
+
+def test_two_hands_on_a_bus_are_driven_in_turn_at_half_the_rate():
+    d = two()
+    info = d.hands[0].open()
+    assert d.hands[1].open() is info and info["serial"] == "FAKE0001, FAKE0002" and info["side"] == "right, left"
+    seen = turn(d, 2.0, (0.1, 0.15))
+    fake = d.body.hands[0]._sdk
+    rates = [len([t for t, _ in trips if t > 1.0]) / (fake.time - 1.0) for trips in fake.by_hand]
+    assert rates == pytest.approx([52.3, 52.3], abs=1.5), "9.6 ms a round trip, 19.1 ms for both"
+    assert len({s[0].sequence for s in seen if s[0] is not None}) / 2.0 == pytest.approx(52, abs=2)
+    for state, goal in zip(seen[-1], (0.1, 0.15), strict=True):
+        assert np.abs(state.position - goal).max() < 0.02 and state.tactile.shape == (5, 120, 3)
+
+
+def test_one_of_two_hands_is_let_go_and_the_other_driven_on():
+    d = two()
+    d.hands[0].open()
+    turn(d, 0.5, (0.1, 0.15))
+    d.hands[0].relax()
+    turn(d, 0.5, (None, 0.12))
+    fake = d.body.hands[0]._sdk
+    assert d.hands[0].released()[0] and "right hand" in d.hands[0].released()[1]
+    assert fake.by_hand[0][-1][1][0] == PASSIVE and not fake.by_hand[0][-1][1][3].any()
+    assert fake.by_hand[1][-1][1][0] == POSITION and fake.by_hand[1][-1][1][3].all()
+    d.hands[1].relax()
+    turn(d, 0.5, (None, None))
+    assert all(trips[-1][1][0] == PASSIVE for trips in fake.by_hand)
+
+
+def test_two_hands_are_told_by_serial_number_and_side():
+    d = two(sides=(None, None), serials=("FAKE0002", "FAKE0001"))
+    assert d.open()["side"] == "left, right"
+    d = two(sides=("left", "right"))
+    assert d.open()["serial"] == "FAKE0002, FAKE0001"
+    with pytest.raises(UserError, match="no second hand.*has hand FAKE0001, not OTHER"):
+        two(sides=(None, None), serials=("FAKE0002", "OTHER")).open()
+    only = VendorXHand("auto", VirtualClock(1.0), partial(FakeXHand, faults=Faults(second="FAKE0002")), side="left")
+    assert only.open()["serial"] == "FAKE0002"
+
+
+def test_a_crc_error_of_one_hand_rests_the_bus_of_both():
+    d = two(crc=0.05, seed=3)
+    d.open()
+    turn(d, 4.0, (0.1, 0.1))
+    at = np.sort([t for trips in d.body.hands[0]._sdk.by_hand for t, _ in trips])
+    assert 0.05 < np.diff(at).max() < 0.12 and (np.diff(at) > 0.05).sum() > 5 and not d.problem()
+
+
+def test_two_hands_are_let_go_by_their_process_where_the_loop_is_silent(tmp_path):
+    log = tmp_path / "log"
+    d = two(Clock(), hang=0.3, log=str(log))
+    d.hands[0].open()
+    try:
+        turn(d, 0.5, (0.3, 0.3))
+        last = time.monotonic()
+        time.sleep(0.8)
+        first = next(t for t, mode, _ in commands(log) if t > last and mode == PASSIVE)
+        assert first - last < 0.6 and all(limit == 0 for t, _, limit in commands(log) if t > first + 0.03)
+    finally:
+        d.close()

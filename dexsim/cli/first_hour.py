@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState
+from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState, VirtualClock
 from dexsim.deploy.readings import copied, implausible
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -42,11 +42,11 @@ settings (key=default):
   joints=             only these, by commas (default: all)
   excite_current=300  mA that no step goes beyond; what does not move at current= gets twice as much, up to this
   steps=              only these, by commas: connection, cycles, signs, limp, zero, taxels, latency, lowest, excite,
-                      bundle (default: all)
+                      calibrate, bundle (default: all)
   kinds=steps,chirp   motions of the excitation (dexsim excite)
   limit=300           s that the diagnosis may take
   seed=0              of the fake
-  yes=false           ask nothing (rehearsals)
+  yes=false           ask nothing (rehearsals); the fake's time then passes as fast as it can be simulated
   out=out/check       a new folder: report.html, check.json, check.mcap, excite.mcap, servo.yaml
 
 examples:
@@ -57,10 +57,17 @@ KEYS = {"driver": "xhand", "port": "auto", "serial": "", "hand_mirror": "false",
         "excite_current": "300", "joints": "", "steps": "", "kinds": "steps,chirp", "limit": "300", "yes": "false",
         "out": "out/check", "seed": "0"}  # fmt: skip
 PERIOD, STALE = 0.01, 0.12
+DRIVE = {"kp": "N.m/rad", "kd": "N.m.s/rad", "torque_limit": "N.m", "no_load_speed": "rad/s", "delay": "s",
+         "coulomb_friction": "N.m"}  # fmt: skip
+"""Columns of a fitted drive that are held against those of training, and their units."""
 SPEED = 0.5
 """rad/s of targets; s of a turn; s that a reading may be old."""
 MOVED = 0.02
 """rad by which a joint counts as moved: 13 counts of its encoder."""
+SHORT = 0.1
+"""rad before an end of its range at which a joint counts as stopped."""
+PRESSES, PRESS_S = 60, 0.3
+"""Of a pad while it is calibrated; s of each."""
 LATENCY_STEP, LATENCY_TRIES = 0.12, 5
 
 
@@ -236,7 +243,8 @@ class Hour:
         return step
 
     def signs(self) -> Step:
-        """See: one joint after the other closes a little, then opens; nothing strains."""
+        """See: one joint after the other closes a little, opens, and goes to both ends of its range; nothing
+        strains."""
         step = Step("signs", "Signs and ranges, joint by joint")
         self.s.move(_still(self.middle), 4.0, self.amps)
         rows = {}
@@ -261,13 +269,28 @@ class Hour:
             span = a.position[-1, j] - c.position[-1, j]
             name = self.hand.joints[j]
             good = rose > 0.5 * reach and span > reach
+            ends = [float(c.position[-1, j]), float(a.position[-1, j])]
+            for k, end in enumerate((low, high) if good else ()):  # as far as it goes, from the middle
+                to, far = goal.copy(), abs(end - goal[j]) / SPEED
+                to[j] = end
+                ends[k] = float(self.s.move(_still(to), far + 0.6, self.amps).position[-1, j])
+                self.s.move(_still(goal), far + 0.2, self.amps)
             rows[name] = {"moved_rad": float(span), "of_rad": float(2 * reach), "current_closing_mA": push,
-                          "limit_mA": float(self.amps[j])}  # fmt: skip
+                          "limit_mA": float(self.amps[j]), "reached_rad": ends}  # fmt: skip
             if not good:
                 step.verdict = "bad"
                 why = "the wrong way" if rose < -0.5 * reach else f"{abs(span):.2f} of {2 * reach:.2f} rad"
                 step.text.append(f"{name} went {why}: is it free, and its order in the hand's file right?")
         step.text = step.text or [f"all {len(rows)} joints follow their targets, the right way"]
+        short = []
+        for n, r in rows.items():
+            at = self.hand.limits[self.hand.joints.index(n)]
+            if np.abs(at - r["reached_rad"]).max() > SHORT:
+                a, z = r["reached_rad"]
+                short.append(f"{n} {a:.2f} to {z:.2f} of {at[0]:.2f} to {at[1]:.2f} rad")
+        if short and step.verdict == "good":
+            step.verdict = "look"
+        step.text.append(f"short of their range: {'; '.join(short)}" if short else "all reach both ends of their range")
         more = {n: f"{r['limit_mA']:.0f} mA" for n, r in rows.items() if r["limit_mA"] > float(self.given["current"])}
         if more:
             step.text.append("needed more than current=: " + ", ".join(f"{n} {x}" for n, x in more.items()))
@@ -400,7 +423,7 @@ class Hour:
         try:
             self.s.move(lambda t: value[min(int(t * 100), len(value) - 1)], float(p.t[-1]), most, speed=20.0)
         finally:
-            self.s.recorder.close()
+            self.s.recorder.close(120.0)
             self.s.recorder = whole
         self.s.relax()
         audit = _dexsim("audit", str(self.out / "excite.mcap"))
@@ -419,6 +442,35 @@ class Hour:
             step.text.append(f"the diagnosis ended: {(servo.stderr or servo.stdout).strip().splitlines()[-1:]}")
         return step
 
+    def calibrate(self) -> Step:
+        """See: press the pad that is named all over with something blunt, as hard as you would hold a cup."""
+        step, names = Step("calibrate", "Taxels under load: dead, swapped, threshold"), self.hand.finger_names
+        if hand_layout(self.hand) is None:
+            return Step("calibrate", step.title, "skipped", ["this hand feels nothing"])
+        press = getattr(self.s.driver, "press", None)
+        self.s.recorder, whole = self.given["recorder"]("touch.mcap"), self.s.recorder
+        try:
+            for f, name in enumerate(names):
+                self.say(f"  press the {name}'s pad all over")
+                for _ in range(PRESSES):
+                    if press is not None:
+                        press(f)
+                    self.s.watch(PRESS_S)
+        finally:
+            self.s.recorder.close(120.0)
+            self.s.recorder = whole
+        done = _dexsim("calibrate", f"touch={self.out / 'touch.mcap'}", f"out={self.out / 'calibration'}",
+                       f"hand_mirror={str(self.hand.mirror).lower()}")  # fmt: skip
+        said = [line[9:] for line in done.stdout.splitlines() if line.startswith("touch    ")]
+        step.figures = {"status": done.returncode, "pads": dict(line.split(": ", 1) for line in said)}
+        step.text = [*said, "calibration/calibration.yaml, for deploy and export calibration=; N a count and A per N.m"
+                     " need a scale or a load cell: docs/tutorials/real_hand.md, 2"]  # fmt: skip
+        if done.returncode:
+            step.verdict, step.text = "look", [f"not calibrated: {(done.stderr.strip() or done.stdout)[-300:]}"]
+        elif any("0 dead; 0 swapped pairs; 0 not pressed" not in line for line in said):
+            step.verdict = "look"
+        return step
+
     def bundle(self) -> Step:
         """See: nothing moves."""
         from dexsim.calibration.file import Calibration
@@ -435,7 +487,7 @@ class Hour:
         trained = SimulatedXHand(b.config, c, clock, grip=b.manifest.get("grip"))
         trained.open()
         there = latency(Session(trained, b.hand, clock), self.middle, self.joints, self.amps)
-        here = self.found["latency"].figures if "latency" in self.found else {}
+        here = {k: x for n in ("cycles", "latency") if n in self.found for k, x in self.found[n].figures.items()}
         more = b.config.get("randomize", {}).get("servo", {}).get("delay", 0.0)
         reach = 1e3 * (max(more) if isinstance(more, list) else float(more))
         if not here.get("ms") or not there["ms"]:
@@ -451,13 +503,52 @@ class Hour:
         stiff = rise[0] > 1.5 * rise[1] or rise[0] < 0.67 * rise[1]
         step.text.append(f"a step of {LATENCY_STEP} rad is half done {rise[0]:.0f} ms after it begins, in training"
                          f" {rise[1]:.0f} ms: {'its gains are others' if stiff else 'gains as trained'}")  # fmt: skip
-        if slow or stiff:
+        others, table = self._drives(b)
+        step.figures["drives"] = table
+        step.text += others or (["the fitted drives lie within what training drew"] if table else
+                                ["gains and limits were not fitted: take the step excite too"])  # fmt: skip
+        reached = self.found["signs"].figures if "signs" in self.found else {}
+        low, high = (dict(zip(b.hand.joints, b.manifest["action"][k], strict=True)) for k in ("low", "high"))
+        short = [f"{n} {r['reached_rad'][0]:.2f} to {r['reached_rad'][1]:.2f} rad for {low[n]:.2f} to {high[n]:.2f}"
+                 for n, r in reached.items() if r["reached_rad"][0] > low[n] + SHORT
+                 or r["reached_rad"][1] < high[n] - SHORT]  # fmt: skip
+        if short:
+            step.text.append(f"the policy's targets go farther than the hand: {'; '.join(short)}")
+        noise, quiet = here.get("jitter_rad"), b.config["task"].get("sensors", {}).get("joint_noise", 0.0)
+        if noise is not None:
+            step.text.append(f"encoders at rest {noise:.4f} rad, in training {quiet:g}")
+        if slow or stiff or others or short or (noise or 0.0) > quiet:
             step.verdict = "look"
             step.text.append("train with servo_file=servo.yaml, which holds what was measured here")
         return step
 
 
-STEPS = ("connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "lowest", "excite", "bundle")
+    def _drives(self, b: Any) -> tuple[list[str], dict[str, Any]]:
+        """What the fitted drives have outside of what training drew, in words; all of it, by joint and column."""
+        from dexsim.actuator.table import ServoTable
+        from dexsim.tasks.servos import RELATIVE
+
+        if not (self.out / "servo.yaml").is_file():
+            return [], {}
+        fitted, trained = ServoTable.load(self.out / "servo.yaml"), ServoTable.from_dict(b.config["servo"])
+        drawn, words, rows = b.config.get("randomize", {}).get("servo") or {}, [], {}
+        for joint in fitted.fitted or ():
+            for column, unit in DRIVE.items():
+                here, there = fitted.value(joint, column), trained.value(joint, column)
+                range_ = drawn.get(column, 1.0 if column in RELATIVE else 0.0)
+                range_ = range_["log"] if isinstance(range_, dict) else np.broadcast_to(range_, 2)
+                low, high = (there.value * r if column in RELATIVE else there.value + r for r in map(float, range_))
+                if not np.isfinite([here.value, low, high]).all():
+                    continue
+                rows.setdefault(joint, {})[column] = {"here": here.value, "low": here.low, "high": here.high,
+                                                      "trained": [low, high]}  # fmt: skip
+                if here.low > high or here.high < low:
+                    words.append(f"{joint}: {column} is {here.value:.3g} {unit}, training drew {low:.3g} to {high:.3g}")
+        return words, rows
+
+
+STEPS = ("connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "lowest", "excite", "calibrate",
+         "bundle")  # fmt: skip
 
 
 def latency(s: Session, middle: np.ndarray, joints: Sequence[int], current: np.ndarray) -> dict[str, Any]:
@@ -515,13 +606,15 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.hand import load_hand
 
     hand = load_hand("xhand", given["hand_mirror"] == "true")
-    driver = make_driver(given, hand)
+    # nobody to wait for, and no hand: its time passes as fast as this machine simulates it, however loaded that is
+    clock = VirtualClock() if given["yes"] == "true" and not _real(given) else Clock()
+    driver = make_driver(given, hand, clock)
     out = files.place(given["out"])
     if (out / "check.json").exists():
         raise UserError(f"out={out}: holds an earlier check; choose another folder")
     out.mkdir(parents=True, exist_ok=True)
     outputs.new(out / "check.mcap", "out=")
-    return walk(driver, hand, Clock(), names, given, out, lambda text: print(text, flush=True))
+    return walk(driver, hand, clock, names, given, out, lambda text: print(text, flush=True))
 
 
 def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) -> HandDriver:
@@ -585,7 +678,7 @@ def walk(
     finally:
         session.asks = False
         ok, text = session.relax()
-        recorder.close()
+        recorder.close(120.0)
         _write(out, hour.found, info, stopped, text, clock.now() - zero)
         driver.close()
     say(f"\n{'the hand is let go: ' if ok else 'DANGER: '}{text}")
@@ -596,10 +689,14 @@ def walk(
 def _recorder(path: Path, hand: Any, clock: Clock, given: dict[str, Any]) -> Any:
     from dexsim.deploy.recorder import Recorder
 
-    real = given["driver"] == "xhand" and not given["port"].startswith("fake")
-    meta = {"source": "real" if real else "sim", "robot": hand.robot, "effort_is": "current_A", "effort_sign": "-1",
-            "tactile_unit": "count", "tactile_layout": hand.robot, "notes": "first hour"}  # fmt: skip
+    meta = {"source": "real" if _real(given) else "sim", "robot": hand.robot,
+            "effort_is": "current_A", "effort_sign": "-1", "tactile_unit": "count", "tactile_layout": hand.robot,
+            "notes": "first hour"}  # fmt: skip
     return Recorder(path, hand.joints, meta, None, clock.now(), most=200_000)
+
+
+def _real(given: dict[str, Any]) -> bool:
+    return bool(given["driver"] == "xhand" and given["port"].partition(":")[0] != "fake")
 
 
 def _still(goal: np.ndarray) -> Callable[[float], np.ndarray]:

@@ -42,7 +42,9 @@ class Faults:
     refused with the code `refuse`; unplug_s: the cable is out for two seconds, and the port's number is another then;
     outlier: share of round trips of 111 ms; opens: how often opening fails first; limp: what makes the hand limp
     (passive: mode 0, torque: a torque limit of 0, never); sdk: version, 0.10.3 has unsigned currents; side, serial;
-    press: the taxel that is felt when somebody presses a finger, -1: none; jitter rad of the encoders; seed; log: a
+    second: serial number of a second hand on the same bus, of the other side;
+    press: the taxel that is felt when somebody presses a finger, later presses of it wander over its pad, -1: none;
+    dead: a taxel that says nothing, on every board; jitter rad of the encoders; seed; log: a
     file to which a line is added for each command that the hand has taken, its time (monotonic, s), mode and largest
     torque limit (mA)."""
 
@@ -63,7 +65,9 @@ class Faults:
     sdk: str = "1.5.2"
     side: str = "R"
     serial: str = "FAKE0001"
+    second: str = ""
     press: int = -1
+    dead: int = -1
     jitter: float = ENCODER_JITTER
     seed: int = 0
     log: str = ""
@@ -121,14 +125,19 @@ class FakeXHand:
     """The module `xhand_controller.xhand_control`, over a hand (`LaggingHand`, `SimulatedHand`) and a clock."""
 
     def __init__(self, clock: Clock, make: Callable[[], Any] = LaggingHand, faults: Faults = Faults()):
-        self.clock, self.hand, self.faults = clock, make(), faults
+        self.clock, self.faults = clock, faults
+        self.hands = [make() for _ in range(1 + bool(faults.second))]
+        self.hand = self.hands[0]
         self.rng = np.random.default_rng(faults.seed)
         for k in range(1, 4):
-            self.hand.advance(k * TRIP)  # compiles what is left
+            for hand in self.hands:
+                hand.advance(k * TRIP)  # compiles what is left
         self.zero = clock.now()
         self._slip = -self.hand.time
-        self.opened, self.pressed = 0, (-1, 0.0)
-        self.trips: list[tuple[float, tuple]] = []  # when a command went over the wire, and what
+        self.opened, self.pressed, self.presses = 0, (-1, 0.0), [0] * BOARDS
+        # when a command went over the wire, and what, by hand; of the first
+        self.by_hand: list[list[tuple[float, tuple]]] = [[] for _ in self.hands]
+        self.trips = self.by_hand[0]
         self.HandCommand_t, self.FingerCommand_t = _HandCommand, _FingerCommand
 
     def XHandControl(self) -> _Control:
@@ -148,6 +157,7 @@ class FakeXHand:
         """The object is held out (1) or let go (2), in the simulated world; somebody presses finger k (3 + k)."""
         if what > 2:
             self.pressed = what - 3, self.clock.now()
+            self.presses[what - 3] += 1
         elif hasattr(self.hand, "present"):
             (self.hand.present if what == 1 else self.hand.release)()
 
@@ -156,14 +166,15 @@ class FakeXHand:
         """s since it was made."""
         return self.clock.now() - self.zero
 
-    def move(self, t: float) -> HandState:
-        """The hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
-        if t - self._slip - self.hand.time > 0.25:
-            self._slip = t - self.hand.time - TRIP
-        while self.hand.time < t - self._slip - TRIP:  # what looks at the object does so all the while
-            self.hand.advance(self.hand.time + TRIP)
-        self.hand.advance(t - self._slip)
-        return self.hand.state(t + self.zero)
+    def move(self, t: float, which: int = 0) -> HandState:
+        """A hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
+        hand = self.hands[which]
+        if t - self._slip - hand.time > 0.25:
+            self._slip = t - hand.time - TRIP
+        while hand.time < t - self._slip - TRIP:  # what looks at the object does so all the while
+            hand.advance(hand.time + TRIP)
+        hand.advance(t - self._slip)
+        return hand.state(t + self.zero)
 
     def ports(self) -> dict[str, bool]:
         """Serial ports now, and whether the hand's bus is on it: the other is its auxiliary one."""
@@ -209,15 +220,22 @@ class _HandCommand:
         self.finger_command: list[Any] = [_FingerCommand(f) for f in fingers]
 
 
+class _Kept:
+    """What the package keeps of a hand."""
+
+    def __init__(self, cache: Any):
+        self.last = _HandCommand()  # what is sent again: zeros at first
+        self.cache, self.code = cache, 0
+        self.half: tuple[float, Any] | None = None  # until when the cache is torn, and the whole frame
+
+
 class _Control:
-    """A connection: see the module. One hand, of id 0."""
+    """A connection: see the module. Hands have the ids 0, 1."""
 
     def __init__(self, fake: FakeXHand):
-        self._fake, self._port, self._id = fake, "", 0
-        self._last = _HandCommand()  # what is sent again: zeros at first
-        self._cache = self._zeros()
-        self._half: tuple[float, Any] | None = None  # until when the cache is torn, and the whole frame
-        self._code, self._crc_at, self._boot_until = 0, -np.inf, -np.inf
+        self._fake, self._port = fake, ""
+        self._kept = [_Kept(self._zeros()) for _ in fake.hands]
+        self._crc_at, self._boot_until = -np.inf, -np.inf
 
     # -- the package's calls
     # ---------------------------------------------------------------------------------------------------------------
@@ -241,15 +259,15 @@ class _Control:
 
     def list_hands_id(self) -> list[int]:
         """Ids on the bus; none on the auxiliary port."""
-        return [self._id] if (self._fake.ports() | {"fake": True}).get(self._port) else []
+        return list(range(len(self._kept))) if (self._fake.ports() | {"fake": True}).get(self._port) else []
 
     def get_hand_type(self, hand: int) -> tuple:
         """(error, L or R)."""
-        return self._said(hand, self._fake.faults.side)
+        return self._said(hand, ("R" if self._fake.faults.side == "L" else "L") if hand else self._fake.faults.side)
 
     def get_serial_number(self, hand: int) -> tuple:
         """(error, text)."""
-        return self._said(hand, self._fake.faults.serial)
+        return self._said(hand, self._fake.faults.second if hand else self._fake.faults.serial)
 
     def read_version(self, hand: int, part: int) -> tuple:
         """(error, text)."""
@@ -268,20 +286,21 @@ class _Control:
         """One round trip; error object."""
         if not isinstance(command, _HandCommand):
             raise TypeError("send_command(): incompatible function arguments")
-        if not self._port or hand != self._id:
+        if not self._port or not 0 <= hand < len(self._kept):
             return _error(NO_HAND, "no such hand")
-        self._last = _HandCommand(command)
-        return _error(self._trip())
+        self._kept[hand].last = _HandCommand(command)
+        return _error(self._trip(hand))
 
     def read_state(self, hand: int, force_update: bool = False) -> tuple:
         """(error, state): forced, the last command goes out once more; the cache either way."""
-        if not self._port or hand != self._id:
+        if not self._port or not 0 <= hand < len(self._kept):
             return _error(NO_HAND, "no such hand"), self._zeros()
         if force_update:
-            self._trip()
-        if self._half is not None and self._fake.clock.now() >= self._half[0]:
-            self._cache, self._half = self._half[1], None
-        return _error(self._code), self._cache  # a frame is not written again once it is there
+            self._trip(hand)
+        kept = self._kept[hand]
+        if kept.half is not None and self._fake.clock.now() >= kept.half[0]:
+            kept.cache, kept.half = kept.half[1], None
+        return _error(kept.code), kept.cache  # a frame is not written again once it is there
 
     def close_device(self) -> None:
         """The hand keeps its last command."""
@@ -290,12 +309,12 @@ class _Control:
     # -- the wire
     # ---------------------------------------------------------------------------------------------------------------
     def _said(self, hand: int, value: str) -> tuple:
-        there = bool(self.list_hands_id()) and hand == self._id
+        there = hand in self.list_hands_id()
         return (_error(), value) if there else (_error(NO_HAND, "no such hand"), "")
 
-    def _trip(self) -> int:
+    def _trip(self, hand: int) -> int:
         """The command goes out, the state comes back; the code of it."""
-        fake, f = self._fake, self._fake.faults
+        fake, f, kept = self._fake, self._fake.faults, self._kept[hand]
         clock, t = fake.clock, fake.time
         if t >= f.abort_s:
             os.abort()
@@ -306,48 +325,48 @@ class _Control:
             self._boot_until = now + BOOTING
         if now < self._boot_until:
             clock.sleep_until(now + REFUSING)
-            self._code = BOOT
+            kept.code = BOOT
             return BOOT
         if not fake.ports() or not (fake.ports() | {"fake": True}).get(self._port):
             clock.sleep_until(now + REFUSING)
-            self._code = NO_HAND
+            kept.code = NO_HAND
             return NO_HAND
         dead = t >= f.freeze_s
         refused = t >= f.refuse_s
         if not dead and not refused:
-            self._carry()
+            self._carry(hand)
         long = OUTLIER if fake.rng.random() < f.outlier else min(TRIP + fake.rng.exponential(TAIL), MOST)
         if dead:
             clock.sleep_until(now + long)
             return 0  # the cache answers on
         broken = fake.rng.random() < f.crc
-        frame = self._frame(fake.move(t + long), broken)
+        frame = self._frame(fake.move(t + long, hand), broken, hand)
         clock.sleep_until(now + long)
-        self._store(frame)
+        self._store(frame, kept)
         if refused:
-            self._code = 0
+            kept.code = 0
             return f.refuse
         boards = t >= f.silent_s or (f.board >= 0 and t >= f.board_s)
-        self._code = CRC if broken else NO_TAXELS if boards else 0
+        kept.code = CRC if broken else NO_TAXELS if boards else 0
         if broken:
             self._crc_at = clock.now()
-        return self._code
+        return kept.code
 
-    def _carry(self) -> None:
-        fake, fingers = self._fake, self._last.finger_command
+    def _carry(self, which: int) -> None:
+        fake, fingers, hand = self._fake, self._kept[which].last.finger_command, self._fake.hands[which]
         mode, kp, limit = fingers[0].mode, fingers[0].kp, np.array([f.tor_max for f in fingers], float)
         position = np.array([f.position for f in fingers])
-        fake.trips.append((fake.time, (mode, kp, position, limit)))
+        fake.by_hand[which].append((fake.time, (mode, kp, position, limit)))
         f = fake.faults
         if f.log:
             with open(f.log, "a", encoding="utf-8") as log:
                 log.write(f"{fake.clock.now():.4f} {mode} {limit.max():g}\n")
         if mode == PASSIVE and f.limp == "passive" or mode != PASSIVE and not limit.any() and f.limp == "torque":
-            fake.hand.relax()
+            hand.relax()
         elif mode == POSITION and limit.any():
-            fake.hand.command(HandCommand(position, limit, kp))
+            hand.command(HandCommand(position, limit, kp))
 
-    def _frame(self, s: HandState, broken: bool) -> SimpleNamespace:
+    def _frame(self, s: HandState, broken: bool, hand: int) -> SimpleNamespace:
         fake, f = self._fake, self._fake.faults
         unsigned = f.sdk.startswith("0.10")
         integer = (lambda x: int(round(x)) & 0xFFFF) if unsigned else (lambda x: int(round(x)))
@@ -361,12 +380,22 @@ class _Control:
             j.tipboard_err = 307 if broken and i == 2 else 0
         for k, board in enumerate(frame.sensor_data):
             if fake.time >= f.silent_s or (k == f.board and fake.time >= f.board_s) or broken:
-                frame.sensor_data[k] = self._cache.sensor_data[k]
+                frame.sensor_data[k] = self._kept[hand].cache.sensor_data[k]
                 continue
             touch = s.tactile[k] if k < len(s.tactile) else np.zeros((TAXELS, 3))
-            if f.press >= 0 and self._fake.pressed[0] == k and fake.clock.now() < self._fake.pressed[1] + 0.5:
+            since = fake.clock.now() - fake.pressed[1]
+            if f.press >= 0 and fake.pressed[0] == k and since < 0.5:
                 touch = touch.copy()
-                touch[f.press] = 0, 0, 60
+                if (n := fake.presses[k]) == 1:
+                    touch[f.press] = 0, 0, 60
+                else:  # a blunt tool, harder and softer again; where: a sequence that covers a pad evenly
+                    at = np.array([0.7549 * n % 1.0 * 9.0, 0.5698 * n % 1.0 * 11.0])
+                    away = np.stack(np.divmod(np.arange(TAXELS), 12), 1) - at
+                    blob = np.exp(-0.5 * (away**2).sum(1) / 1.5**2)
+                    touch[:, 2] = np.round((40 + 40 * (n % 3)) * blob * np.sin(np.pi * min(since / 0.25, 1.0)))
+            if f.dead >= 0:
+                touch = touch.copy()
+                touch[f.dead] = 0
             if touch.any():
                 rows = np.clip(touch, [-128, -128, 0], [127, 127, 255]).astype(int).tolist()
                 total = np.clip(touch.sum(0), [-128, -128, 0], [127, 127, 255]).astype(int).tolist()
@@ -375,14 +404,14 @@ class _Control:
             board.calc_temperature = 30
         return frame
 
-    def _store(self, frame: SimpleNamespace) -> None:
+    def _store(self, frame: SimpleNamespace, kept: _Kept) -> None:
         """The package's thread writes the cache: now, or, of a torn frame, to its end in 1.5 ms."""
         fake = self._fake
-        self._cache, self._half = frame, None
+        kept.cache, kept.half = frame, None
         if fake.rng.random() < fake.faults.torn:
             joints = frame.finger_state[:7] + self._zeros().finger_state[7:]
-            self._cache = SimpleNamespace(finger_state=joints, sensor_data=frame.sensor_data)
-            self._half = fake.clock.now() + 0.0015, frame
+            kept.cache = SimpleNamespace(finger_state=joints, sensor_data=frame.sensor_data)
+            kept.half = fake.clock.now() + 0.0015, frame
 
     def _zeros(self) -> SimpleNamespace:
         names = ("id sensor_id position torque raw_position temperature commboard_err jonitboard_err tipboard_err"

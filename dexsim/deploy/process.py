@@ -166,13 +166,17 @@ class BusDriver:
     def relax(self) -> None:
         """Let go in the next bus cycle; nothing that was sent before drives again. Raises UserError where nobody holds
         the bus."""
-        self._era += 1
-        if self.body is None and self._process is not None:
-            self._v["era"].value = self._era  # counts at once, even where a thread hangs inside `send`
+        self.renew()
         zero = np.zeros(self.joints)
         self._post(HandCommand(zero, zero, kp=0, mode=PASSIVE), self._era)
         if self._gone():
             raise UserError(self._ended)
+
+    def renew(self) -> None:
+        """What was sent until now drives no more."""
+        self._era += 1
+        if self.body is None and self._process is not None:
+            self._v["era"].value = self._era  # counts at once, even where a thread hangs inside `send`
 
     def problem(self) -> str:
         """Why the hand cannot be driven any longer; empty while it can."""

@@ -18,8 +18,9 @@ package may print, hang or abort: it lives in a process of its own (`dexsim.depl
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -128,9 +129,10 @@ class XHandBus:
             return [interface] if interface else list(_enumerate(self._sdk, "EtherCAT"))
         return list(_enumerate(self._sdk, "RS485")) if name == "auto" else [self.port]
 
-    def _take(self, device: Any, port: str, wrong: list[str]) -> dict[str, str] | None:
-        """The hand that is asked for, on an open port; None, with the reason in `wrong`, where it is not there."""
-        hands = list(device.list_hands_id() or ())
+    def _take(self, device: Any, port: str, wrong: list[str], taken: Sequence[int] = ()) -> dict[str, str] | None:
+        """The hand that is asked for, on an open port, but for ids that are taken; None, with the reason in `wrong`,
+        where it is not there."""
+        hands = [x for x in device.list_hands_id() or () if x not in taken]
         if not hands:
             wrong.append(f"{port} opens and lists no hand (the auxiliary port?)")
         for hand in hands:
@@ -384,6 +386,180 @@ class XHandBus:
             self._call(lambda: init(self._id, 1, 1, 500_000), None)
             self.clock.sleep_until(self.clock.now() + 0.2)
         self._device.close_device()
+
+
+class XHandsBus:
+    """The hands' side of two on one bus: a round trip of each in turn, some 50 cycles a second. Commands and states
+    hold one hand's joints and pads after the other's; a hand whose torque limits are all 0 is let go. See `XHandBus`.
+
+    serials, sides: of the hands, in that order.
+    """
+
+    def __init__(
+        self, clock: Clock, port: str, serials: Sequence[str | None], sides: Sequence[str | None],
+        package: Callable[[Clock], Any] | None,
+    ):  # fmt: skip
+        sdk = package(clock) if package is not None else _import()
+        self.clock = clock
+        self.hands = [XHandBus(clock, port, s, side, lambda _: sdk) for s, side in zip(serials, sides, strict=True)]
+        self._states: list[HandState | None] = [None] * len(self.hands)
+        self._sequence = 0
+
+    @property
+    def due(self) -> float:
+        return max(h.due for h in self.hands)
+
+    def open(self) -> dict[str, str]:
+        """Find one hand, and the others beside it; nothing moves. Raises UserError."""
+        first, *others = self.hands
+        infos = [first.open()]
+        for hand in others:
+            wrong: list[str] = []
+            more = hand._take(first._device, infos[0]["port"], wrong, [h._id for h in self.hands[: len(infos)]])
+            if more is None:
+                first.close()
+                raise UserError(f"no second hand to drive on the same bus ({'; '.join(wrong)})")
+            infos.append(more)
+        self._states = [h._state for h in self.hands]
+        return {k: ", ".join(dict.fromkeys(i[k] for i in infos)) for k in infos[0]}
+
+    def cycle(self, command: HandCommand | None) -> HandState | None:
+        """A round trip of each."""
+        new = False
+        for k, hand in enumerate(self.hands):
+            hand._pause_until = max(h._pause_until for h in self.hands)  # a bus rests as a whole
+            state = hand.cycle(None if command is None else _part(command, k))
+            if state is not None:
+                self._states[k], new = state, True
+        states = [s for s in self._states if s is not None]
+        if not new or len(states) < len(self.hands):
+            return None
+        self._sequence += 1
+        join = lambda name: np.concatenate([getattr(s, name) for s in states])  # noqa: E731
+        nobody = np.zeros(TAXELS[0], bool)
+        return HandState(
+            min(s.time for s in states), self._sequence, join("position"), join("current"), join("temperature"),
+            join("error"), join("tactile"), None if any(s.velocity is None for s in states) else join("velocity"),
+            np.concatenate([nobody if s.silent is None else s.silent for s in states]))  # fmt: skip
+
+    def problem(self) -> str:
+        """Of either hand."""
+        return "; ".join(f"{h.side or h.serial} hand: {why}" for h in self.hands if (why := h.problem()))
+
+    def released(self) -> tuple[bool, str] | None:
+        """Of those that are let go: none of them until all are known."""
+        proofs = [(h, h.released()) for h in self.hands if h._letting_go is not None]
+        known = [(h, p) for h, p in proofs if p is not None]
+        if not proofs or len(known) < len(proofs):
+            return None
+        return all(p[0] for _, p in known), "; ".join(f"{h.side or h.serial} hand: {p[1]}" for h, p in known)
+
+    def seen(self) -> np.ndarray:
+        return self.hands[0].seen()
+
+    def handle(self, what: int) -> None:
+        self.hands[0].handle(what)
+
+    def close(self) -> None:
+        self.hands[0].close()
+
+
+class VendorXHands(BusDriver):
+    """Two xHands on one RS485 bus, in a child process; `hands` are a driver of each, for a `Loop` of its own. Letting
+    go of one leaves the other driven; a fault of the bus lets go of both. See `VendorXHand`."""
+
+    name = "xHands"
+
+    def __init__(
+        self,
+        serials: Sequence[str | None] = (None, None),
+        sides: Sequence[str | None] = ("right", "left"),
+        port: str = "auto",
+        clock: Clock | None = None,
+        package: Callable[[Clock], Any] | None = None,
+        hang: float = HANG,
+    ):
+        n = len(sides)
+        make = partial(XHandsBus, port=port, serials=serials, sides=sides, package=package)
+        super().__init__(make, n * JOINTS, (n * TAXELS[0], TAXELS[1]), clock, hang)
+        self.hands = [OneOfTwo(self, k, f"{side or serials[k] or k} xHand") for k, side in enumerate(sides)]
+
+    def open(self) -> dict[str, str]:
+        """Connect, whichever hand asks first; returns what to log. Raises UserError."""
+        with self._parts_lock:
+            if not self._opened:
+                self._info, self._parts, self._opened = super().open(), [None] * len(self.hands), True
+            return self._info
+
+    _opened, _info = False, {}  # type: ignore[var-annotated]
+    _parts_lock = threading.RLock()
+
+    def part(self, k: int, command: HandCommand | None) -> None:
+        """What hand k is told: None lets go of it; nothing that was sent before drives it again."""
+        with self._parts_lock:
+            self._parts[k] = command
+            driven = next((c for c in self._parts if c is not None), None)
+            if driven is None:
+                return self.relax()
+            zero = np.zeros(JOINTS)
+            position, limit = (
+                np.concatenate([zero if c is None else getattr(c, name) for c in self._parts])
+                for name in ("position", "tor_max")
+            )
+            if command is None:
+                self.renew()
+            self.send(HandCommand(position, limit, driven.kp, driven.ki, driven.kd))
+
+
+class OneOfTwo:
+    """A hand of a bus with several: a `HandDriver`."""
+
+    def __init__(self, bus: VendorXHands, k: int, name: str):
+        self.bus, self.k, self.name = bus, k, name
+
+    def open(self) -> dict[str, str]:
+        """Connect, unless another hand has; returns what to log. Raises UserError."""
+        return self.bus.open()
+
+    def read(self) -> HandState | None:
+        """The newest state of this hand, None before the first."""
+        state = self.bus.read()
+        if state is None:
+            return None
+        j, p = (slice(self.k * n, (self.k + 1) * n) for n in (JOINTS, TAXELS[0]))
+        silent = None if state.silent is None or not state.silent[p].any() else state.silent[p]
+        return HandState(state.time, state.sequence, state.position[j], state.current[j], state.temperature[j],
+                         state.error[j], state.tactile[p], None if state.velocity is None else state.velocity[j],
+                         silent)  # fmt: skip
+
+    def send(self, command: HandCommand) -> None:
+        """Hand over targets for the next bus cycle."""
+        self.bus.part(self.k, None if command.mode == PASSIVE else command)
+
+    def relax(self) -> None:
+        """Let go of this hand."""
+        self.bus.part(self.k, None)
+
+    def problem(self) -> str:
+        """Why the bus cannot be driven any longer; empty while it can."""
+        return self.bus.problem()
+
+    def released(self) -> tuple[bool, str] | None:
+        """Whether what was let go is limp, and by what that is known."""
+        return self.bus.released()
+
+    def close(self) -> None:
+        """Let go; the bus is closed with the last of its hands."""
+        self.relax()
+        if all(c is None for c in self.bus._parts):
+            self.bus.close()
+
+
+def _part(c: HandCommand, k: int) -> HandCommand:
+    """Hand k's share of a command for several; without any torque it is let go."""
+    j = slice(k * JOINTS, (k + 1) * JOINTS)
+    mode = c.mode if c.tor_max[j].any() else PASSIVE
+    return HandCommand(c.position[j], c.tor_max[j], c.kp, c.ki, c.kd, mode)
 
 
 class VendorXHand(BusDriver):
