@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
+from dexsim.hand.couplings import Couplings
 from dexsim.recording.mechanism import Mechanism, Run
 
 
@@ -37,14 +38,19 @@ class ContactCheck:
         self.data = mujoco.MjData(self.model)
         self.clearance = clearance
         self.address = np.array([self.model.jnt_qposadr[self.model.joint(j).id] for j in m.joints])
+        self._couplings = Couplings(self.model, m.joints) if m.hand is not None else None
         self.exempt: set[tuple[str, str]] = set()
         self.exempt = set(self.near(home))
 
     def near(self, q: np.ndarray) -> list[tuple[str, str]]:
-        """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest)."""
-        qpos = self.model.qpos0.copy()
-        qpos[self.address] = q
-        return self.near_qpos(qpos)
+        """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest, or, in a hand,
+        where these hold them)."""
+        self.data.qpos[:] = self.model.qpos0
+        if self._couplings is not None:
+            self._couplings.put(self.data, q)
+        else:
+            self.data.qpos[self.address] = q
+        return self.near_qpos(self.data.qpos.copy())
 
     def near_qpos(self, qpos: np.ndarray) -> list[tuple[str, str]]:
         """The same for a whole qpos [nq]."""
