@@ -37,7 +37,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dexsim import system
+from dexsim import system, typed
 from dexsim.errors import UserError
 
 T = TypeVar("T")
@@ -77,14 +77,14 @@ def ours(path: Path) -> bool:
 def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted: bool, patience: float) -> Any:
     if _inside:  # within a reader's limits already
         return function(*args)
-    times = _times()
+    times = typed.number(TRUSTED, os.environ.get(TRUSTED, "1"), 1.0, 1e6)
     seconds = times * (patience * SECONDS + SECONDS_A_MIB * size / 2**20)
     most = int(times * (BYTES + TIMES_SIZE * size))
     answer: Any = ""
     for method in dict.fromkeys((system.start_method(), "spawn")):
         context: Any = multiprocessing.get_context(method)
         receive, send = context.Pipe(False)
-        child = context.Process(target=_child, args=(send, _here(), function, args, seconds, most, wanted))
+        child = context.Process(target=_child, args=(send, os.getcwd(), function, args, seconds, most, wanted))
         try:
             try:
                 child.start()
@@ -115,16 +115,6 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
     raise UserError(f"{what}: breaks the library that reads it ({how}, with at most {most / 2**30:.3g} GiB of memory)")
 
 
-def _times() -> float:
-    text = os.environ.get(TRUSTED, "1")
-    try:
-        if 1.0 <= float(text) <= 1e6:
-            return float(text)
-    except ValueError:
-        pass
-    raise UserError(f"{TRUSTED}={text} (environment): must be a number from 1 to 1e6")
-
-
 def _answer(receive: Connection, pid: int, wall: float) -> Any:
     """The child's answer in a tuple, its error, what it waits for in words, or "" where it ended without."""
     begun = moved = time.monotonic()
@@ -144,22 +134,13 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         return ""
 
 
-def _here() -> str:
-    """The working folder, "" where it is gone."""
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
-
-
 def _child(
     send: Connection, here: str, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
 ) -> None:
     """The process: works out, answers, ends."""
     global _inside
     _inside = True
-    if here:  # a process that is begun anew has that of the program's start
-        os.chdir(here)
+    os.chdir(here)  # a process that is begun anew has that of the program's start
     gc.freeze()  # what a fork would collect of the program may wait for a thread that is not here
     system.limit(seconds, most)
     faulthandler.disable()

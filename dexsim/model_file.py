@@ -14,8 +14,6 @@ import numpy as np
 from dexsim import files, guard
 from dexsim.errors import UserError
 
-MAX_MODEL = 64 << 20
-"""Bytes of a model file."""
 Edit = Callable[[mujoco.MjSpec], None] | None
 MAX_DOFS = 1000
 """Degrees of freedom of a model."""
@@ -25,7 +23,7 @@ def read(path: Path, where: str, edit: Edit = None) -> mujoco.MjSpec:
     """The model of an MJCF or URDF file, as `edit` changes it, which compiles. where: what the file is, for messages.
     Raises UserError."""
     if not guard.ours(path):
-        files.check(path, MAX_MODEL, f"{where}:")
+        files.check(path, f"{where}:")
         for text in guard.call(_tried, path, where, edit, what=where):
             print(f"warning: {where}: {text}", file=sys.stderr)
     with warned():

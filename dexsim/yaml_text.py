@@ -11,7 +11,6 @@ import yaml
 from dexsim import files, guard
 from dexsim.errors import UserError
 
-MOST_BYTES = 8 << 20
 SMALL = 4096
 """Bytes of a text that is read at once; a longer one in a process of its own."""
 MOST_NODES = 500_000
@@ -45,8 +44,6 @@ def parse(text: str | bytes, source: object) -> Any:
     """The plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the limit that
     was passed: size, depth, number of values (aliases expanded), merge keys (<<), a key that stands twice, a value that
     holds itself, tags of other data than plain."""
-    if len(text) > MOST_BYTES:
-        raise UserError(f"{source}: {len(text) / 2**20:.1f} MiB of YAML, allowed {MOST_BYTES >> 20} MiB")
     if len(text) <= SMALL:
         return _parse(text, source)
     return guard.call(_parse, text, source, what=str(source))
@@ -63,9 +60,9 @@ def _parse(text: str | bytes, source: object) -> Any:
 
 
 def load(path: Path, what: str) -> Any:
-    """The plain data of a YAML file of people (at most `files.MAX_YAML` bytes); `what` it is, for the message. Raises
+    """The plain data of a YAML file of people (at most `files.MAX_TEXT` bytes); `what` it is, for the message. Raises
     UserError."""
-    return parse(files.text(path, files.MAX_YAML, what), f"{what} '{path}'")
+    return parse(files.text(path, what), f"{what} '{path}'")
 
 
 def _plain(node: Any, rest: list[int]) -> Any:

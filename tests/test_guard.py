@@ -100,9 +100,9 @@ def test_the_holes_of_a_sparse_file_give_no_limits(tmp_path):
     path = tmp_path / "sparse"
     path.write_bytes(b"x")
     os.truncate(path, 1 << 40)
-    assert files.check(path, 1 << 41, "file") < 1 << 20
+    assert files.check(path, "file", 1 << 41) < 1 << 20
     path.write_bytes(bytes(3000))
-    assert files.check(path, 1 << 20, "file") == 3000
+    assert files.check(path, "file") == 3000
 
 
 def test_limits_grow_with_the_file_and_where_it_is_trusted(monkeypatch):

@@ -54,6 +54,11 @@ def test_a_path_is_taken_as_it_was_typed(path):
     assert str(override.value()).strip("'\"").replace("\\\\", "\\").replace("\\'", "'") == path
 
 
+def test_paths_in_a_list_are_taken_as_they_were_typed():
+    (override,) = settings.parse(["task.objects.train=[/a b/müg 1.stl, box,it's.obj]"], CONFIGS).values
+    assert [str(x).strip("'").replace("\\'", "'") for x in override.value()] == ["/a b/müg 1.stl", "box", "it's.obj"]
+
+
 def test_a_list_that_is_not_closed_is_still_refused():
     with pytest.raises(ValueError, match="cannot read 'task.objects.train=\\[a'"):
         settings.parse(["task.objects.train=[a"], CONFIGS)

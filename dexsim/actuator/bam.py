@@ -103,7 +103,7 @@ def read(path: str | Path) -> Bam:
     """Return a BAM parameter file. Raises UserError: not JSON, a parameter unknown, missing or impossible, a motor
     that is not driven by voltage."""
     path = Path(path).expanduser()
-    raw = files.mapping(path, files.MAX_YAML, "BAM file")
+    raw = files.mapping(path, "BAM file")
     motor = raw.get("actuator")
     if isinstance(motor, str) and motor.startswith(NOT_BY_VOLTAGE):
         raise UserError(

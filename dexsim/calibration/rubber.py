@@ -16,7 +16,6 @@ import numpy as np
 from dexsim import files
 from dexsim.errors import UserError
 
-MOST_BYTES = 64 << 20
 """Of a curve's file."""
 
 TRELOAR_1944 = np.array([
@@ -155,12 +154,8 @@ def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
     if str(path) == "treloar":
         return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()
-    files.check(path, MOST_BYTES, "curve=")
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"curve={path}: cannot be read: {error}") from None
+    lines = files.text(path, "curve=").splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     for kind, names in (("press", ("depth_m", "force_N")), ("stress", ("stretch", "stress_Pa"))):
         if rows and set(names) <= set(rows[0]):
             try:

@@ -58,9 +58,12 @@ def parse(argv: list[str], config_dir: Path) -> Request:
             item = parser.parse_override(text)
         except HydraException as error:
             key, _, value = text.partition("=")
-            try:  # a path with spaces, umlauts or brackets is what was typed
-                quoted = value.replace("\\", "\\\\").replace("'", "\\'")
-                item = parser.parse_override(text if value[:1] in tuple("[{(\"'$") else f"{key}='{quoted}'")
+            a_list = value[:1] == "[" and value[-1:] == "]"
+            plain = value[1:-1] if a_list else value
+            try:  # paths with spaces, umlauts or brackets are what was typed
+                quoted = ",".join(f"'{_escaped(x)}'" for x in (plain.split(",") if a_list else [plain]))
+                as_typed = f"{key}=[{quoted}]" if a_list else f"{key}={quoted}"
+                item = parser.parse_override(text if plain[:1] in tuple("[{(\"'$") else as_typed)
             except HydraException:
                 said = " ".join(str(error).split())[:200]
                 raise UserError(f"cannot read {text!r}: {said}; lists are written [a,b], text 'a b'") from None
@@ -73,6 +76,11 @@ def parse(argv: list[str], config_dir: Path) -> Request:
         else:
             request.values.append(item)
     return request
+
+
+def _escaped(text: str) -> str:
+    """A text as it stands between single quotes."""
+    return text.strip().replace("\\", "\\\\").replace("'", "\\'")
 
 
 def _option(item: Override, options: list[str]) -> str:

@@ -23,8 +23,6 @@ TERMS = "observation.onnx"
 """The observation of a task of declared terms, from signals."""
 HAND = "hand"
 """Folder of a bundle with the hand that it is for, where that does not come with dexsim."""
-MOST_BYTES = 256 << 20
-"""Of a policy's network."""
 
 
 @dataclass
@@ -88,7 +86,7 @@ def _network(file: Path, digest: str) -> bytes:
     """The bytes of a network. Raises UserError: missing, too large, not the one that the manifest names."""
     if not file.exists():
         raise UserError(f"{file.parent}: {file.name} is missing; export the bundle again")
-    files.check(file, MOST_BYTES, "network")
+    files.check(file, "network")
     data = file.read_bytes()
     if hashlib.sha256(data).hexdigest() != digest:
         raise UserError(f"{file}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
@@ -125,7 +123,7 @@ def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
 
 
 def _mapping(file: Path) -> dict[str, Any]:
-    data = yaml_text.parse(files.text(file, yaml_text.MOST_BYTES, "bundle's"), file)
+    data = yaml_text.parse(files.text(file, "bundle's"), file)
     if not isinstance(data, dict):
         raise UserError(f"{file}: is {type(data).__name__}, must map keys to values; export the bundle again")
     return data

@@ -18,7 +18,6 @@ RECORDINGS = (".mcap", ".csv", ".tsv", ".npz", ".h5", ".hdf5")
 OWN = (("model", ("model.xml", "model.urdf")), ("servo", ("servo.yaml",)))
 """Files that a machine's folder may hold in the place of the command's model= and servo=."""
 RESULT = "diagnosis.json"
-MOST_BYTES = 64 << 20
 Value = tuple[float, float, float]
 """A size, and the ends of its interval."""
 
@@ -124,7 +123,7 @@ def _last(job: jobs.Job) -> str:
 def read(folder: Path) -> dict[str, Any]:
     """A machine's diagnosis.json. Raises UserError for a damaged one."""
     try:
-        data = files.mapping(folder / RESULT, MOST_BYTES, "diagnosis")
+        data = files.mapping(folder / RESULT, "diagnosis", 64 << 20)
         cells_of(data)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{folder / RESULT}: damaged ({type(error).__name__}: {error}); diagnose it again") from None

@@ -146,8 +146,8 @@ def to_yaml(file: HandFile) -> str:
 def write(file: HandFile, path: Path) -> None:
     """Write the file whole or not at all."""
     text = to_yaml(file)
-    if len(text.encode()) > files.MAX_YAML:
-        raise UserError(f"hand {path}: {len(text)} characters, at most {files.MAX_YAML} are read")
+    if len(text.encode()) > files.MAX_TEXT:
+        raise UserError(f"hand {path}: {len(text)} characters, at most {files.MAX_TEXT} are read")
     new = path.with_suffix(".yaml.new")
     new.write_text(text, encoding="utf-8")
     new.replace(path)

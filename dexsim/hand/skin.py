@@ -34,7 +34,7 @@ def tip_skins(hand: Hand) -> list[np.ndarray]:
 
 @lru_cache(maxsize=64)
 def _vertices(path: Path, stamp: int) -> np.ndarray:
-    text = files.text(path, MAX_SKIN, "fingertip skin")
+    text = files.text(path, "fingertip skin", MAX_SKIN)
     try:
         rows = [[float(x) for x in line.split()[1:4]] for line in text.splitlines() if line.startswith("v ")]
         out = np.array(rows, dtype=float).reshape(-1, 3)
@@ -47,7 +47,7 @@ def _vertices(path: Path, stamp: int) -> np.ndarray:
 
 def obj_vertices(path: Path) -> np.ndarray:
     """Vertices [V, 3] of an OBJ file. Raises UserError."""
-    files.check(path, MAX_SKIN, "fingertip skin")
+    files.check(path, "fingertip skin", MAX_SKIN)
     return _vertices(path, path.stat().st_mtime_ns).copy()
 
 

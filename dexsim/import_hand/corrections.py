@@ -110,7 +110,7 @@ def _laid(node: Any, place: str, value: Any) -> bool:
 def written(folder: Path) -> dict[str, Any] | None:
     """What the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no note."""
     try:
-        data = files.mapping(folder / NOTE, files.MAX_YAML, "note")
+        data = files.mapping(folder / NOTE, "note")
     except UserError:
         return None
     return data if isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict) else None

@@ -56,7 +56,7 @@ def read(
     Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
     coupled joints, links without inertia, limits that are none.
     """
-    files.check(path, urdf.MAX_MODEL, "model")
+    files.check(path, "model")
     with tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch:
         given = path, packages, coupled, density, inertia, Path(scratch)
         return guard.call(_read, *given, what=f"model {path}")

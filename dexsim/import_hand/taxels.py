@@ -15,7 +15,6 @@ from dexsim.errors import UserError
 from dexsim.import_hand import geometry
 from dexsim.import_hand.frame import unit
 
-MAX_CSV = 16 << 20
 STEEPEST = 0.35
 """Least cosine between a taxel's normal and the pad's: flanks steeper than 70 degrees carry none."""
 OFF = 1e-3
@@ -122,7 +121,7 @@ def _smooth(normals: np.ndarray, rows: int, columns: int) -> np.ndarray:
 def read(path: Path) -> dict[str, Pad]:
     """A person's taxels: columns finger, x, y, z [m], nx, ny, nz in the tip body's frame, and area [m2] where it is
     known. Raises UserError, with the line."""
-    rows = list(csv.DictReader(io.StringIO(files.text(path, MAX_CSV, "taxels"))))
+    rows = list(csv.DictReader(io.StringIO(files.text(path, "taxels"))))
     need = ("finger", "x", "y", "z", "nx", "ny", "nz")
     missing = [c for c in need if not rows or c not in rows[0]]
     if missing:

@@ -12,8 +12,6 @@ from typing import Any
 from dexsim import files
 from dexsim.errors import UserError
 
-MAX_MODEL = 64 << 20
-"""Bytes of a model file."""
 READS = (".stl", ".obj", ".msh")
 """Mesh files that MuJoCo reads."""
 
@@ -35,7 +33,7 @@ def is_urdf(path: Path) -> bool:
 
 
 def _root_of_any(path: Path, what: str = "mesh") -> ET.Element:
-    return ET.fromstring(files.text(path, MAX_MODEL, what))
+    return ET.fromstring(files.text(path, what, files.MAX_FILE))
 
 
 def _root(path: Path) -> ET.Element:

@@ -40,8 +40,6 @@ FORMAT = "dexsim-checkpoint"
 VERSION = 1
 KEYS = ("kind", "config", "versions", "git", "layout", "iteration", "steps", "actor")
 TRAIN_KEYS = ("critic", "optimizer", "env", "rng")
-MOST_BYTES = 16 << 30
-"""Of a checkpoint: a million worlds' states."""
 
 
 def save(path: str | Path, payload: dict[str, Any]) -> Path:
@@ -105,7 +103,12 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     checkpoint, another format version, a missing part, one of the wrong type, weights that are not finite.
     """
     path = policies.place(path)
-    guard.rehearse(_load, path, "cpu", what=f"{path}", size=_check_whole(path))
+    if not path.exists():
+        names = ", ".join(policies.included())
+        raise UserError(f"{path}: no such checkpoint{_nearby(path)}; dexsim comes with {names}")
+    if path.is_dir():
+        raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
+    guard.rehearse(_whole, path, what=f"{path}", size=files.check(path, "checkpoint", 16 << 30))
     return _load(path, device)
 
 
@@ -142,42 +145,23 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _check_whole(path: Path) -> int:
-    """Tell a missing, truncated, damaged or pickled file apart before torch gets it; return its bytes."""
-    if not path.exists():
-        names = ", ".join(policies.included())
-        raise UserError(f"{path}: no such checkpoint{_nearby(path)}; dexsim comes with {names}")
-    if path.is_dir():
-        raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
-    size = files.check(path, MOST_BYTES, "checkpoint")
+def _whole(path: Path) -> None:
+    """Tell a truncated, damaged or pickled file from a checkpoint, and read it."""
+    with open(path, "rb") as file:
+        head = file.read(2)
+    if head[:1] == b"\x80":  # first byte of a raw pickle
+        raise UserError(f"{path}: refused, it is a raw pickle, which can run code; a dexsim checkpoint holds only"
+                        " tensors, numbers and text")
+    another = "use another checkpoint of its run folder"
     try:
-        with open(path, "rb") as file:
-            head = file.read(2)
-        if head[:1] == b"\x80":  # first byte of a raw pickle
-            raise UserError(f"{path}: refused, it is a raw pickle, which can run code; a dexsim checkpoint holds only"
-                            " tensors, numbers and text")
         with zipfile.ZipFile(path) as archive:
-            if head != b"PK" or min(i.header_offset for i in archive.infolist()) != 0:
-                raise UserError(
-                    f"{path}: refused, something else stands before its archive, which a dexsim checkpoint never has"
-                )
-            if any(i.compress_type != zipfile.ZIP_STORED for i in archive.infolist()):
-                raise UserError(
-                    f"{path}: refused, its parts are compressed, which those of a dexsim checkpoint never are"
-                )
             bad = archive.testzip()
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, ValueError, RuntimeError) as error:
-        if isinstance(error, UserError):
-            raise
+    except Exception:  # a damaged archive fails anywhere
         what = "truncated" if head == b"PK" else "empty" if not head else "not a checkpoint"
-        raise UserError(
-            f"{path}: {what} ({path.stat().st_size} bytes); use another checkpoint of its run folder"
-        ) from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+        raise UserError(f"{path}: {what} ({path.stat().st_size} bytes); {another}") from None
     if bad:
-        raise UserError(f"{path}: damaged, its part {bad} fails its checksum; use another checkpoint of its run folder")
-    return size
+        raise UserError(f"{path}: damaged, its part {bad} fails its checksum; {another}")
+    _load(path, "cpu")
 
 
 def _nearby(path: Path) -> str:

@@ -27,7 +27,6 @@ from dexsim.recording.schema import Finding
 from dexsim.recording.units import UNITS
 
 SUFFIXES = (".csv", ".tsv", ".npz")
-MAX_BYTES = 1 << 30  # of a file, unpacked
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "time": ("time", "timestamp", "stamp", "t", "host_time"),
     "command": (
@@ -440,7 +439,7 @@ def _clock(
 def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
     """Columns of a text file, as texts: separated by commas, semicolons or tabs, a line of names before the numbers;
     lines from # on are left out."""
-    text = files.text(path, MAX_BYTES, "recording")
+    text = files.text(path, "recording", 1 << 30)
     lines = text.lstrip("\ufeff").splitlines()
     body = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if body and _numeric(body[0]):  # the names may stand in a comment
@@ -530,7 +529,7 @@ def _numeric(line: str) -> bool:
 def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
     """Columns of a NumPy archive: arrays [T], or [T, J] with `joint_names` [J]. Nothing pickled is read."""
     try:
-        arrays = files.arrays(path, MAX_BYTES)
+        arrays = files.arrays(path)
     except ValueError as error:
         fix = ": cut it into several files" if "unpacks" in str(error) else ""
         raise UserError(f"recording {path}: is not an NPZ file that can be read: {error}{fix}") from None

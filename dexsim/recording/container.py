@@ -25,8 +25,6 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
 from dexsim.errors import UserError
 
-MAX_FILE = 64 << 30
-"""Bytes of a file; only what its records need is read of it."""
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
 ZSTD = b"\x28\xb5\x2f\xfd"

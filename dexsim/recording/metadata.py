@@ -117,7 +117,7 @@ def own_record(records: list[Any]) -> dict[str, str]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    raw = yaml_text.parse(files.text(path, files.MAX_YAML, "metadata"), path)
+    raw = yaml_text.parse(files.text(path, "metadata"), path)
     if raw is None:
         return {}
     return typed.convert(raw, Written, path, f"it must map metadata keys to values; valid keys: {', '.join(VALID)}")

@@ -15,7 +15,7 @@ from dexsim import files, guard
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, readers, schema, timeline
-from dexsim.recording.container import BAGS, MAX_FILE, Container, open_container
+from dexsim.recording.container import BAGS, Container, open_container
 from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
 from dexsim.recording.units import Unit, Units, split
@@ -66,7 +66,7 @@ def read(
     if dataset is not None:
         size = readers.ready(dataset, base)
     else:
-        size = sum(files.check(p, MAX_FILE, "recording") for p in _files(path))
+        size = sum(files.check(p, "recording", 64 << 30) for p in _files(path))
     given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand, limits
     return guard.call(_read, *given, what=f"recording {path}", size=size)
 

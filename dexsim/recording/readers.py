@@ -30,9 +30,7 @@ from dexsim.errors import UserError
 from dexsim.recording.schema import TACTILE, Finding, shown
 
 GROUP = "dexsim.readers"
-MAX_META = 64 << 20  # bytes of a file that describes a data set
 MAX_EPISODES = 100_000
-MAX_FILE = 64 << 30
 PICKLES = (".pkl", ".pickle", ".joblib", ".npy")
 NOMINAL = "times are nominal, frame / rate: what a reading or a command was late by is not in them"
 
@@ -101,7 +99,7 @@ def ready(reader: Reader, path: Path) -> int:
         except ImportError:
             raise UserError(f"recording {path}: needs {name}: pip install {reader.needs}") from None
     inside = [path] if path.is_file() else (p for p in path.rglob("*") if p.is_file() and "videos" not in p.parts)
-    return sum(files.check(p, MAX_FILE, "recording") for p in inside)
+    return sum(files.check(p, "recording", 64 << 30) for p in inside)
 
 
 def expanded(path: Path) -> list[Path]:
@@ -234,12 +232,12 @@ class LeRobot:
         return (path / "meta" / "info.json").is_file()
 
     def count(self, path: Path) -> int:
-        return int(files.mapping(path / "meta" / "info.json", MAX_META, "data set")["total_episodes"])
+        return int(files.mapping(path / "meta" / "info.json", "data set")["total_episodes"])
 
     def read(self, path: Path, episode: int) -> Episode:
         from pyarrow import parquet
 
-        info = files.mapping(path / "meta" / "info.json", MAX_META, "data set")
+        info = files.mapping(path / "meta" / "info.json", "data set")
         place = {"episode_index": episode, "episode_chunk": episode // int(info.get("chunks_size") or 1000)}
         if str(info.get("codebase_version", "")).startswith("v3"):
             place |= self._place(path, episode)

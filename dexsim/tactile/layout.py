@@ -211,7 +211,7 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"taxel file {path}: not found")
-    text = files.text(path, files.MAX_YAML, "taxel file")
+    text = files.text(path, "taxel file")
     lines = [s for s in text.splitlines() if s.strip() and not s.startswith("#")]
     rows = list(csv.DictReader(lines))
     if not rows:

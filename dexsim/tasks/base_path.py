@@ -105,7 +105,7 @@ def along(path: Path) -> tuple[Callable[[float], np.ndarray], float]:
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [K], places [K, 3], rotation vectors [K, 3]."""
     where = f"task.evaluation.base={path}"
-    rows = csv.DictReader(io.StringIO(files.text(path, files.MAX_YAML, "path of the base")))
+    rows = csv.DictReader(io.StringIO(files.text(path, "path of the base")))
     known, have = ("t", "x", "y", "z", "rx", "ry", "rz"), [str(c).strip() for c in rows.fieldnames or ()]
     if have not in ([*known], [*known[:4]]):
         raise UserError(

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 KEEP = 10
 """Files a run writes at most; `nan_count` goes on counting."""
-MOST_BYTES = 1 << 30
 """Of a file, packed or not."""
 
 
@@ -145,7 +144,7 @@ def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
 def load(path: Path) -> dict[str, np.ndarray]:
     """Arrays of a dump by name. Raises UserError for a file that is not one."""
     try:
-        data = files.arrays(path, MOST_BYTES)
+        data = files.arrays(path)
         json.loads(str(data["config"]))
         data["qpos"], data["servo_state"]
     except (ValueError, KeyError) as error:

@@ -20,7 +20,6 @@ from dexsim.hand import Hand
 
 FOUND = "held_cubes.npz"
 """File of a hand's folder in which a search keeps what it found."""
-MOST_BYTES = 256 << 20
 """Of a file of held poses, packed or not."""
 FINGERTIPS = Path(__file__).parents[1] / "assets" / "grasps" / "fingertips.npz"
 """Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
@@ -63,7 +62,7 @@ class GraspSet:
         """Read a file that this module wrote. Raises UserError."""
         path = files.place(path)
         try:
-            data = files.arrays(path, MOST_BYTES)
+            data = files.arrays(path)
             out = cls(*(torch.as_tensor(data[k], dtype=torch.float32) for k in ROWS))
             if "names" in data:
                 out.names = tuple(str(x) for x in np.atleast_1d(data["names"]))

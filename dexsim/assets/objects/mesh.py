@@ -21,7 +21,6 @@ from dexsim.errors import UserError
 SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold
 _CELLS = 62  # along the longest side of the grid, margin included
 _FINE_CELLS = 90  # the same of what is split into many parts
-MOST_BYTES = 256 << 20
 PATIENCE = 40.0
 """Times the usual limits for a sound surface: CoACD splits a hollow one by a search, and a distance grid is baked."""
 MOST_PARTS = 32  # convex parts of one object
@@ -155,7 +154,7 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
 def surface(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
     """Triangles [T, 3, 3] (m) of the closed surface in a mesh file, outward, and notes. Raises UserError for what is
     wrong with it."""
-    return guard.call(_read, path, scale, what=f"mesh {path}", size=files.check(path, MOST_BYTES, "mesh"))
+    return guard.call(_read, path, scale, what=f"mesh {path}", size=files.check(path, "mesh"))
 
 
 def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: int, single: bool) -> Shape:

@@ -21,7 +21,6 @@ from dexsim.errors import UserError
 FORMAT = 1
 FILE = "object.npz"
 MESHES = (".stl", ".obj", ".ply", ".off")
-MOST_BYTES = 256 << 20
 PARTS = 16  # convex parts of a hollow mesh, where nothing is said
 
 
@@ -91,9 +90,9 @@ def own_shape(name: str, scale: float = 1.0, parts: int = PARTS) -> Shape:
     imported), called `name`. Raises UserError as `load_mesh` does."""
     path = files.place(name)
     if os.path.isdir(path):
-        files.check(path / FILE, MOST_BYTES, "object")
+        files.check(path / FILE, "object")
         return replace(_read(path / FILE), name=name)
-    files.check(path, MOST_BYTES, "mesh")
+    files.check(path, "mesh")
     return replace(_cached(path.resolve(), path.stat().st_mtime_ns, float(scale), int(parts)), name=name)
 
 
@@ -149,7 +148,7 @@ def save(shape: Shape, path: Path) -> None:
 def _read(path: Path) -> Shape:
     """What `save` wrote. Raises UserError for anything else."""
     try:
-        d = files.arrays(path, MOST_BYTES)
+        d = files.arrays(path)
         if int(d["format"]) != FORMAT:
             raise ValueError(f"format {int(d['format'])}, must be {FORMAT}")
         hulls = np.split(d["hulls"].astype(float), np.cumsum(d["hull_sizes"])[:-1])
