@@ -186,23 +186,50 @@ def test_intervals_follow_how_well_what_was_held_out_is_followed():
 
 
 def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeypatch):
-    clock = iter(np.arange(0.0, 1000.0, 4.0))
-    monkeypatch.setattr("dexsim.gap.command.time.perf_counter", lambda: float(next(clock)))
+    now = [100.0]  # what was before the search does not count
+    monkeypatch.setattr("dexsim.gap.command.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr(compute.time, "monotonic", lambda: now[0])
 
     def work(k, tell):
         for part in (0.05, 0.25, 0.5):
+            now[0] += 40 * part - (now[0] - 103.0)
             tell(part)
+        now[0] = 143.0
         return k
 
-    assert compute.map_joints(["knuckle"], work, "cpu", Progress()) == [0]
+    says = Progress()
+    now[0] = 103.0
+    assert compute.map_joints(["knuckle"], work, "cpu", says) == [0]
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == [
         "searching knuckle (1/1)",
-        "searching knuckle (1/1), 5 % done",
-        "searching knuckle (1/1), 25 % done, about 36 s left",
-        "searching knuckle (1/1), 50 % done, about 16 s left",
-        "searched 1 in 20 s",
+        "searching knuckle (1/1), 25 % done, about 30 s left",
+        "searching knuckle (1/1), 50 % done, about 20 s left",
+        "searched 1 in 40 s",
     ]
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_the_time_left_of_several_searches_counts_those_that_wait_and_the_longest(lanes, monkeypatch):
+    """Searches of 20 to 60 s: from a fifth of the time on, what is told to be left is right within a third."""
+    now, took = [0.0], [20.0, 60.0, 30.0, 45.0, 25.0, 50.0, 35.0]
+    monkeypatch.setattr(compute.time, "monotonic", lambda: now[0])
+    pace, begun, free, told = compute.Pace(len(took), lanes), {}, 0, []
+    while free < len(took) or begun:
+        while free < len(took) and len(begun) < lanes:
+            begun[free] = now[0]
+            pace.tell(free, 0.0)
+            free += 1
+        now[0] += 1.0
+        for k, t in list(begun.items()):
+            pace.tell(k, min((now[0] - t) / took[k], 1.0))
+            if now[0] - t >= took[k]:
+                del begun[k]
+        told.append((now[0], pace.share()))
+    end = now[0]
+    assert told[-1] == (end, 1.0)
+    right = [abs(t / x - end) <= (end - t) / 3 for t, x in told[:-1] if t > 0.2 * end]
+    assert np.mean(right) > 0.9
 
 
 def test_a_search_tells_how_far_it_is():

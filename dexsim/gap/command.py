@@ -317,8 +317,10 @@ class Progress:
         self.said, self.searched = 0.0, -1
 
     def __call__(self, done: float, total: int, name: str) -> None:
-        """done of total are searched, the one under way in part."""
+        """done of total are searched, by the time that it takes."""
         now = time.perf_counter()
+        if not done:  # what was before says nothing of how long it takes
+            self.start = now
         if int(done) == self.searched < total and not self.live and now - self.said < self.EVERY:
             return
         self.said, self.searched, spent = now, int(done), now - self.start

@@ -191,27 +191,62 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
         return list(pool.map(work, range(count)))
 
 
+class Pace:
+    """How much of the time that searches take side by side is over. count: of them; lanes: that run at a time."""
+
+    TELLS = 0.05  # share of its own time from which on a search tells how long it takes
+
+    def __init__(self, count: int, lanes: int):
+        self._count, self._lanes, self._first = count, lanes, time.monotonic()
+        self._parts, self._begun, self._took = [0.0] * count, dict[int, float](), dict[int, float]()
+
+    def tell(self, k: int, part: float) -> None:
+        """Search k has this share (0..1) of its time behind it."""
+        now, self._parts[k] = time.monotonic(), part
+        begun = self._begun.setdefault(k, now)
+        if part >= 1.0:
+            self._took[k] = now - begun
+
+    def share(self) -> float:
+        """Share (0..1) of the whole time that is over: each search takes as long as its own share says, one that tells
+        nothing yet as long as the others in the mean."""
+        now = time.monotonic()
+        running = [k for k in self._begun if k not in self._took]
+        whole = self._took | {
+            k: (now - self._begun[k]) / self._parts[k] for k in running if self._parts[k] >= self.TELLS
+        }
+        if not whole:
+            return sum(self._parts) / self._count
+        mean = sum(whole.values()) / len(whole)
+        lanes = [max(whole.get(k, mean) - (now - self._begun[k]), 0.0) for k in running]
+        lanes += [0.0] * (self._lanes - len(lanes))
+        heapq.heapify(lanes)
+        for _ in range(self._count - len(self._begun)):  # each goes where a lane is free first
+            heapq.heapreplace(lanes, lanes[0] + mean)
+        return (now - self._first) / max(now - self._first + max(lanes), 1e-9)
+
+
 def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
              progress: Callable[[float, int, str], None] | None = None, left: Sequence[float] = ()) -> list[T]:
-    """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is
-    worked on). left: what is to be explained of each, where that is known: the more, the sooner it has its turns."""
-    parts = [0.0] * len(names)
-    lock = threading.Lock()
+    """work(k, tell) for each name, in their order; tell(part) says how much of its time is over; progress(done, of,
+    which is worked on): `done` of them by the time that is over. left: what is to be explained of each, where that is
+    known: the more, the sooner it has its turns."""
+    lock, at_once = threading.Lock(), workers(device, len(names))
+    pace = Pace(len(names), at_once)
 
     def one(k: int) -> T:
         def tell(part: float) -> None:
             with lock:
-                parts[k] = part
+                pace.tell(k, part)
                 if progress and part < 1.0:
-                    progress(sum(parts), len(names), names[k])
+                    progress(len(names) * pace.share(), len(names), names[k])
 
-        tell(0.0)
         with turn(-left[k] if len(left) else 0.0):
+            tell(0.0)
             out = work(k, tell)
         tell(1.0)
         return out
 
-    at_once = workers(device, len(names))
     if at_once <= 1:
         out = [one(k) for k in range(len(names))]
     else:

@@ -38,7 +38,7 @@ GAIN, DAMPING, LIMIT = (0.2, 5.0), 20.0, (0.3, 3.0)  # x what is believed, where
 WIDER = 2.0  # x: a stated range may be off by as much
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
 MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
-OFFSET = 0.5  # of a joint's typical torque
+OFFSET = 1.0  # of a joint's typical torque
 UNSTATED = ("braking_slope",)  # what is believed of an unknown drive is not the servo table's default (`plant.case`)
 UNITS = {
     "torque_limit": "N.m",
@@ -120,14 +120,14 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
         )
     factor("torque_limit", LIMIT)
     factor("no_load_speed", LIMIT)
-    if not case.told:  # what the recorded torque has told is known
+    if not case.told:  # friction that the recorded torque has told is known
         room = min(min(room_for_friction(case, train).values()) - case.constants.friction, s.tau)
         stated = case.ranges.get("coulomb_friction", (0.0, 0.0))[1]
         room = min(room, WIDER * stated) if stated > 0 else room
         if room > 0:
             most("coulomb_friction", room)
         most("viscous_friction", max(3 * s.tau / s.speed, 2 * s.nominal["viscous_friction"]))
-        out.append(Param("offset", ("bias",), "set", -OFFSET * s.tau, OFFSET * s.tau, 0.0, UNITS["offset"]))
+    out.append(Param("offset", ("bias",), "set", -OFFSET * s.tau, OFFSET * s.tau, 0.0, UNITS["offset"]))
     most("delay", max(LATEST, 2 * s.nominal["delay"]))
     most("lag", max(SLOWEST, 2 * s.nominal["lag"]))
     least = max(LEAST_INERTIA * s.inertia, -case.constants.armature)  # what the model's rotor can give
