@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import shlex
 
+import mujoco
 import numpy as np
+import pytest
 
+from dexsim.actuator.table import ServoTable
 from dexsim.gap import command
 from dexsim.gap.audit import main
+from dexsim.gap.plant import information
+from dexsim.gap.plant.case import build
+from dexsim.gap.read import Run, agreement
 
 T = np.arange(0, 6, 0.001)
 
@@ -69,3 +75,114 @@ def test_what_a_log_cannot_tell_is_said(tmp_path, capsys):
     main([str(written(tmp_path / "ramp.csv", still, 0))])
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.startswith(("  a ", "  b "))}
     assert "hardly moves" in rows["a"] and "friction, play" in rows["b"] and "delay, lag" in rows["b"]
+
+
+RIG = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0" armature="2e-3"/>
+<geom size=".02" pos="0 0 -.1" mass=".1" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+BELIEF = {"kp": 2.0, "kd": 0.05, "torque_limit": 1.0, "no_load_speed": 8.0, "coulomb_friction": 0.01}
+
+
+def made_run(name="run", sent=None, lag=0.04, scale=1.0, seed=0, effort=0.0):
+    """A run of joint a that follows with a lag and a scale; effort: N.m for each rad of target minus position."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, 6, 0.01)
+    c = 0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t + seed) if sent is None else sent
+    q = scale * np.interp(t - lag, t, c) + 2e-4 * rng.standard_normal(len(t))
+    run = Run(name, ("a",), t, c[:, None], t, q[:, None], ServoTable.from_dict({"joints": {"*": BELIEF}}),
+              np.array([0, 0, -9.81]))  # fmt: skip
+    if effort:
+        run.torque = (effort * (c - q))[:, None]
+    return run
+
+
+def test_what_holds_of_a_machine_is_judged_over_all_of_its_recordings():
+    usual = [made_run(f"r{k}", seed=k, lag=0.04 + 0.004 * k, effort=2.0) for k in range(4)]
+    assert agreement.contradictions(usual, "a") == []
+    for odd, kind, words in (
+        (made_run("odd", seed=9, lag=0.16, effort=2.0), "clock_skew", "160 ms late here and 35 to 50 ms"),
+        (made_run("odd", seed=9, lag=-0.1, effort=2.0), "clock_skew", "-100 ms late here"),
+        (made_run("odd", seed=9, effort=-2.0), "sign_mismatch", "the other way in 4 other recordings"),
+        (made_run("odd", seed=9, effort=2000.0), "unit", "1e+03 x that in 4 other recordings"),
+        (made_run("odd", seed=9, scale=57.3), "unit", "57.3 x as far"),
+    ):
+        found = agreement.contradictions([*usual, odd], "a")
+        assert {f[0] for f in found} == {"odd"} and any(f[1] == kind and words in f[2] for f in found), found
+    pair = agreement.contradictions([made_run("x", lag=0.02), made_run("y", lag=0.2, seed=3)], "a")
+    assert {f[0] for f in pair} == {"x", "y"}  # which of two is wrong does not show
+
+
+def test_a_narrow_band_tells_no_lag():
+    """A sine repeats: its lag is known up to a period only."""
+    t = np.arange(0, 6, 0.01)
+    assert agreement.seen(made_run(sent=0.4 * np.sin(2 * np.pi * 4 * t)), 0).lag is None
+    assert agreement.seen(made_run(sent=0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t)), 0).lag == pytest.approx(0.0375, abs=0.003)
+
+
+def test_the_stages_of_a_drive_have_their_delays_and_their_order():
+    t = np.arange(0, 8, 0.005)
+    rng = np.random.default_rng(0)
+    c = np.repeat(rng.uniform(-0.5, 0.5, 40), 40)
+    late = lambda x, d: np.interp(t - d, t, x)  # noqa: E731
+    q, v = np.zeros(len(t)), np.zeros(len(t))
+    for k in range(1, len(t)):
+        v[k] = v[k - 1] + 0.005 * (late_target(c, t, k, 0.02) - q[k - 1] - 0.05 * v[k - 1]) * 150
+        q[k] = q[k - 1] + 0.005 * v[k]
+    duty = late(c, 0.02) - q
+    run = Run("r", ("a",), t, c[:, None], t, q[:, None], ServoTable.from_dict({"joints": {"*": BELIEF}}),
+              np.array([0, 0, -9.81]))  # fmt: skip
+    run.duty, run.torque = duty[:, None], late(duty, 0.01)[:, None]
+    delays = {(s.before, s.after): s.delay for s in agreement.stages([run], "a")}
+    assert list(delays) == [("target", "duty"), ("duty", "effort"), ("effort", "motion")]
+    assert delays["target", "duty"] == pytest.approx(0.02, abs=0.004)
+    assert delays["duty", "effort"] == pytest.approx(0.01, abs=0.004)
+    run.torque = late(duty, -0.012)[:, None]  # logged before what it follows
+    assert agreement.stages([run], "a")[1].delay == pytest.approx(-0.012, abs=0.004)
+    run.duty = run.torque = None
+    assert agreement.stages([run], "a") == []
+
+
+def late_target(c, t, k, delay):
+    return c[max(k - round(delay / (t[1] - t[0])), 0)]
+
+
+def told(sent, seed=0):
+    model = mujoco.MjModel.from_xml_string(RIG)
+    return {x.figure.words: x for x in information.informed(build(model, [made_run(sent=sent, seed=seed)])[0])}
+
+
+def test_a_motion_tells_only_what_it_excites():
+    """A slow sine says nothing of the limits; steps at full speed do; a joint at rest nothing of what moves."""
+    t = np.arange(0, 6, 0.01)
+    slow, fast = told(0.4 * np.sin(2 * t)), told(0.9 * np.sign(np.sin(3 * t)))
+    assert not slow["torque limit"].possible and not slow["no-load speed"].possible and slow["stiffness"].possible
+    assert fast["no-load speed"].possible and fast["torque limit"].steps < slow["torque limit"].steps
+    rest = told(0 * t)
+    assert not any(rest[w].possible for w in ("damping", "inertia", "viscous friction", "no-load speed", "play"))
+    assert slow["viscous friction"].beside is not None and slow["viscous friction"].beside.words == "damping"
+    how = dict(information.advice(list(slow.values())))
+    assert "limit" in how["torque limit"] and "drive off" in how["viscous friction"]
+
+
+def test_more_of_the_same_motion_tells_more():
+    t = np.arange(0, 6, 0.01)
+    sent = 0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t)
+    model = mujoco.MjModel.from_xml_string(RIG)
+    one, four = (information.informed(build(model, [made_run(f"r{k}", sent, seed=k) for k in range(n)])[0])
+                 for n in (1, 4))  # fmt: skip
+    for a, b in zip(one, four, strict=True):
+        if a.possible:
+            assert b.steps == pytest.approx(a.steps / 2, rel=0.3)
+
+
+def test_the_audit_prints_stages_figures_and_what_to_record(tmp_path, capsys):
+    run = made_run()
+    names = "time,command.a,position.a,effort.a"
+    rows = np.stack([run.t, run.cmd[:, 0], run.q[:, 0], 2.0 * (run.cmd[:, 0] - run.q[:, 0])], 1)
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header=names, comments="")
+    (tmp_path / "rig.xml").write_text(RIG)
+    (tmp_path / "rig.yaml").write_text(str({"joints": {"*": BELIEF}}))
+    main([str(tmp_path / "r.csv"), f"model={tmp_path / 'rig.xml'}", f"servo={tmp_path / 'rig.yaml'}"])
+    said = capsys.readouterr().out
+    assert "stages of the drives" in said and "target -> effort" in said
+    assert "figures of the believed drives that a fit could tell" in said and "of 9 " in said
+    assert "for the others record" in said and "torque limit of all joints: steps so large" in said

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,6 +130,28 @@ def test_episodes_of_a_data_set_are_recordings(tmp_path, name, make, version):
         read(made)
     with pytest.raises(UserError, match=r"'7' is none of its 3 episodes, 0 to 2"):
         read(made.with_name(made.name + "#7"))
+
+
+GOLDEN = Path(__file__).parent / "golden" / "lerobot"
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_what_the_lerobot_package_wrote(version):
+    """Data sets that lerobot 0.3.3 and 0.4.3 wrote (`golden/lerobot/write.py`), within the limits of a reader's
+    process."""
+    pytest.importorskip("pyarrow")
+    sys.path.insert(0, str(GOLDEN))
+    try:
+        import write
+    finally:
+        sys.path.pop(0)
+    paths = inputs.files([GOLDEN / version], "recordings")
+    assert len(paths) == 3
+    for k, path in enumerate(paths):
+        r, (c, q) = read(path), write.motion(k)
+        assert r.joints == ("shoulder_pan", "elbow_flex") and r.meta["robot"] == "so100_follower"
+        assert np.allclose(r.commands.value, c, atol=1e-6) and np.allclose(r.states.position.value, q, atol=1e-6)
+        assert np.allclose(r.states.position.t, np.arange(len(q)) / write.FPS, atol=1e-6)
 
 
 def test_aloha_has_an_episode_a_file_and_its_rate_is_stated(tmp_path):

@@ -169,6 +169,54 @@ def test_joints_that_move_alike_are_not_taken_for_one_another(tmp_path):
     assert not [f for f in r.findings if f.kind == "joint_order"]
 
 
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+POINT = "trajectory_msgs/JointTrajectoryPoint"
+
+
+def controller_state(typestore, t, names, fields):
+    """fields: name -> positions."""
+    none, zero = np.zeros(0), TYPES["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+    kind = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
+    each = {n: kind(positions=np.array(q, float), velocities=none, accelerations=none, effort=none, time_from_start=zero)
+            for n, q in fields.items()}  # fmt: skip
+    return typestore.types[CONTROLLER](header=header(START + t), joint_names=list(names), **each)
+
+
+@pytest.mark.parametrize("fields", [("reference", "feedback", "error", "output"), ("desired", "actual", "error")])
+@pytest.mark.parametrize("alone", [True, False])
+def test_the_state_of_a_trajectory_controller_is_read_by_itself(tmp_path, monkeypatch, fields, alone):
+    """`control_msgs/JointTrajectoryControllerState`, new and old: its reference is the command, as it was
+    interpolated."""
+    from rosbags.typesys import get_types_from_msg
+
+    own = get_typestore(Stores.ROS2_HUMBLE)
+    text = "\n".join(["std_msgs/Header header", "string[] joint_names", *(f"{POINT} {n}" for n in fields)])
+    own.register(get_types_from_msg(text, CONTROLLER))
+    monkeypatch.setattr("test_recordings_of_others.STORE", own)
+    messages = [] if alone else states(("a", "b"))
+    for t in np.arange(0, 6, 0.02):
+        goal, read_ = [follow(t, k, 0.0) for k in (1, 0)], [follow(t, k) for k in (1, 0)]
+        values = {n: (goal, read_, [0.0, 0.0], [])[k] for k, n in enumerate(fields)}
+        messages.append(("/arm_controller/controller_state", t, controller_state(own, t, "ba", values)))
+    r = read(bag(tmp_path / "bag", sorted(messages, key=lambda m: m[1])))
+    j = r.joints.index("b")
+    assert len(r.commands) == 300 and np.allclose(r.commands.value[:, j], follow(r.commands.t, 1, 0.0), atol=1e-6)
+    assert len(r.states.position) == (300 if alone else 600)
+    assert any("a controller's " + fields[0] in f.text or "controller's reference" in f.text for f in r.findings)
+
+
+def test_what_a_controller_is_sent_is_the_command_where_nothing_else_is(tmp_path):
+    points = [(a, [follow(a, k, 0.0) for k in (0, 1)], []) for a in np.arange(0, 5.9, 0.05)]
+    sent = ("/arm/joint_trajectory", 0.0, trajectory(START, ("a", "b"), points))
+    r = read(bag(tmp_path / "one", [sent, *states(("a", "b"))]))
+    assert len(r.commands) == len(points) and any("a trajectory; say otherwise" in f.text for f in r.findings)
+    more = [("/hand_controller/commands", t, m) for _, t, m in commands((0, 1))]
+    assert len(read(bag(tmp_path / "two", [*states(("a", "b")), *more])).commands) == len(more)
+    two = [sent, ("/leg/joint_trajectory", *sent[1:]), *states(("a", "b"))]
+    r = read(bag(tmp_path / "three", two))
+    assert not len(r.commands) and any("could be any of" in f.text for f in r.findings)
+
+
 RIG = """<mujoco><compiler angle="radian"/><worldbody>{}</worldbody></mujoco>"""
 LINK = """<body pos="0 {k} 0"><joint name="{n}" axis="0 1 0" armature="1e-3" range="-2 2"/>
 <geom type="sphere" size="0.02" pos="0 0 -0.1" mass="0.1" contype="0" conaffinity="0"/></body>"""

@@ -18,14 +18,16 @@ import mujoco
 import numpy as np
 
 from dexsim.console.tables import table as columns_of
-from dexsim.gap.plant.case import noise
-from dexsim.gap.read import Run, channels, inputs, same_commands
+from dexsim.gap.plant.case import build, noise
+from dexsim.gap.plant.information import advice, informed
+from dexsim.gap.read import Run, agreement, channels, inputs, same_commands
 from dexsim.recording.arguments import read_arguments
 from dexsim.recording.audit import KINDS, summary, table
 from dexsim.recording.audit_time import command_lead
 from dexsim.recording.mechanism import Mechanism, mechanism
 from dexsim.recording.reader import read
 from dexsim.recording.schema import STATES, Finding, Recording
+from dexsim.sim.quiet import quiet_warp
 
 HELP = """usage: dexsim audit FILE ... [model=FILE] [servo=FILE] [units.QUANTITY=UNIT ...] [remap.OURS=THEIRS ...]
                     [meta.KEY=VALUE ...]
@@ -115,6 +117,10 @@ def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], 
             joint = (f["where"]["joints"] or [""])[0]
             topic = (f["where"]["topics"] or [""])[0]
             out[name].append(Finding(kind, topic, when[0]["start"], len(when), text, severity, joint, when[-1]["end"]))
+    for joint in dict.fromkeys(j for r in runs for j in r.joints):
+        for name, kind, text in agreement.contradictions(runs, joint):
+            if not any(f.kind == kind and f.joint == joint for f in out[name]):
+                out[name].append(Finding(kind, STATES, 0.0, 1, text, "warning", joint))
     for group in repeats(runs):
         for joint in group.apart:
             if group.disagree(joint):
@@ -178,6 +184,51 @@ def carries(recordings: Sequence[Recording], runs: Sequence[Run]) -> str:
     return out
 
 
+def delays(runs: Sequence[Run]) -> str:
+    """The order and the delays of the stages of each drive, a row a joint; nothing where only targets and positions are
+    recorded."""
+    rows, order = [], []
+    for joint in dict.fromkeys(j for r in runs for j in r.joints):
+        chain = agreement.stages(runs, joint)
+        if not chain:
+            continue
+        steps = [f"{s.before} -> {s.after} " + ("?" if s.delay is None else f"{1e3 * s.delay:.0f}") for s in chain]
+        rows.append((joint, ", ".join(steps)))
+        order += [f"{joint}: {s.after} is logged {-1e3 * s.delay:.0f} ms before the {s.before} that it follows"
+                  for s in chain if s.delay is not None and s.delay < -0.004]  # fmt: skip
+    if not rows:
+        return ""
+    return "\n".join([columns_of("stages of the drives, ms (?: it does not tell)", ("joint", "delays"), rows), *order])
+
+
+def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
+    """How well a fit could tell each figure of the believed drives from recordings, a row a joint, and what to record
+    for those that it could not."""
+    joints = [j for j in known.joints if all(j in r.joints for r in runs)]
+    if not joints:
+        return "figures that could be told: not known, for the recordings have no joint in common"
+    mine = inputs.common_joints([copy.copy(r) for r in runs], [])
+    floors = {j: max((g.apart[j] for g in repeats(runs) if j in g.apart), default=0.0) for j in joints}
+    rows: list[tuple[str, ...]] = []
+    more: dict[tuple[str, str], list[str]] = {}
+    for case in build(known.spec.compile(), mine):
+        told = informed(case, floors[case.joint])
+        good = [x for x in told if x.possible]
+        rows.append((case.joint, f"{len(good)} of {len(told)}", ", ".join(f"{x.figure.words} {x.within()}" for x in good)
+                     or "-", ", ".join(x.figure.words + (f" (only with {x.beside.words})" if x.beside else "")
+                                       for x in told if not x.possible) or "-"))  # fmt: skip
+        for x in advice(told):
+            more.setdefault(x, []).append(case.joint)
+    text = columns_of(
+        "figures of the believed drives that a fit could tell", ("joint", "told", "to about", "not told"), rows
+    )
+    if more:
+        text += "\n\nfor the others record, with `dexsim excite kinds=...` or by hand:"
+    for (words, how), of in more.items():
+        text += f"\n  {words} of {', '.join(of) if len(of) < len(joints) else 'all joints'}: {how}"
+    return text
+
+
 def _only(r: Recording, joint: str) -> Recording:
     return next(p for p in r.parts() if joint in p.joints)._of([_place(r, joint)])
 
@@ -220,6 +271,7 @@ def main(argv: Sequence[str]) -> int:
     own = {k: v for k, _, v in (a.partition("=") for a in argv) if k in ("model", "servo")}
     rest = [a for a in argv if a.partition("=")[0] not in own]
     given, remap, meta = read_arguments(rest)
+    quiet_warp("cpu")
     known = mechanism(own.get("model"), own.get("servo") or {}) if own.get("model") else None
     recordings, worst = [], 0
     for path in inputs.files(given, "audit"):
@@ -240,6 +292,9 @@ def main(argv: Sequence[str]) -> int:
         worst = max(worst, int(any(f.severity == "error" for f in found)))
     if runs:
         print(carries([r for _, r in recordings], runs) + "\n")
+        for text in (delays(runs), beliefs(runs, known) if known is not None else ""):
+            if text:
+                print(text + "\n")
         options = [a for a in rest if a not in given]
         print(f"next: {next_command(given, own, options)}")
         if not own.get("model"):

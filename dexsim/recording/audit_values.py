@@ -534,8 +534,9 @@ def units(r: Recording) -> Iterator[Finding]:
                 text = f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts, or registers? State"
                 yield finding(series, f"{text} units.position=ticks:4096, or registers=LOW..HIGH [rad]", joint)
             elif not limits and 4 * np.pi < top < 400 and _jumpless(x):
-                text = f"{name} of {joint} reaches {top:.4g} rad: degrees? percent? State units.position=deg or percent"
-                yield finding(series, text, joint, "warning")
+                ways = "deg" if top > 101 else "deg or percent" if np.nanmin(x) > -0.5 else "deg or signed_percent"
+                text = f"{name} of {joint} reaches {top:.4g} rad: degrees? percent? State units.position={ways}"
+                yield finding(series, f"{text}; of one joint, units.position.{joint}=", joint, "warning")
     for j, joint in enumerate(r.joints):  # one against the other
         if len(c) > 20 and len(s.position) > 20:
             drive, q = _drive(r, j, s.position.t), s.position.value[:, j]
@@ -642,6 +643,10 @@ def _effort_units(r: Recording, finding: Callable[..., Finding]) -> Iterator[Fin
             yield finding(e, f"effort of {joint} reaches {top:.4g} A: milliamperes?", joint)
         elif r.effort_is == "torque_Nm" and (top > 20 * limit.get(joint, np.inf) or (is_integer(x) and top > 50)):
             yield finding(e, f"effort of {joint} reaches {top:.4g} N.m: a current in mA, or counts?", joint)
+        elif r.effort_is == "torque_Nm" and top > 50 and any("effort_is is not stated" in f.text for f in r.findings):
+            text = f"effort of {joint} reaches {top:.4g} N.m, if it is a torque: a current in mA? State"
+            yield finding(e, f"{text} meta.effort_is=current_A units.effort=mA, or meta.effort_is=torque_Nm", joint,
+                          "warning")  # fmt: skip
 
 
 def _smooth(x: np.ndarray, width: int = 5) -> np.ndarray:

@@ -28,7 +28,7 @@ from dexsim.recording.units import UNITS
 
 SUFFIXES = (".csv", ".tsv", ".npz")
 QUANTITIES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "timestamp", "stamp", "t", "host_time"),
+    "time": ("time", "timestamp", "timestamps", "stamp", "t", "host_time", "zeit", "temps", "tiempo"),
     "command": (
         "command",
         "cmd",
@@ -378,6 +378,9 @@ def _unit(column: str) -> tuple[str, str]:
         return match.group(1), match.group(2).lower()
     if match and match.group(2) in ("A", "N", "V", "s", "C", "m") and _known(match.group(1)):
         return match.group(1), match.group(2).lower()
+    match = re.search(r"^(.*[A-Za-z])[_\s]?[_\s(\[]([A-Za-z.]+(?:/s|_s)?)[)\]]?([./:].+)$", column)  # current_mA.elbow
+    if match and match.group(2).lower() in known - {"1", "c", "t"} and _known(match.group(1)):
+        return match.group(1) + match.group(3), match.group(2).lower()
     return column, ""
 
 

@@ -149,9 +149,13 @@ def first(m: Any, *names: str) -> Any:
 
 
 def walk(m: Any, path: str) -> Any:
-    """Follow a dotted path of field names and list indices."""
+    """Follow a dotted path of field names and list indices; of names with | between them, the first that is filled."""
     for step in filter(None, path.split(".")):
-        m = m[int(step)] if step.removeprefix("-").isdecimal() else get(m, step)
+        if "|" in step:
+            there = [x for x in (get(m, n) for n in step.split("|")) if x is not None]
+            m = next((x for x in there if len(floats(get(x, "positions")))), there[0] if there else None)
+        else:
+            m = m[int(step)] if step.removeprefix("-").isdecimal() else get(m, step)
         if m is None:
             raise ValueError(f"no field '{step}' of '{path}'")
     return m

@@ -30,6 +30,11 @@ LINE = 0.1
 """s: points of a trajectory that lie further apart get targets between them (cubic where speeds are given)."""
 MAX_START = 1 << 62
 """ns: a start up to which a stamp less it fits 64 bits."""
+CONTROLLER = "JointTrajectoryControllerState"
+PARTS = {schema.COMMANDS: "reference|desired", schema.STATES: "feedback|actual"}
+"""What a controller's state (`control_msgs/JointTrajectoryControllerState`, new and old) says of each topic."""
+SENT = {"a trajectory": "trajectory_msgs/msg/JointTrajectory", "values": "std_msgs/msg/Float64MultiArray"}
+"""Types of topics that are the commands where no other can be, by what they hold."""
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
@@ -240,6 +245,7 @@ class _Reading:
                         "warning",
                     )
                 )
+        self._of_controllers(out)
         if schema.STATES not in out and schema.COMMANDS not in out:
             raise UserError(
                 f"recording {self.path} has neither {schema.STATES} nor {schema.COMMANDS} (say which they are with"
@@ -248,6 +254,33 @@ class _Reading:
         if schema.STATES not in out:  # without commands: the audit says so, of CSV and NPZ files too
             self.findings.append(Finding("missing_topic", schema.STATES, NAN, 0, "not in the recording", "warning"))
         return out
+
+    def _of_controllers(self, out: dict[str, tuple[str, str]]) -> None:
+        """Adds what ros2_control's controllers say of themselves or are sent, where commands or states are not found
+        yet; a part of a controller's state for those that are."""
+        told = [t for t in self.streams if (s := self.streams[t][0].schema) and s.name.endswith(CONTROLLER)]
+        for ours, part in PARTS.items():
+            if ours in out:
+                theirs, own = out[ours]
+                out[ours] = (theirs, own or part) if theirs in told else (theirs, own)
+                continue
+            if any(f.topic == ours and f.kind == "topic" for f in self.findings):
+                continue  # several are of its name
+            fits, what = [(t, part) for t in told], f"a controller's {part.split('|')[0]}"
+            for kind in SENT if ours == schema.COMMANDS and not fits else ():
+                taken = {theirs for theirs, _ in out.values()}
+                of_kind = [t for t in self.streams if t not in taken and self._is_a(t, SENT[kind], strict=True)]
+                fits = [(t, "") for t in of_kind if kind == "a trajectory" or t.endswith("/commands")]
+                if fits:
+                    what = kind
+                    break
+            if len(fits) == 1:
+                out[ours] = fits[0]
+                text = f"read from {fits[0][0]} ({what}; say otherwise with remap.{ours}=TOPIC)"
+                self.findings.append(Finding("topic", ours, NAN, 1, text, "info"))
+            elif fits:
+                text = f"could be any of {', '.join(t for t, _ in fits)}; none is used (say which: remap.{ours}=TOPIC)"
+                self.findings.append(Finding("topic", ours, NAN, len(fits), text, "warning"))
 
     def _is_a(self, topic: str, kind: str, strict: bool = False) -> bool:
         s = self.streams[topic][0]

@@ -235,8 +235,6 @@ class LeRobot:
         return int(files.mapping(path / "meta" / "info.json", "data set")["total_episodes"])
 
     def read(self, path: Path, episode: int) -> Episode:
-        from pyarrow import parquet
-
         info = files.mapping(path / "meta" / "info.json", "data set")
         place = {"episode_index": episode, "episode_chunk": episode // int(info.get("chunks_size") or 1000)}
         if str(info.get("codebase_version", "")).startswith("v3"):
@@ -246,9 +244,7 @@ class LeRobot:
             raise UserError(f"data set {path}: data_path leads out of it")
         features = info["features"]
         keys = [k for k in ("observation.state", "action") if k in features]
-        schema = parquet.read_schema(source)
-        more = [k for k in ("timestamp", "frame_index", "episode_index") if k in schema.names]
-        table = parquet.read_table(source, columns=[*keys, *more], filters=[("episode_index", "=", episode)])
+        table = _table(source, [*keys, "timestamp", "frame_index"], episode)
         arrays = {k: np.stack([np.asarray(v, float) for v in table[k].to_pylist()]) for k in keys}
         out = Episode({})
         for key, kind in (("observation.state", "position"), ("action", "command")):
@@ -270,14 +266,20 @@ class LeRobot:
 
     def _place(self, path: Path, episode: int) -> dict[str, Any]:
         """Where v3 keeps an episode: its chunk and file."""
-        from pyarrow import parquet
-
         for part in sorted((path / "meta" / "episodes").rglob("*.parquet")):
-            keys = ["episode_index", "data/chunk_index", "data/file_index"]
-            for row in parquet.read_table(part, columns=keys).to_pylist():
-                if row["episode_index"] == episode:
-                    return {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
+            for row in _table(part, ["data/chunk_index", "data/file_index"], episode).to_pylist():
+                return {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
         raise UserError(f"data set {path}: meta/episodes names no episode {episode}")
+
+
+def _table(path: Path, columns: Sequence[str], episode: int) -> Any:
+    """The rows of an episode in a parquet file. Not by pyarrow's data sets, whose library alone takes what memory a
+    reader has."""
+    from pyarrow import compute, parquet
+
+    file = parquet.ParquetFile(path, memory_map=False, pre_buffer=False)
+    table = file.read(columns=[*columns, "episode_index"], use_threads=False)
+    return table.filter(compute.equal(table["episode_index"], episode))
 
 
 def _filled(pattern: str, place: Mapping[str, Any]) -> str:
