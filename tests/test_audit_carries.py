@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
 from dexsim.gap import command
 from dexsim.gap.audit import main
 from dexsim.gap.plant import information
 from dexsim.gap.plant.case import build
-from dexsim.gap.read import Run, agreement
+from dexsim.gap.read import Run, agreement, inputs
+from dexsim.recording.mechanism import mechanism
 
 T = np.arange(0, 6, 0.001)
 
@@ -102,7 +104,7 @@ def test_what_holds_of_a_machine_is_judged_over_all_of_its_recordings():
         (made_run("odd", seed=9, lag=0.16, effort=2.0), "clock_skew", "160 ms late here and 35 to 50 ms"),
         (made_run("odd", seed=9, lag=-0.1, effort=2.0), "clock_skew", "-100 ms late here"),
         (made_run("odd", seed=9, effort=-2.0), "sign_mismatch", "the other way in 4 other recordings"),
-        (made_run("odd", seed=9, effort=2000.0), "unit", "1e+03 x that in 4 other recordings"),
+        (made_run("odd", seed=9, effort=2000.0), "unit", "1e+03 times as large or small as in 4 other recordings"),
         (made_run("odd", seed=9, scale=57.3), "unit", "57.3 x as far"),
     ):
         found = agreement.contradictions([*usual, odd], "a")
@@ -115,7 +117,8 @@ def test_a_narrow_band_tells_no_lag():
     """A sine repeats: its lag is known up to a period only."""
     t = np.arange(0, 6, 0.01)
     assert agreement.seen(made_run(sent=0.4 * np.sin(2 * np.pi * 4 * t)), 0).lag is None
-    assert agreement.seen(made_run(sent=0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t)), 0).lag == pytest.approx(0.0375, abs=0.003)
+    wide = agreement.seen(made_run(sent=0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t)), 0)
+    assert wide.lag == pytest.approx(0.0375, abs=0.003)
 
 
 def test_the_stages_of_a_drive_have_their_delays_and_their_order():
@@ -186,3 +189,30 @@ def test_the_audit_prints_stages_figures_and_what_to_record(tmp_path, capsys):
     assert "stages of the drives" in said and "target -> effort" in said
     assert "figures of the believed drives that a fit could tell" in said and "of 9 " in said
     assert "for the others record" in said and "torque limit of all joints: steps so large" in said
+
+
+def test_from_a_bare_log_to_a_diagnosis(tmp_path, monkeypatch, capsys):
+    """Where neither a model nor a servo is there, the audit writes both to begin with, and its last line is a diagnosis
+    that has all that it needs."""
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "bare.csv", motion(0), 0)
+    assert main(["bare.csv"]) == 0
+    assert "model=MODEL.xml servo=SERVO.yaml" in capsys.readouterr().out
+    assert main(["bare.csv", "out=mine"]) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("next: ")]
+    words = shlex.split(line.removeprefix("next: dexsim diagnose "))
+    settings = command.settings_of(command.parse(words), tmp_path / "out", "cpu")
+    m = mechanism(settings.model, settings.servo)
+    assert m.joints == ("a", "b") and len(inputs.files(settings.recordings, "recordings")) == 1
+    with pytest.raises(UserError, match=r"model.xml exists"):
+        main(["bare.csv", "out=mine"])
+    assert main(["bare.csv", "model=mine/model.xml", "servo=mine/servo.yaml"]) == 0  # which the audit reads, too
+    assert "figures of the believed drives" in capsys.readouterr().out
+
+
+def test_the_xhands_recording_needs_no_model(tmp_path, capsys):
+    path = tmp_path / "xhand.csv"
+    path.write_text(written(path, motion(0), 0).read_text().replace(".a", ".index_joint1").replace(".b", ".mid_joint1"))
+    main([str(path)])
+    said = capsys.readouterr().out
+    assert f"next: dexsim diagnose recordings={path} out=out/diagnosis" in said

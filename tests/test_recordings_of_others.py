@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import recordings
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dexsim.gap.plant.case import noise_of, refined_cases
 from dexsim.gap.read import inputs
@@ -55,7 +55,7 @@ def trajectory(t, names, points, begin=None):
 START = 1_700_000_000
 
 
-def bag(folder, messages, storage=StoragePlugin.MCAP, packed=None):
+def bag(folder, messages, storage=StoragePlugin.MCAP, packed=None, store=STORE):
     """A bag as `rosbags` writes it. messages: (topic, s since the start, message)."""
     writer = Writer(folder, version=9, storage_plugin=storage)
     if packed is not None:
@@ -65,8 +65,8 @@ def bag(folder, messages, storage=StoragePlugin.MCAP, packed=None):
         for topic, t, m in messages:
             kind = m.__msgtype__
             if topic not in channels:
-                channels[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(channels[topic], START * 10**9 + int(round(t * 1e9)), STORE.serialize_cdr(m, kind))
+                channels[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(channels[topic], START * 10**9 + int(round(t * 1e9)), store.serialize_cdr(m, kind))
     return folder
 
 
@@ -173,32 +173,35 @@ CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
 POINT = "trajectory_msgs/JointTrajectoryPoint"
 
 
+def controllers(fields):
+    """The types of messages, with a controller's state of these fields."""
+    own = get_typestore(Stores.ROS2_HUMBLE)
+    text = "\n".join(["std_msgs/Header header", "string[] joint_names", *(f"{POINT} {n}" for n in fields)])
+    own.register(get_types_from_msg(text, CONTROLLER))
+    return own
+
+
 def controller_state(typestore, t, names, fields):
     """fields: name -> positions."""
     none, zero = np.zeros(0), TYPES["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
     kind = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
-    each = {n: kind(positions=np.array(q, float), velocities=none, accelerations=none, effort=none, time_from_start=zero)
-            for n, q in fields.items()}  # fmt: skip
+    rest = {"velocities": none, "accelerations": none, "effort": none, "time_from_start": zero}
+    each = {n: kind(positions=np.array(q, float), **rest) for n, q in fields.items()}
     return typestore.types[CONTROLLER](header=header(START + t), joint_names=list(names), **each)
 
 
 @pytest.mark.parametrize("fields", [("reference", "feedback", "error", "output"), ("desired", "actual", "error")])
 @pytest.mark.parametrize("alone", [True, False])
-def test_the_state_of_a_trajectory_controller_is_read_by_itself(tmp_path, monkeypatch, fields, alone):
+def test_the_state_of_a_trajectory_controller_is_read_by_itself(tmp_path, fields, alone):
     """`control_msgs/JointTrajectoryControllerState`, new and old: its reference is the command, as it was
     interpolated."""
-    from rosbags.typesys import get_types_from_msg
-
-    own = get_typestore(Stores.ROS2_HUMBLE)
-    text = "\n".join(["std_msgs/Header header", "string[] joint_names", *(f"{POINT} {n}" for n in fields)])
-    own.register(get_types_from_msg(text, CONTROLLER))
-    monkeypatch.setattr("test_recordings_of_others.STORE", own)
+    own = controllers(fields)
     messages = [] if alone else states(("a", "b"))
     for t in np.arange(0, 6, 0.02):
         goal, read_ = [follow(t, k, 0.0) for k in (1, 0)], [follow(t, k) for k in (1, 0)]
         values = {n: (goal, read_, [0.0, 0.0], [])[k] for k, n in enumerate(fields)}
         messages.append(("/arm_controller/controller_state", t, controller_state(own, t, "ba", values)))
-    r = read(bag(tmp_path / "bag", sorted(messages, key=lambda m: m[1])))
+    r = read(bag(tmp_path / "bag", sorted(messages, key=lambda m: m[1]), store=own))
     j = r.joints.index("b")
     assert len(r.commands) == 300 and np.allclose(r.commands.value[:, j], follow(r.commands.t, 1, 0.0), atol=1e-6)
     assert len(r.states.position) == (300 if alone else 600)

@@ -18,9 +18,11 @@ import mujoco
 import numpy as np
 
 from dexsim.console.tables import table as columns_of
+from dexsim.errors import UserError
 from dexsim.gap.plant.case import build, noise
 from dexsim.gap.plant.information import advice, informed
 from dexsim.gap.read import Run, agreement, channels, inputs, same_commands
+from dexsim.hand import load_hand
 from dexsim.recording.arguments import read_arguments
 from dexsim.recording.audit import KINDS, summary, table
 from dexsim.recording.audit_time import command_lead
@@ -29,12 +31,13 @@ from dexsim.recording.reader import read
 from dexsim.recording.schema import STATES, Finding, Recording
 from dexsim.sim.quiet import quiet_warp
 
-HELP = """usage: dexsim audit FILE ... [model=FILE] [servo=FILE] [units.QUANTITY=UNIT ...] [remap.OURS=THEIRS ...]
-                    [meta.KEY=VALUE ...]
+HELP = """usage: dexsim audit FILE ... [model=FILE] [servo=FILE] [out=FOLDER] [units.QUANTITY=UNIT ...]
+                    [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]
 
 Say what is in recordings (MCAP, a ROS 2 bag's folder, CSV or NPZ with named columns, episodes of a LeRobot, Zarr or
 HDF5 data set), what is wrong with them, and what a diagnosis could tell from them. FILE may be a pattern. model=,
-servo=: of the mechanism, for its joints and their ranges.
+servo=: of the mechanism, for its joints, their ranges, and which figures of its drives a fit could tell. out=: a folder
+for a model.xml and a servo.yaml to begin with, where these are not given.
 
 examples:
   dexsim audit a.mcap remap./joint_states=/xhand/state
@@ -214,9 +217,9 @@ def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
     for case in build(known.spec.compile(), mine):
         told = informed(case, floors[case.joint])
         good = [x for x in told if x.possible]
-        rows.append((case.joint, f"{len(good)} of {len(told)}", ", ".join(f"{x.figure.words} {x.within()}" for x in good)
-                     or "-", ", ".join(x.figure.words + (f" (only with {x.beside.words})" if x.beside else "")
-                                       for x in told if not x.possible) or "-"))  # fmt: skip
+        well = ", ".join(f"{x.figure.words} {x.within()}" for x in good)
+        rest = (x.figure.words + (f" (only with {x.beside.words})" if x.beside else "") for x in told if not x.possible)
+        rows.append((case.joint, f"{len(good)} of {len(told)}", well or "-", ", ".join(rest) or "-"))
         for x in advice(told):
             more.setdefault(x, []).append(case.joint)
     text = columns_of(
@@ -255,10 +258,41 @@ def _quoted(text: str) -> str:
     return text
 
 
+START = """# Guesses to begin with: put in what the drives' maker says (dexsim diagnose columns=true lists the columns)
+joints:
+  "*": {kp: [0.2, 20], kd: [0.002, 1], torque_limit: [0.2, 5], no_load_speed: [2, 30]}
+"""
+"""A servo.yaml of a drive of which nothing is known."""
+
+
+def begin(out: Path, joints: Sequence[str], own: dict[str, str]) -> None:
+    """Write model.xml and servo.yaml to begin with into a new folder, those that `own` does not name, and name them
+    there. Raises UserError where the folder is not free."""
+    new = {"model": "model.xml", "servo": "servo.yaml"}
+    new = {k: out / name for k, name in new.items() if not own.get(k)}
+    for path in new.values():
+        if path.exists():
+            raise UserError(f"out={out}: {path} exists; name another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    for key, path in new.items():
+        if key == "servo":
+            path.write_text(START, encoding="utf-8")
+        else:
+            note = "<!-- A pendulum a joint, to begin with: put in your axes, lengths, masses and inertias -->\n"
+            bodies = "".join(
+                f'    <body pos="0 {0.2 * k:g} 0"><joint name="{_quoted(j)}" axis="0 1 0" armature="1e-4"/>\n      '
+                '<geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.1" mass="0.05" contype="0" conaffinity="0"/>'
+                "</body>\n" for k, j in enumerate(joints)
+            )  # fmt: skip
+            text = f'<mujoco>\n  {note}  <compiler angle="radian"/>\n  <worldbody>\n{bodies}  </worldbody>\n</mujoco>\n'
+            path.write_text(text, encoding="utf-8")
+        own[key] = str(path)
+
+
 def next_command(paths: Sequence[str], own: dict[str, str], rest: Sequence[str]) -> str:
     """The `dexsim diagnose` to run next, as it is typed."""
     recordings = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
-    of = [f"model={own.get('model', 'MODEL.xml')}", f"servo={own.get('servo', 'SERVO.yaml')}"]
+    of = [f"{k}={own[k]}" for k in ("model", "servo") if own.get(k)]
     words = [f"recordings={recordings}", *of, *rest, "out=out/diagnosis"]
     return "dexsim diagnose " + " ".join(shlex.quote(w) for w in words)
 
@@ -268,11 +302,11 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP + "\n".join(f"  {kind:<20}{text}" for kind, text in (KINDS | MORE).items()))
         return 0 if argv else 2
-    own = {k: v for k, _, v in (a.partition("=") for a in argv) if k in ("model", "servo")}
+    own = {k: v for k, _, v in (a.partition("=") for a in argv) if k in ("model", "servo", "out")}
     rest = [a for a in argv if a.partition("=")[0] not in own]
     given, remap, meta = read_arguments(rest)
     quiet_warp("cpu")
-    known = mechanism(own.get("model"), own.get("servo") or {}) if own.get("model") else None
+    known = mechanism(own["model"], own.get("servo") or {}) if own.get("model") else None
     recordings, worst = [], 0
     for path in inputs.files(given, "audit"):
         of = (None, None) if known is None else (known.joints, known.ranges)
@@ -292,13 +326,19 @@ def main(argv: Sequence[str]) -> int:
         worst = max(worst, int(any(f.severity == "error" for f in found)))
     if runs:
         print(carries([r for _, r in recordings], runs) + "\n")
-        for text in (delays(runs), beliefs(runs, known) if known is not None else ""):
+        for text in (delays(runs), beliefs(runs, known) if known is not None and own.get("servo") else ""):
             if text:
                 print(text + "\n")
         options = [a for a in rest if a not in given]
-        print(f"next: {next_command(given, own, options)}")
-        if not own.get("model"):
-            print("  (model= and servo=: the mechanism and what is believed of its drives; the xHand's where left out)")
+        xhand = own.get("model") is None and set(joints) <= set(load_hand().joints)
+        if own.get("out") and not xhand:
+            begin(Path(own["out"]).expanduser(), joints, own)
+            print(f"{own['out']}: model.xml, servo.yaml to begin with, of guesses: put in what you know\n")
+        missing = [] if xhand else [k for k in ("model", "servo") if not own.get(k)]
+        asked = own | {k: {"model": "MODEL.xml", "servo": "SERVO.yaml"}[k] for k in missing}
+        print(f"next: {next_command(given, asked, options)}")
+        if missing:
+            print(f"  ({' and '.join(missing)} of the machine; out=FOLDER writes what is missing, to begin with)")
     return worst
 
 

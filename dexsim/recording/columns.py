@@ -69,7 +69,7 @@ _CLOCKS = ("elapsed", "epoch", "timestamp", "time", "stamp", "datetime", "date")
 _NAMED = ("joint", "joint_name", "name", "motor", "motor_name", "servo", "joint_id", "motor_id", "servo_id")
 """Columns that say which joint a line is of."""
 _NOT_POSITIONS = {w for q in ("velocity", "effort", "duty") for w in QUANTITIES[q]} | {"force", "acceleration"}
-_OWN = ("ticks", "counts", "raw", "register", "registers", "value")
+_OWN = ("ticks", "counts", "raw", "register", "registers", "value", "abs", "filtered")
 """Ends of a column's name that say no more than that its numbers are the drive's own."""
 _CLOCK_STEP = 0.5  # s between samples from which on a time without a unit is not believed to be in seconds
 
@@ -155,8 +155,9 @@ def of_columns(
     si: set[tuple[str, str]] = set()
     of = schema.joint_names(meta.get("joint_names", ""))
     listed = {j for q, j, _, _ in roles.values() if q not in ("time", "supply_voltage") and j}
-    if of and listed and all(x.isdecimal() and int(x) < len(of) for x in listed):  # columns by number
-        roles = {c: (q, of[int(j)] if j and q != "time" else j, u, w) for c, (q, j, u, w) in roles.items()}
+    place = lambda x: x.removeprefix("joint").removeprefix("_")  # noqa: E731
+    if of and not listed & set(of) and all(place(x).isdecimal() and int(place(x)) < len(of) for x in listed):
+        roles = {c: (q, of[int(place(j))] if j and q != "time" else j, u, w) for c, (q, j, u, w) in roles.items()}
     for column, (quantity, joint, unit, word) in roles.items():
         if joint in found.get(quantity, {}):
             other = next(c for c, r in roles.items() if r[:2] == (quantity, joint))
@@ -334,6 +335,13 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
     name = re.sub(r"^/?joint_states/", "", name)
     if name.lstrip("/").startswith("joint_commands/"):  # topics as plotting tools write them out
         name = re.sub(r"^/?joint_commands/(.+)/position$", r"command.\1", name)
+    name = re.sub(r"^observation[./]state[./]", "", name)  # LeRobot's names
+    name = re.sub(r"^action[./](.+?)([./]pos)?$", r"command.\1", name)
+    if (of := re.fullmatch(r"t[_.](\w+)|(\w+)[_.]t", name, re.I)) is not None:  # t_cmd, pos_t
+        plain = (of[1] or of[2]).lower()
+        whose = next((q for q, words in QUANTITIES.items() if q != "time" and plain in words), None)
+        if whose or plain == "state":
+            return "time", whose or "position", unit, "t"
     for word, quantity in _WORDS:
         inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
         if re.fullmatch(rf"[_\W]*{inner}[_\W]*", name, re.I):
@@ -351,7 +359,9 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
         if quantity == "time":
             of = next((q for q, words in QUANTITIES.items() if joint.lower() in words), None)
             return ("time", of, unit, word) if of else None
-        if quantity == "command" and joint.lower() in _NOT_POSITIONS:  # a target of another kind
+        if (quantity == "command" and joint.lower() in _NOT_POSITIONS) or (  # a target of another kind
+            quantity in ("velocity", "effort", "duty") and joint.lower() in QUANTITIES["command"]
+        ):
             return None
         return quantity, joint, unit, word
     return None
@@ -378,7 +388,8 @@ def _unit(column: str) -> tuple[str, str]:
         return match.group(1), match.group(2).lower()
     if match and match.group(2) in ("A", "N", "V", "s", "C", "m") and _known(match.group(1)):
         return match.group(1), match.group(2).lower()
-    match = re.search(r"^(.*[A-Za-z])[_\s]?[_\s(\[]([A-Za-z.]+(?:/s|_s)?)[)\]]?([./:].+)$", column)  # current_mA.elbow
+    # current_mA.elbow
+    match = re.search(r"^(.*[A-Za-z])[_\s]?[_\s(\[]([A-Za-z.]+(?:/s|_s)?)[)\]]?([./:\[(].+)$", column)
     if match and match.group(2).lower() in known - {"1", "c", "t"} and _known(match.group(1)):
         return match.group(1) + match.group(3), match.group(2).lower()
     return column, ""

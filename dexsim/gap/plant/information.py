@@ -19,6 +19,8 @@ from dexsim.gap.plant.columns import INDEX
 HOLDS = 0.1
 WINDOW = 1.0
 """s over which a simulation runs freely from the recorded state."""
+STILL = 8.0
+"""x its noise that a joint must move in a window."""
 DOUBT = 10.0
 """Steps by which a figure is uncertain before: more is not looked at."""
 ALIKE = 0.95
@@ -97,6 +99,12 @@ def informed(case: Case, floor: float = 0.0) -> list[Told]:
     q = plant.simulate(np.array(guesses), windows)[0]
     ok = np.isfinite(q).all(0)
     J = (q[1:, ok] - q[:1, ok]).T
+    # where a joint stands it shows its stiffness against gravity; the rest of what is simulated there is how it came
+    # to stand
+    shown, of = plant.q[windows.sample_row[ok]], windows.sample_window[ok]
+    way = np.array([np.ptp(shown[of == w]) if (of == w).any() else 0.0 for w in range(len(windows.window))])
+    J[np.ix_(way[of] < STILL * case.sigma, [f.column != "kp" for f in used])] = 0.0
+    J -= J.mean(0)  # an encoder's zero is fitted too
     rate = 1 / max(float(np.median(np.diff(plant.t))), 1e-6) if len(plant.t) > 1 else 1.0
     noise = max(case.sigma, floor) * np.sqrt(max(HOLDS * rate, 1.0))
     information = J.T @ J / noise**2

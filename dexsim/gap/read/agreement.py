@@ -19,8 +19,8 @@ CLEAR, ALONE = 0.8, 0.1
 """Correlation of speeds that tells a lag, and by how much it is above that of any other lag: less in a narrow band."""
 DIFFERS = {"lag": 0.03, "scale": np.log(1.5), "effort scale": np.log(4.0)}
 """s, or log of a factor, by which one recording must differ from the others to contradict them."""
-MADE = 3.0
-"""x the others' own spread that this must be, too."""
+MADE, USUAL = 3.0, 0.6
+"""x the others' own spread, and of a lag x their median, that this must be, too: a drive at its limits lags more."""
 FINE, LATEST = 0.002, 0.1
 """s: grid and reach of the delay of a stage."""
 EXPLAINED, SHARP = 0.7, 0.1
@@ -98,6 +98,8 @@ def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]
             middle = float(np.median(others))
             spread = float(np.abs(others - middle).max())
             least = 1.0 if what == "effort sign" else max(DIFFERS[what], MADE * spread)
+            if what == "lag":
+                least = max(least, USUAL * abs(middle))
             if (what == "effort sign" and spread) or abs(values[k] - middle) <= least:
                 continue
             theirs = [y for n, y in told if n != name]
@@ -111,8 +113,8 @@ def _said(joint: str, what: str, mine: float, theirs: Sequence[float], factor: f
     if what == "lag":
         span = " to ".join(dict.fromkeys(f"{1e3 * x:.0f}" for x in (min(theirs), max(theirs))))
         return "clock_skew", (
-            f"{joint} follows its target {1e3 * mine:.0f} ms late here and {span} ms late {rest}: the clocks of commands "
-            "and states may be shifted, or the drive is set otherwise"
+            f"{joint} follows its target {1e3 * mine:.0f} ms late here and {span} ms late {rest}: the clocks of "
+            "commands and states may be shifted, or the drive is set otherwise"
         )
     if what == "scale":
         return "unit", (
@@ -125,7 +127,8 @@ def _said(joint: str, what: str, mine: float, theirs: Sequence[float], factor: f
             f"effort of {joint} acts {drives} target minus position here, and the other way {rest}: effort_sign of one "
             "of them is wrong (meta.effort_sign=...)"
         )
-    return "unit", f"effort of {joint} is {factor:.3g} x that {rest}, or a {factor:.3g}th: another unit, or another gain"
+    text = f"effort of {joint} is {factor:.3g} times as large or small as {rest}: another unit, or another gain"
+    return "unit", text
 
 
 @dataclass(frozen=True)
