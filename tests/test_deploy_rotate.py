@@ -213,7 +213,7 @@ def test_the_whole_loop_on_the_simulated_hand(made, tmp_path):
     loop.bundle.act = lambda observation: np.zeros((1, 12), np.float32)  # hold still
     report = loop.run()
     assert report.ended == "done" and report.acts == 47 and np.isfinite(np.stack(report.observations)).all()
-    assert len(said) == 1 and "close on it in 0.5 s" in said[0]
+    assert said[0].startswith("hand     ") and len(said) == 2 and "close on it in 0.5 s" in said[1]
     assert np.stack(report.forces)[10:].sum(1).min() > 0.02, "fingertips hold the cube"
     place = hand.hand.env.object_pose[0, :3].numpy()
     assert np.linalg.norm(place - np.array(b.manifest["grip"]["object_pose"][:3])) < 0.02, "it has not fallen"

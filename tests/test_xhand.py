@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 
@@ -21,9 +22,11 @@ from dexsim.deploy import bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, VirtualClock
 from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
 from dexsim.deploy.loop import Loop, LoopSettings
+from dexsim.deploy.recorder import Recorder
 from dexsim.deploy.vendor import VendorXHand, VendorXHands, XHandBus
 from dexsim.deploy.vision import FixedPlace
 from dexsim.errors import UserError
+from dexsim.recording.reader import read
 
 torch.set_num_threads(1)
 
@@ -228,6 +231,21 @@ def test_versions_and_names_are_logged_and_the_auxiliary_port_is_passed_over():
         opened(port="/dev/ttyACM0")
     with pytest.raises(UserError, match="has hand FAKE0001, not OTHER"):
         opened(serial="OTHER")
+
+
+def test_a_run_says_and_records_which_hand_it_was(b, tmp_path):
+    from mcap.reader import make_reader
+
+    d, said, path = driver(VirtualClock(50.0)), [], tmp_path / "a.mcap"
+    recorder = Recorder(path, b.hand.joints, {"source": "sim"}, None, 50.0)
+    settings = LoopSettings(seconds=0.2, tor_max=300.0, home_speed=3.0)
+    eye = FixedPlace([0.055, 0.0, 0.04])
+    Loop(b, d, eye, Calibration.default(), settings, d.clock, recorder, say=said.append).run()
+    assert "serial FAKE0001" in said[0] and "sdk 1.5.2" in said[0] and "firmware 1.3.9" in said[0]
+    with path.open("rb") as file:
+        about = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    assert about["hand"]["serial"] == "FAKE0001" and about["hand"]["sdk"] == "1.5.2"
+    assert len(read(path, audit=False).states.position) > 20
 
 
 def test_a_left_hand_under_a_right_policy_is_refused():
@@ -479,3 +497,26 @@ def test_two_hands_are_let_go_by_their_process_where_the_loop_is_silent(tmp_path
         assert first - last < 0.6 and all(limit == 0 for t, _, limit in commands(log) if t > first + 0.03)
     finally:
         d.close()
+
+
+def test_two_loops_run_their_policies_on_two_hands_of_a_bus(b):
+    """In real time, each in a thread; the left hand's loop ends first, and the right hand goes on."""
+    d = two(Clock(), serials=("FAKE0001", "FAKE0002"), hang=3.0)
+    patient = {"late": 2.0, "stale": 1.0, "overruns": 1000, "hang": 3.0, "home_speed": 3.0, "tor_max": 300.0}
+    make = partial(Loop, b, eye=FixedPlace([0.055, 0.0, 0.04]), calibration=Calibration.default(), clock=d.clock)
+    right, left = d.hands
+    loops = [make(right, settings=LoopSettings(seconds=1.5, **patient)),
+             make(left, settings=LoopSettings(seconds=0.5, **patient))]  # fmt: skip
+    d.open()
+    threads = [threading.Thread(target=loop.run) for loop in loops]
+    try:
+        for t in threads:
+            t.start()
+        for t in threads:
+            t.join(60)
+    finally:
+        for hand in d.hands:
+            hand.close()
+    for loop, least in zip(loops, (40, 10), strict=True):
+        assert loop.report.ended == "done" and loop.report.acts > least and not loop.report.not_relaxed
+    assert "right hand" in loops[0].report.limp and "left hand" in loops[1].report.limp

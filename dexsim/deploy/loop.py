@@ -36,7 +36,7 @@ from dexsim.deploy.readings import (
     overwritten,
     refused,
 )  # fmt: skip
-from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
+from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HAND, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
 from dexsim.deploy.vision import HeightSource
@@ -226,7 +226,7 @@ class Loop:
         c = self.clock
         interval = sys.getswitchinterval()
         try:
-            self.driver.open()
+            info = self.driver.open()
         except BaseException:
             self._close_recording()
             raise
@@ -240,6 +240,10 @@ class Loop:
                 watch = threading.Thread(target=self._watch, name="watchdog", daemon=True)
                 self._beat = c.now()
                 watch.start()
+            if isinstance(info, dict) and info:
+                self.say("hand     " + ", ".join(f"{k} {x}" for k, x in info.items() if x))
+                if self.recorder is not None:
+                    self.recorder.put(HAND, c.now(), {k: str(x) for k, x in info.items()})
             self._first_reading()
             self._turns()
             self.report.ended = self.report.ended or "done"

@@ -23,6 +23,8 @@ OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = (
     "/joint_errors",
 )
 TURNED, GOAL = "/object_turned", "/policy/goal"
+HAND = "hand"
+"""A record of metadata: serial number, side and versions, as the driver gave them."""
 LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",),
           ERRORS: ("joint",),
           TURNED: ("wxyz",), GOAL: ("wxyz",)}  # fmt: skip
@@ -56,7 +58,7 @@ class Recorder:
         self._thread.start()
 
     def put(self, kind: str, t: float, *values: Any) -> None:
-        """kind: command, state, tactile, temperature, or a topic of `LABELS`; values are not to be changed
+        """kind: command, state, tactile, temperature, `HAND`, or a topic of `LABELS`; values are not to be changed
         afterwards."""
         if self._queue.qsize() >= self._most or self.error:
             self.dropped += 1
@@ -99,6 +101,9 @@ class Recorder:
             kind, t, values = item
             first = t if first is None else first
             try:
+                if kind == HAND:
+                    w.add_about(HAND, values[0])
+                    continue
                 if kind == "state":
                     position, velocity, effort, stamp = values
                     w.add_state(t, position, velocity, effort, stamp - self.zero)

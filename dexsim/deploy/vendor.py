@@ -69,6 +69,7 @@ class XHandBus:
         self, clock: Clock, port: str, serial: str | None, side: str | None, package: Callable[[Clock], Any] | None
     ):
         self.clock, self.port, self.serial, self.side = clock, port, serial, side
+        self.label = _label(serial, side)
         self._sdk = package(clock) if package is not None else _import()
         self.counts: Counter = Counter()
         self._pause_until = self._refused_at = clock.now()
@@ -444,7 +445,7 @@ class XHandsBus:
 
     def problem(self) -> str:
         """Of either hand."""
-        return "; ".join(f"{h.side or h.serial} hand: {why}" for h in self.hands if (why := h.problem()))
+        return "; ".join(f"{h.label}: {why}" for h in self.hands if (why := h.problem()))
 
     def released(self) -> tuple[bool, str] | None:
         """Of those that are let go: none of them until all are known."""
@@ -452,7 +453,7 @@ class XHandsBus:
         known = [(h, p) for h, p in proofs if p is not None]
         if not proofs or len(known) < len(proofs):
             return None
-        return all(p[0] for _, p in known), "; ".join(f"{h.side or h.serial} hand: {p[1]}" for h, p in known)
+        return all(p[0] for _, p in known), "; ".join(f"{h.label}: {p[1]}" for h, p in known)
 
     def seen(self) -> np.ndarray:
         return self.hands[0].seen()
@@ -482,7 +483,8 @@ class VendorXHands(BusDriver):
         n = len(sides)
         make = partial(XHandsBus, port=port, serials=serials, sides=sides, package=package)
         super().__init__(make, n * JOINTS, (n * TAXELS[0], TAXELS[1]), clock, hang)
-        self.hands = [OneOfTwo(self, k, f"{side or serials[k] or k} xHand") for k, side in enumerate(sides)]
+        labels = map(_label, serials, sides)
+        self.hands = [OneOfTwo(self, k, label) for k, label in enumerate(labels)]
 
     def open(self) -> dict[str, str]:
         """Connect, whichever hand asks first; returns what to log. Raises UserError."""
@@ -545,14 +547,19 @@ class OneOfTwo:
         return self.bus.problem()
 
     def released(self) -> tuple[bool, str] | None:
-        """Whether what was let go is limp, and by what that is known."""
-        return self.bus.released()
+        """Whether this hand is limp since it was let go, and by what that is known; None while it is not."""
+        proof = self.bus.released()
+        return proof if proof is not None and (self.name in proof[1] or not proof[0]) else None
 
     def close(self) -> None:
         """Let go; the bus is closed with the last of its hands."""
         self.relax()
         if all(c is None for c in self.bus._parts):
             self.bus.close()
+
+
+def _label(serial: str | None, side: str | None) -> str:
+    return f"{side or serial or 'any'} hand"
 
 
 def _part(c: HandCommand, k: int) -> HandCommand:

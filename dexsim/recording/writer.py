@@ -73,6 +73,10 @@ class Writer:
         self._last_flush: int | None = None
         self._open = True
 
+    def add_about(self, name: str, values: Mapping[str, str]) -> None:
+        """Text by key as a further record of metadata, of that name."""
+        self._mcap.add_metadata(name, dict(values))
+
     def add_command(self, t: float, position: np.ndarray, stamp: float | None = None) -> None:
         """Targets [J] sent to the servos [rad]; NaN: none for this joint."""
         self._joints(schema.COMMANDS, t, position, None, None, stamp)
