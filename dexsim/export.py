@@ -29,11 +29,12 @@ settings (key=default):
   check=              a bundle to recompute
   steps=64            golden rows from a simulated episode; as many again are drawn at random
   seed=0              of both
+  mirror=false        true: for the mirror image of the trained hand, a left one of a right one's policy
   task=               module:Class of a task of your own that the checkpoint names, and no installed package provides
   agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class);
                       typed here, its code runs
 """
-KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed", "task")
+KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed", "mirror", "task")
 TOLERANCE = 1e-5
 OPSET = 17
 
@@ -62,6 +63,7 @@ def main(argv: Sequence[str]) -> int:
         whole("steps", given.get("steps", "64"), 2, 100_000),
         whole("seed", given.get("seed", "0")),
         frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
+        _truth(given.get("mirror", "false")),
     )
     return 0 if check(out) else 1
 
@@ -73,21 +75,30 @@ def export(
     steps: int = 64,
     seed: int = 0,
     typed: frozenset[tuple[str, Any]] = frozenset(),
+    mirror: bool = False,
 ) -> Path:
-    """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
+    """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. mirror: for the mirror
+    image of its hand. Raises UserError."""
     from dexsim import outputs
     from dexsim.calibration.file import Calibration
     from dexsim.console import folders
     from dexsim.deploy import bundle, measure
     from dexsim.learning import checkpoint as checkpoints
+    from dexsim.learning import teacher
     from dexsim.learning.ppo import load_policy
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import registry
-    from dexsim.tasks.env import hand_of
+    from dexsim.tasks.building import hand_of
 
     data = checkpoints.load(checkpoint)
     registry.task_class(data["config"], str(checkpoint)).check_deployed(str(checkpoint))
-    measured = None if calibration is None else Calibration.load(calibration, hand=hand_of(data["config"]))
+    if (sees := teacher.groups(data["config"]["agent"])) != ["actor"]:
+        raise UserError(
+            f"{checkpoint}: its policy acts by the observations {', '.join(sees)}, which no hand measures; let a"
+            f" student learn from it: dexsim train agent=distill agent.teacher.checkpoint={checkpoint}"
+        )
+    config = data["config"] | ({"hand_mirror": not data["config"].get("hand_mirror", False)} if mirror else {})
+    measured = None if calibration is None else Calibration.load(calibration, hand=hand_of(config))
     out = Path(out).expanduser()
     if out.is_dir():
         outputs.recover(out)  # what an export that was killed left
@@ -102,7 +113,7 @@ def export(
 
     quiet_warp("cpu")
     torch.manual_seed(seed)
-    cfg = data["config"] | {"device": "cpu", "worlds": 1}
+    cfg = config | {"device": "cpu", "worlds": 1}
     print("building the task, for its scales and for golden episodes ...", flush=True)
     env = make_env(cfg, 1, "cpu", seed, "mujoco")
     checkpoints.check_layout(data, checkpoints.layout_of(env), checkpoint)
@@ -131,7 +142,7 @@ def export(
         if not env.hand.comes_along:
             _copy_hand(env.hand, part / bundle.HAND)
         (part / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
-        (part / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
+        (part / bundle.CONFIG).write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     (out / outputs.WRITTEN).unlink(missing_ok=True)  # a bundle is never written twice
     for text in measured.assumed:
         print(f"note     {text}")
@@ -201,38 +212,23 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     of = measure.of(env.task["name"])
     if not hasattr(of, "SIGNALS"):
         return _golden_terms(env, of.Observation(env), policy, model, steps, seed)
-    observations = of.SIGNALS
-    seen: list[Any] = []  # the `Signals` of the task
-    build = observations.build
-    names = ("observation", "q", "before", "target", "begins", *(f"signal_{n}" for n in observations.Signals._fields))
+    names = ("observation", "q", "before", "target", "begins", *(f"signal_{n}" for n in of.SIGNALS.Signals._fields))
     kept: dict[str, list] = {k: [] for k in names}
-
-    def watch(signals: Any, settings: Any) -> Any:
-        seen.append(type(signals)(*(x.clone() for x in signals)))  # some are the task's own memory
-        return build(signals, settings)
-
     env.rng.manual_seed(seed)
-    observations.build = watch  # the task calls it by its module
-    try:
-        with torch.no_grad():
-            env.reset_all()
-            begins = True
-            for _ in range(steps):
-                obs = env.get_observations()
-                signals, q, before = seen[-1], env.q.clone(), env.target.clone()
-                env.step(policy(obs))
-                if bool(env.done[0]):
-                    begins = True
-                    continue  # the target is the new episode's
-                kept["observation"].append(obs["actor"][0])
-                kept["begins"].append(torch.tensor(begins))
-                begins = False
-                for name, value in zip(signals._fields, signals, strict=True):
-                    kept[f"signal_{name}"].append(value[0].clone())
-                for name, value in (("q", q[0]), ("before", before[0]), ("target", env.target[0].clone())):
-                    kept[name].append(value)
-    finally:
-        observations.build = build
+    with torch.no_grad():
+        env.reset_all()
+        begins = True
+        for _ in range(steps):
+            obs, signals = env.get_observations(), of.signals_of(env)
+            now = {f"signal_{name}": value[0].clone() for name, value in zip(signals._fields, signals, strict=True)}
+            now |= {"observation": obs["actor"][0], "begins": torch.tensor(begins), "q": env.q[0].clone(),
+                    "before": env.target[0].clone()}  # fmt: skip
+            env.step(policy(obs))
+            begins = bool(env.done[0])
+            if begins:
+                continue  # the target is the new episode's
+            for name, value in (now | {"target": env.target[0].clone()}).items():
+                kept[name].append(value)
     return _with_random(kept, model, steps, seed)
 
 
@@ -298,6 +294,11 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
                       "scaling": scaling,
                       "source": source})  # fmt: skip
         at += width
+    if at != env.obs["actor"].shape[1]:
+        raise UserError(
+            f"task.observations: its policy sees {env.obs['actor'].shape[1]} numbers, the loop builds {at}: rows of"
+            " this task that a bundle can lack are switched by task.observe"
+        )
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
               "lead": floats(env.lead()) if task["action"]["lead"] is None else float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
@@ -441,6 +442,12 @@ def _golden_rows(file: Path) -> dict[str, Any]:
         return files.arrays(file)
     except ValueError as error:
         raise UserError(f"{file}: {error}; export the bundle again") from None
+
+
+def _truth(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise UserError(f"mirror={text}: must be true or false")
+    return text == "true"
 
 
 def _settings(argv: Sequence[str]) -> dict[str, str]:

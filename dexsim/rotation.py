@@ -126,6 +126,12 @@ def six_of_matrix(m: torch.Tensor) -> torch.Tensor:
     return torch.cat([m[..., :, 0], m[..., :, 1]], -1)
 
 
+def matrix_of_six(six: torch.Tensor) -> torch.Tensor:
+    """Matrices [..., 3, 3] of `six_of_matrix`."""
+    a, b = six[..., :3], six[..., 3:]
+    return torch.stack([a, b, torch.linalg.cross(a, b)], -1)
+
+
 def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Vectors v [..., 3] turned by q."""
     u, w = q[..., 1:], q[..., :1]

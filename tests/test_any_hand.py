@@ -27,7 +27,7 @@ from dexsim.paths import CONFIGS
 from dexsim.recording import led_object, mechanism, read
 from dexsim.recording.compare import compare
 from dexsim.tasks import grasp_eval, make_env
-from dexsim.tasks.env import UNIT_SPAN
+from dexsim.tasks.building import UNIT_SPAN
 from dexsim.tasks.make_grasps import generate
 from dexsim.view import plots
 from tests.made_hand import made_hand

@@ -63,11 +63,11 @@ def test_emphasis_counts_in_training_and_not_elsewhere(env):
     rows, weight = env.train_rows, env.emphasis
     assert float(weight[rows].max()) == 1.5  # box
     env.draw_from(rows)
-    even = env._cumulative.diff(prepend=torch.zeros(1))
+    even = env._chances.diff(prepend=torch.zeros(1))
     names = [env.objects.scene.variants[int(i)].shape.name for i in rows]
     share = {n: sum(float(p) for p, m in zip(even, names, strict=True) if m == n) for n in set(names)}
     assert all(abs(v - 1 / 3) < 1e-6 for v in share.values())
     env.draw_from(rows, env.emphasis)
-    now = env._cumulative.diff(prepend=torch.zeros(1))
+    now = env._chances.diff(prepend=torch.zeros(1))
     box = sum(float(p) for p, m in zip(now, names, strict=True) if m == "box")
     assert box == pytest.approx(1.5 / 3.5, abs=1e-6)

@@ -573,7 +573,7 @@ def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp
     from dexsim.import_hand import source
     from dexsim.paths import CONFIGS
     from dexsim.recording.mechanism import mechanism
-    from dexsim.tasks.env import model_of
+    from dexsim.tasks.building import model_of
 
     monkeypatch.setattr(guard, "SECONDS", 1.0)
     monkeypatch.setattr(guard, "WAITING_S", 0.3)
@@ -632,7 +632,7 @@ def test_a_name_that_no_file_can_have_is_one_line(payload, tmp_path, key, name):
     from dexsim.hand import load_hand
     from dexsim.paths import CONFIGS
     from dexsim.tasks import base_path
-    from dexsim.tasks.env import model_of
+    from dexsim.tasks.building import model_of
 
     config = start.for_train(["task=grasp", "device=cpu", "worlds=2"], CONFIGS).cfg
     uses = {"objects": lambda: own.own_shape(name), "kept_out": lambda: own.own_shape(name),

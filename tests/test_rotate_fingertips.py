@@ -59,7 +59,7 @@ def test_starts_are_held_by_fingertips_whatever_the_palm():
     for _ in range(round(1.0 / env.dt)):
         env.step(torch.zeros(24, 12))
         held &= (env.object_pose[:, :3] - env.home).norm(dim=1) < DRIFT
-        held &= rotation.error(env.object_pose[:, 3:], env.start) < TURN
+        held &= rotation.error(env.object_pose[:, 3:], env.first) < TURN
         held &= (env.other_force < OTHER) & (env.tip_force[:, 0] > 0.05)
     assert set(env.palm.tolist()) == {0, 1, 2}
     assert int(held.sum()) >= 20
@@ -86,12 +86,12 @@ def test_the_palm_looks_where_it_is_told(palm, down):
 
 def test_goals_turn_about_every_axis_both_ways_and_stay_in_reach():
     env = make(worlds=256)
-    last, seen = env.start.clone(), set()
+    last, seen = env.first.clone(), set()
     for _ in range(12):
         env.goal.copy_(last)
         goal = env.next_goal(env.object_pose[:, 3:])
         assert torch.allclose(rotation.error(last, goal), torch.full((256,), math.radians(20)), atol=1e-3)
-        assert (rotation.error(env.start, goal) <= math.radians(30.2)).all()
+        assert (rotation.error(env.first, goal) <= math.radians(30.2)).all()
         step = rotation.multiply(goal, rotation.conjugate(last))[:, 1:]
         axis = step.abs().argmax(1)
         sign = step.gather(1, axis[:, None])[:, 0].sign()
@@ -157,7 +157,7 @@ def test_the_pose_is_late_by_its_delay():
         env.object_velocity.zero_()
         env.step(0.3 * torch.ones(2, 12))
         poses.append(env.object_pose.clone())
-    assert torch.allclose(env.age, torch.full((2,), 0.084))
+    assert torch.allclose(env.old, torch.full((2,), 0.084))
     assert (poses[-3][:, :3] - poses[-1][:, :3]).norm(dim=1).min() > 1e-5  # the cube does move
     assert torch.allclose(env.seen_position, poses[-3][:, :3], atol=1e-7)
     assert (rotation.error(env.seen, poses[-3][:, 3:]) < 1e-4).all()
@@ -169,7 +169,7 @@ def test_a_hidden_pose_stays_as_it_was_and_ages():
     ages, seen = [], []
     for _ in range(30):
         env.step(torch.zeros(2, 12))
-        ages.append(env.age[0].item())
+        ages.append(env.old[0].item())
         seen.append(env.seen[0].clone())
     hidden = [k for k in range(1, 30) if ages[k] > 0.05]
     assert 0.5 < len(hidden) / 29 < 0.8  # 0.42 of 0.63 s
@@ -210,7 +210,7 @@ def test_what_rests_on_the_palm_is_counted_and_ends():
         if dones[0]:
             ended = 1
             break
-    assert touched and ended and env.tipped[0] and env.ENDS[int(env.end_kind()[0])] == "leaned"
+    assert touched and ended and env.tipped[0] and env.end_names[int(env.ended_by()[0])] == "leaned"
     assert not env.tipped[1]
 
 

@@ -272,7 +272,7 @@ def orders(env, rng: torch.Generator, mask, due_push) -> dict[str, torch.Tensor]
     return {
         "command": torch.where(mask, value, env.command),
         "command_left": torch.where(mask, hold, env.command_left),
-        "push": torch.where(due_push[:, None], push, env.push),
+        "push_force": torch.where(due_push[:, None], push, env.push_force),
         "push_left": torch.where(due_push, s.draw("push.duration"), env.push_left),
         "push_wait": torch.where(due_push, s.draw("push.wait"), env.push_wait),
     }
@@ -290,7 +290,7 @@ def test_commands_and_pushes(env, pushes):
         on = (env.push_wait <= 0) & pushes
         env.push_left -= env.dt * on
         over = env.push_left <= 0
-        want_force = torch.where((on & ~over)[:, None], env.push, 0.0) + force
+        want_force = torch.where((on & ~over)[:, None], env.push_force, 0.0) + force
         want = orders(env, rng, env.command_left <= 0, over)
         for x, moved in ((env.command_left, True), (env.push_wait, True), (env.push_left, on)):
             x += env.dt * moved  # back again: the kernel does it
@@ -349,7 +349,7 @@ def test_an_episode_begins_as_drawn(env):
     torch.testing.assert_close(env.command_left, c["hold_s"][0] + (c["hold_s"][1] - c["hold_s"][0]) * hold)
     size = drawn["push.weights"][0] * env.objects.mass * 9.81
     want = push / push.norm(dim=1, keepdim=True) * size[:, None]
-    torch.testing.assert_close(env.push, want, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(env.push_force, want, rtol=1e-5, atol=1e-6)
     assert torch.equal(env.push_left, drawn["push.duration"][0]) and torch.equal(env.push_wait, drawn["push.wait"][0])
 
 

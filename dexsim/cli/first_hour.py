@@ -631,7 +631,7 @@ def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) ->
     if given["driver"] == "xhand" and kind != "fake":
         return VendorXHand(given["port"], clock, serial=given["serial"] or None, side=hand.handedness)
     Faults.parse(faults)
-    config = settings.resolve(settings.from_files(CONFIGS, {"task": "grasp"})) | hand.identity
+    config = settings.resolve(settings.from_files(CONFIGS, {})) | hand.identity
     calibration = Calibration.default(hand=hand)
     if given["driver"] == "xhand":
         return faked(config, calibration, faults, int(given["seed"]), hang=1.0, clock=clock)

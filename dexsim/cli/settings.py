@@ -176,6 +176,10 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
             continue
         value = item.value()
         finite(value, key)
+        if item.type == OverrideType.CHANGE and not _there(cfg, key) and (usual := _of_term(cfg, key)) is not None:
+            _check_type(key, usual, value)
+            OmegaConf.update(cfg, key, value, merge=False, force_add=True)
+            continue
         if item.type != OverrideType.CHANGE and isinstance(group := cfg.get(key), DictConfig):
             raise UserError(
                 f"+{key}: is there already, a group of settings ({', '.join(f'{key}.{k!s}' for k in group)}): give"
@@ -197,6 +201,16 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
                 raise
             raise UserError(f"{key}: {a_list} is a list, whose values are numbered: {a_list}.0=..., or [..]") from None
     return cfg
+
+
+def _of_term(cfg: DictConfig, key: str) -> Any:
+    """The usual value of a term's setting that the settings do not list, since the task's class declares it; None for
+    any other. Raises UserError for a term that the task has not."""
+    if key.split(".")[0] != "task" or not registry.TERMS & {key.split(".")[1]} or key.count(".") not in (2, 3):
+        return None
+    declared = OmegaConf.create({"task": registry.terms(resolve(cfg))})
+    node = _parent(declared, key)
+    return OmegaConf.select(node, key.rpartition(".")[2])
 
 
 def typed(request: Request) -> frozenset[tuple[str, Any]]:

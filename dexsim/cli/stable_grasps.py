@@ -8,6 +8,7 @@ from dexsim import files, outputs, yaml_text
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
+from dexsim.tasks import registry
 
 USAGE = """usage: dexsim stable-grasps [key=value ...]
 
@@ -29,8 +30,13 @@ settings (key=default):
   any setting of task=rotate, or task=rotate_fingertips  (dexsim train --help)
 """
 
-TASK = {"palm": ("rotate", [0.045, 0.06]), "fingertips": ("rotate_fingertips", [0.04, 0.065])}
-"""What carries the cube -> task whose episodes start so, usual edges of the cubes [m]."""
+
+def tasks() -> dict[str, tuple[str, list[float]]]:
+    """What carries the cube -> task whose episodes start so, usual edges of the cubes [m]."""
+    made = {name: registry.load(where) for name, where in registry.built_in().items()}
+    held = {name: task.holds for name, task in made.items() if hasattr(task, "holds")}
+    return {carries: (name, list(edges)) for name, (carries, edges) in held.items()}
+
 
 WHOLE = {"count": (1, 10**6), "worlds": (1, 10**5), "seed": (0, 2**63 - 1)}
 """Lowest and highest of the whole numbers."""
@@ -56,9 +62,10 @@ def main(argv: list[str]) -> int:
             own[key] = value if key == "out" else _value(key, value)
         else:
             rest.append(text)
-    if own["hold"] not in [*TASK]:  # a list, as what was typed may be one
-        raise UserError(f"hold={own['hold']}: must be {' or '.join(TASK)}")
-    task, usual = TASK[own["hold"]]
+    known = tasks()
+    if own["hold"] not in [*known]:  # a list, as what was typed may be one
+        raise UserError(f"hold={own['hold']}: must be {' or '.join(known)}")
+    task, usual = known[own["hold"]]
     sizes = usual if own["sizes"] is None else own["sizes"]
     if not (
         isinstance(sizes, list)
@@ -82,7 +89,7 @@ def main(argv: list[str]) -> int:
 
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_fingertip_grasps, make_grasps
-    from dexsim.tasks.env import UNIT_SPAN, hand_of
+    from dexsim.tasks.building import UNIT_SPAN, hand_of
 
     generate = (make_grasps if own["hold"] == "palm" else make_fingertip_grasps).generate
     torch.set_num_threads(1)

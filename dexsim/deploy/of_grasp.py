@@ -51,10 +51,12 @@ def parts(env: Any) -> dict[str, Any]:
         "tau/tau_max": "torque [N.m] / normalization.tau_max",
         "F/F_max": "force [N] / normalization.force_max_N",
     }
+    felt = env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    commands = 1 if env.thumb_range is None else 2
     named = {"force_command": "the commanded share of normalization.force_max_N"}
     rows = [
         (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
-        for name, width, unit, source in env.rows()
+        for name, width, unit, source in observations.rows(env.num_actions, env.fingers, felt, commands)
     ]
     return {
         "rows": rows, "initial_pose": floats(env.pose0),
@@ -65,6 +67,14 @@ def parts(env: Any) -> dict[str, Any]:
                                         " along the palm's normal", "object_xy": "held at the first value",
                        "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
     }  # fmt: skip
+
+
+def signals_of(env: Any) -> observations.Signals:
+    """What the last observation of a simulated task was built from, noise and all."""
+    s, felt = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    return observations.Signals(
+        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, :felt],
+        env.touch.centre[:, :felt], s.tip, env.force_command())  # fmt: skip
 
 
 class Measure:

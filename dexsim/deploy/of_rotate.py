@@ -57,7 +57,7 @@ def parts(env: Any) -> dict[str, Any]:
     scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
     rows = [
         (name, width, unit, source, scaled.get(name, "none"))
-        for name, width, unit, source in observations_rotate.rows(task, *env.sizes)
+        for name, width, unit, source in observations_rotate.rows(task, env.num_actions, env.fingers, env.pads)
     ]
     imu = task["perception"] == "imu"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
@@ -84,6 +84,18 @@ def parts(env: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def signals_of(env: Any) -> observations_rotate.Signals:
+    """What the last observation of a simulated task was built from, noise and all."""
+    widths = {name: width // env.history for name, width, _ in env.describe()["observations"]["actor"]}
+    frames = env.obs["actor"].view(env.num_envs, env.history, -1).clone()
+    row = dict(zip(widths, frames[:, 0].split([*widths.values()], 1), strict=True))
+    blind = env.task["perception"] == "proprioception"
+    return observations_rotate.Signals(
+        row.get("joint_angle", env.q), row.get("joint_velocity", env.qd), env.seen.clone(), env.goal_seen(), env.sent(),
+        env.contact_force(), env.contact_centre().flatten(1), row.get("fingertip_position", env.tips.flatten(1)),
+        torch.roll(frames, -1, 1) if blind else frames[:, :0], env.episode_length_buf == 0)  # fmt: skip
+
+
 class TurnMeasure:
     """The rotation: turns readings into observations; keeps the goal, the history and the last angles.
 
@@ -95,10 +107,7 @@ class TurnMeasure:
         self.calibration, self.period, self.task = calibration, float(period), manifest["task_settings"]
         self.needs = ORIENTATION if self.task["perception"] == "imu" else None
         self.hand = HandKinematics(calibration.hand)
-        goal = self.task["goal"]
-        axis = torch.tensor([float(x) for x in goal["axis"]])
-        self.axis = axis / axis.norm()
-        self.turn = rotation.about(self.axis, torch.tensor(math.radians(float(goal["angle"]))))
+        self.axis, self.turn = observations_rotate.axis_and_turn(self.task["goal"], calibration.hand.mirror)
         low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
         self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
         self.frame = sum(row[1] for row in observations_rotate.rows(self.task, *self._sizes(), frames=1))

@@ -88,7 +88,7 @@ class Observation(torch.nn.Module):
     def __init__(self, task: Task, names: list[str] | None = None):
         super().__init__()
         self.task = task
-        self.rows = [r for r in task._sensed if task.task["observations"][r.term.name]["actor"]]
+        self.rows = [r for r in task._sensed if task._named(task.task["observations"][r.term.name]["actor"])]
         shapes = signals(len(task.hand.joints), task.fingers, task.pads)
         self.shapes = shapes | {f"command {k}": (v.shape[1],) for k, v in task.commands.items()}
         self.names = names or self._asked()
@@ -146,10 +146,10 @@ def parts(env: Task) -> dict[str, Any]:
     of = Observation(env)
     rows = []
     for row in of.rows:
-        wide = row.width * row.frames * env.task["history"]
+        wide = row.width * row.frames * env.history
         rows.append((row.term.name, wide, row.unit or "1", row.term.text, "none"))
     told = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
-    rows += [(k, v.shape[1] * env.task["history"], "1", "told", "none") for k, v in told.items()]
+    rows += [(k, v.shape[1] * env.history, "1", "told", "none") for k, v in told.items()]
     width = env.sampler.width.clone()
     env.sampler.width.fill_(0.0)  # the middle of every range
     env.reset_all()
@@ -159,14 +159,14 @@ def parts(env: Task) -> dict[str, Any]:
         "terms": {
             "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
             "rows": [{"name": r.term.name, "width": r.width, "frames": r.frames} for r in of.rows],
-            "history": int(env.task["history"]),
+            "history": int(env.history),
             "commands": {k: floats(v[0]) for k, v in told.items()},
         },
         "perception": {"object_pose": "something that sees where the object is and how it is turned, palm frame"
                        if "object_pose" in of.names else "none", "critic": "not deployed"},
     }  # fmt: skip
-    if env._grasps is not None:
-        g = env._grasps
+    if env.grasps is not None:
+        g = env.grasps
         middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
         out["initial_pose"] = floats(g.hand[middle])
         out["grip"] = {

@@ -23,7 +23,7 @@ from dexsim.deploy.vendor import VendorXHand
 from dexsim.errors import UserError
 from dexsim.tactile.layout import touch_shape
 from dexsim.tasks import registry
-from dexsim.tasks.env import hand_of
+from dexsim.tasks.building import hand_of
 
 POSITION_LSB = 2 * np.pi / 4096
 """rad a count of the hand's 12-bit encoders."""

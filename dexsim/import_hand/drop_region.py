@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 WORLDS = 64
-AREA = 0.045  # m, either side of the cupped pose's middle, of a hand of dexsim.tasks.env.UNIT_SPAN; then half of it
+AREA = 0.045  # m, either side of the cupped pose's middle, of a hand of tasks.building.UNIT_SPAN; then half of it
 FEWEST = 0.1
 """Share of the drops about a place that must be held for it to be taken."""
 

@@ -2,96 +2,35 @@
 
     action --scale, clip--> targets --[ servo | physics ] x K, touch--> terminations -> rewards -> reset -> observations
 
-Nothing here reads from the device: decisions are masks, buffers live as long as the environment.
+The scene is built by `building.py`, episodes begin by `episodes.py`, checkpoints keep what `keeping.py` says. Nothing
+here reads from the device: decisions are masks, buffers live as long as the environment.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-import os
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
-import mujoco
-import numpy as np
 import torch
 import warp as wp
 from tensordict import TensorDict
 
-from dexsim import files, model_file, rotation
-from dexsim.actuator.servo import Servo
-from dexsim.actuator.table import ServoTable
-from dexsim.assets.objects.own import named
 from dexsim.errors import UserError
-from dexsim.hand import Hand, load_hand
-from dexsim.hand.couplings import Couplings
-from dexsim.hand.places import places
-from dexsim.hand.skin import tip_skins
-from dexsim.sim import ContactPair, make_engine
-from dexsim.sim.make import engine_of, newton_iterations
-from dexsim.sim.memory import give_back
-from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.sim.warmup import compile_side_by_side
-from dexsim.tactile.layout import hand_layout, tip_layout
-from dexsim.tactile.shapes import ShapeSet
-from dexsim.tactile.tactile import Tactile
-from dexsim.tasks import nan_dump, object_kernel, randomize, servos, state_kernels, worlds
+from dexsim.tasks import state_kernels
+from dexsim.tasks.keeping import Kept
 from dexsim.tasks.nan_dump import NanDump
-from dexsim.tasks.objects import Objects
-from dexsim.tasks.randomize import Sampler
-from dexsim.tasks.reality import Reality, present
-from dexsim.tasks.recorded import Constants, unrecordable
-from dexsim.tasks.scenes import BASE, Scene, Slide, fasten, furnish, mount
+from dexsim.tasks.recorded import unrecordable
 from dexsim.tasks.structs import filled
-from dexsim.tasks.watched import Watched, unread
-
-if TYPE_CHECKING:
-
-    class VecEnv:
-        """Stand for rsl-rl's class, which says nothing of its types: a wrong name on an environment is then seen."""
-
-else:
-    from rsl_rl.env import VecEnv
+from dexsim.tasks.watched import unread
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
-MOST_GROUPS = 4
-"""Groups of observations that a task may have."""
-UNIT_SPAN = 0.1
-"""m, `span` of the hand that the lengths in task settings are for; they are multiplied by span / UNIT_SPAN."""
-UNIT_PALM = 0.025
-"""m, height of that hand's palm over the origin of its palm frame."""
 
 
-def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[ContactPair, ...]:
-    """Contact pairs of the hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object (F .. 2F-1),
-    palm on object (2F), distal link on the hand itself (2F+1 .. 3F), then fingertips on each of the bodies `parts`. A
-    fingertip of several geoms counts as its whole distal link. root: the hand's root body."""
-    obj = ("body", OBJECT)
-    tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
-    return (
-        *(ContactPair(f"tip_{f.name}", tip, obj) for f, tip in zip(hand.fingers, tips, strict=True)),
-        *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
-        ContactPair("palm", ("body", hand.palm_body), obj),
-        *(ContactPair(f"self_{f.name}", ("body", f.body), ("subtree", root)) for f in hand.fingers),
-        *(
-            ContactPair(f"tip_{f.name}:{body}", tip, ("body", body))
-            for body in parts
-            for f, tip in zip(hand.fingers, tips, strict=True)
-        ),
-    )
-
-
-def hand_of(cfg: dict) -> Hand:
-    """The hand of a resolved config; the xHand for checkpoints from before there was a choice. Raises UserError."""
-    return load_hand(cfg.get("hand") or "xhand", cfg.get("hand_mirror", False), cfg.get("hand_scale", 1.0))
-
-
-class HandEnv(VecEnv):
+class HandEnv(Kept):
     """N hands with one object each. A task subclasses it; see `tasks/grasp.py`.
 
     Shapes: actions [N, J] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
@@ -100,138 +39,9 @@ class HandEnv(VecEnv):
     `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """
 
-    scene: ClassVar[Scene] = Scene()
-    """What the world holds beside the hand."""
-    TAKES_OBJECTS: bool = False
-    """Whether `objects=` and `kept_out=` may give it a user's own objects (`task.objects`)."""
-    camera: ClassVar[dict[str, Any] | None] = None
-    """View of a film: lookat [3] m, distance m, azimuth and elevation in degrees; None: the usual one."""
-    given: Sequence[str] = ()
-    """Names of settings that the user gave: after the first step each must have been read."""
-    learning = True
-    """False while an evaluation plays."""
-    nan_count: torch.Tensor
-    _reach: Any
-    _moves: tuple[float, float]
-    _reaches: torch.Tensor
-    _act_args: list[Any]
-    _wrong: torch.Tensor | None
-    _sources: tuple[str, ...]
-
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
-        self.cfg, self.task, sim = cfg, Watched(cfg["task"], "task"), cfg["sim"]
-        self.hand = hand_of(cfg)
-        self.unit, self.places = self.hand.span / UNIT_SPAN, places(self.hand)
-        self.rise = float(self.places.catch[2]) - self.unit * UNIT_PALM
-        base = self.scene.base
-        self.joints = self.hand.joints if base is None else (*self.hand.joints, *BASE)
-        self.num_envs, self.device, self.num_actions = n_worlds, device, len(self.joints)
-        self.fingers, self.pads = len(self.hand.fingers), len(self.hand.fingers) if self.hand.touches else 0
-        self.decimation, self.dt = _periods(sim, self.task)
-        if self.task["action"]["mode"] not in ("relative", "absolute"):
-            raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
+        super().__init__(cfg, n_worlds, device, seed, engine)
         self._check_rewards()
-        self._length_limit = torch.zeros((), dtype=torch.long, device=device)
-        self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
-        shapes = {} if self.scene.object is None else named(self.task["objects"])
-        self.shape_names = list(shapes)
-        spec = model_of(self.hand, cfg.get("model_file"))  # a checkpoint from before has none
-        contact = self.task["contact"]
-        d = contact["impedance"]
-        if not 0.5 <= d < 1.0:
-            raise UserError(f"task.contact.impedance={d}: must lie in [0.5, 1)")
-        firm = contact.get("hand_impedance")  # links and palm; null, and in checkpoints from before: MuJoCo's default
-        if firm is not None and not 0.5 <= firm < 1.0:
-            raise UserError(f"task.contact.hand_impedance={firm}: must be null or lie in [0.5, 1)")
-        root = spec.worldbody.bodies[0].name
-        if base is not None:
-            mount(spec, base)
-        spec.option.timestep = sim["timestep"]
-        table = None
-        if self.scene.object is None:
-            spec.worldbody.add_body(name=OBJECT, pos=[0.0, 0.0, -1e3])  # what pairs and touch name; nothing is there
-        else:
-            scales = [x * self.unit for x in self.task["objects"]["baked_scales"]]
-            table = hand_object_scene(spec, [shapes[s] for s in self.shape_names], scales, sim["timestep"])
-            if not self.scene.free:
-                spec.delete(spec.joint("object_free"))
-                fasten(spec.body(OBJECT), self.scene.object, spec)  # type: ignore[arg-type]  # not free, not None
-        self.furniture = furnish(spec, self.scene)
-        tips, joints = set(self.hand.tip_geoms), {*self.hand.joints, *self.hand.couplings.passive}
-        for geom in spec.geoms:
-            if geom.name in tips:
-                geom.solimp = [d, d, 1e-3, 0.5, 2.0]
-            elif firm is not None:  # the object's too: MuJoCo takes the mean of two that touch
-                geom.solimp = [firm, firm, 1e-3, 0.5, 2.0]
-        for joint in spec.joints:
-            if joint.name in joints:
-                # stiffer dry friction than MuJoCo's default, in which a stuck joint creeps; stiffer yet, and Newton
-                # needs many more iterations (measured: 99th percentile 9 at 0.9999, 5 here)
-                joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
-        _solver_options(spec, sim, engine_of(engine, device), self.scene.table is not None)
-        self.rng = torch.Generator(device=device)
-        self.rng.manual_seed(seed)
-        # another world to be judged in
-        self.reality = Reality(cfg["reality"], self.rng, self.hand) if present(cfg) else None
-        if self.reality is not None:
-            self.reality.change_model(spec)
-        self._drawn: mujoco.MjModel | None = None
-        self._frames: tuple[Any, dict[int, mujoco.MjModel]] | None = None
-        self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
-        for geom in list(spec.geoms):
-            if not geom.contype and not geom.conaffinity:
-                spec.delete(geom)
-        # parts of hollow objects, further bodies: each may touch
-        more = (len(table.slots) - len(SLOTS) if table is not None else 0) + 4 * len(self.furniture.parts)
-        more += 8 * (self.scene.table is not None)
-        bodies = [p.body for p in self.furniture.parts]
-        self.engine = make_engine(
-            spec,
-            n_worlds,
-            device,
-            engine,
-            fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
-            pairs=contact_pairs(self.hand, root, bodies),
-            deterministic=sim["deterministic"],
-            nconmax=sim["nconmax"] + 2 * more,
-            njmax=sim["njmax"] + 8 * more,
-            threads=sim["threads"],
-            collision=sim.get("collision", "auto"),
-            solver=sim.get("solver", "auto"),
-        )
-        drives = cfg["servo"]
-        if base is not None:
-            drives = {**drives, "joints": {**drives["joints"], **base.servos()}}
-        self.servo = Servo(
-            self.engine,
-            self.joints,
-            ServoTable.from_dict(drives),
-            control_period=self.dt,
-            varied=list(cfg["randomize"].get("servo", {})),
-        )
-        if table is not None:
-            self.objects = Objects(self.engine, table, list(self.hand.tip_geoms), d)
-        if self.reality is not None and table is not None:
-            self.objects.friction_factor = self.reality.friction_factor(
-                self.engine.mjm, self.objects.hand_geoms.tolist()
-            )
-        shown = [v.shape for v in table.variants] if table is not None else []
-        pairs = [[f"tip_{f}", *(f"tip_{f}:{body}" for body in bodies)] for f in self.hand.finger_names]
-        self.touch = Tactile(
-            self.engine,
-            hand_layout(self.hand) or tip_layout(self.hand),
-            ShapeSet([*shown, *(p.touch for p in self.furniture.parts)], device),
-            [OBJECT, *bodies] if bodies else OBJECT,
-            cfg["tactile"],
-            pairs=pairs,
-            tips=tip_skins(self.hand) if self.hand.touches else None,
-        )
-        for k, part in enumerate(self.furniture.parts, 1):
-            self.touch.shape_id[:, k] = len(shown) + k - 1
-            self.touch.shape_size[:, k] = torch.as_tensor(part.size, dtype=torch.float32, device=device)
-        self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
-        self._index()
-        self._buffers()
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
@@ -255,6 +65,11 @@ class HandEnv(VecEnv):
     def config(cls) -> dict[str, Any]:
         """The settings of a task that has them in its class; see `dexsim.tasks.Task`. Raises UserError."""
         raise UserError(f"{cls.__name__}: its settings stand in a file; derive from dexsim.tasks.Task for your own")
+
+    @classmethod
+    def declared(cls) -> dict[str, Any]:
+        """Settings of declared terms, by part of the task's settings; see `dexsim.tasks.Task`."""
+        return {}
 
     @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:
@@ -289,14 +104,15 @@ class HandEnv(VecEnv):
             f"{source}: {cls.__name__} declares no terms, so that the deployed loop cannot build what its policy sees"
         )
 
-    # -- for the task to fill in
-    # -----------------------------------------------------------------------------------------
+    @classmethod
+    def another_world(cls, u: Callable[..., float], friction: float, size: float) -> dict[str, Any]:
+        """What is drawn of this task for another world to be judged in: "randomize", ranges by name, and "sensors".
+
+        u(low, high, digits): a number. friction, size [m] of the object. See `dexsim.tasks.reality`."""
+        return {}
+
     def setup(self) -> None:
         """Allocate what the task needs; called once, before the first reset."""
-
-    def begin_episodes(self, mask: torch.Tensor) -> None:
-        """Sample new episodes where mask [N] holds: object, servo, initial state (through `place`)."""
-        raise NotImplementedError
 
     def before_physics(self) -> None:
         """Commands, pushes: once a control step, before physics."""
@@ -314,6 +130,17 @@ class HandEnv(VecEnv):
         """By name of each reward term that the task knows: what it is, for the first screen."""
         raise NotImplementedError
 
+    def mirror_signs(self) -> torch.Tensor | None:
+        """Signs [A] by which the actor's observation changes where hand and world are mirrored; None where the task
+        does not say."""
+        return None
+
+    def symmetries(self) -> Sequence[Mapping[str, Callable[[torch.Tensor], torch.Tensor]]]:
+        """Situations that are as likely and end alike, beside the present one: for each, by name of a row of the
+        observation, or "action", what makes its value [N, D] there of the present one; rows without stay as they are.
+        `agent=ppo_symmetric` learns from them too."""
+        return ()
+
     def reward_rows(self) -> list[tuple[str, float, str]]:
         """(name, weight, what it is) of the rewards in the settings."""
         words = self.reward_words()
@@ -321,10 +148,6 @@ class HandEnv(VecEnv):
 
     def rewards(self) -> dict[str, torch.Tensor]:
         """Named reward terms, weighted, [N] each."""
-        raise NotImplementedError
-
-    def observe(self, advance: bool) -> dict[str, torch.Tensor]:
-        """Observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
         raise NotImplementedError
 
     @property
@@ -346,8 +169,6 @@ class HandEnv(VecEnv):
     def episode_length_buf(self, steps: torch.Tensor) -> None:
         self._episode_length.copy_(steps)
 
-    # -- rsl-rl's interface
-    # ------------------------------------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
 
@@ -410,7 +231,8 @@ class HandEnv(VecEnv):
 
     def ended_by(self) -> torch.Tensor:
         """Index into `end_names` [N] of what ended the episodes that the last step ended."""
-        return self._rates.argmax(0)
+        at = len(self.end_names) - 2  # of nan, which goes before what else may be said of such a state
+        return torch.where(self._rates[at] > 0, at, self._rates.argmax(0))
 
     def _judge(
         self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]
@@ -434,12 +256,6 @@ class HandEnv(VecEnv):
         inputs = [given, *map(wp.from_torch, (reward, self.nan, self._wrong, count)), out]
         wp.launch(state_kernels.judge, dim=self.num_envs, inputs=inputs, device=self.device)
         return rates, reward
-
-    @contextmanager
-    def _drawn_ahead(self, name: str) -> Iterator[None]:
-        """On a GPU, all random numbers of a part of the step at once; evaluation draws as ever, whatever the device."""
-        with self.sampler.drawn_ahead(name) if self.graphs and self.draws_ahead else nullcontext():
-            yield
 
     def _reset_done(self) -> None:
         if self.skip_idle_resets and not bool(self.done.any()):
@@ -498,238 +314,6 @@ class HandEnv(VecEnv):
             return torch.full((J,), float(said), device=self.device)
         return torch.minimum(self.servo.saturation[:J].float(), (self.q_high - self.q_low)[:J])
 
-    def reset_all(self) -> None:
-        """Begin an episode in every world."""
-        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self.reset(mask)
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
-        with self._drawn_ahead("episodes"):
-            self.begin_episodes(mask)
-        self.engine.refresh()
-        self._clear_touch(mask)
-        self.episode_length_buf.masked_fill_(mask, 0)
-        self.action.masked_fill_(mask[:, None], 0.0)
-        self.last_action.masked_fill_(mask[:, None], 0.0)
-        self.read_state()
-        self._observe_all()
-
-    def _observe_all(self) -> None:
-        self._blind.zero_()
-        with self._drawn_ahead("observations"):
-            observed = self.observe(advance=True)
-        for row, (group, value) in enumerate(observed.items(), 1):
-            if group not in self.obs:
-                self.obs[group] = torch.zeros_like(value)
-            args, dim = [wp.from_torch(value), row, wp.from_torch(self._blind)], value.shape
-            wp.launch(state_kernels.note_not_finite, dim=dim, inputs=args, device=self.device)
-            out = wp.from_torch(self.obs[group])
-            wp.launch(state_kernels.keep_finite, dim=dim, inputs=[*args, out], device=self.device)
-
-    def place(
-        self,
-        mask: torch.Tensor,
-        hand_q: torch.Tensor,
-        object_pose: torch.Tensor,
-        object_velocity: torch.Tensor,
-        target: torch.Tensor | None = None,
-        also: Mapping[int, torch.Tensor] | None = None,
-    ) -> None:
-        """Where mask holds: hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); object at pose
-        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own), where
-        it moves freely. also: values [N] of further numbers of qpos, by index (`q_of`)."""
-        e, target = self.engine, hand_q if target is None else target
-        # what else there is begins as the scene has it
-        qpos = e.t.qpos.clone() if self._alone else self._begin_q.expand_as(e.t.qpos).clone()
-        qvel = torch.zeros_like(e.t.qvel)
-        at_q, at_v = self._object_at
-        qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
-        if self.scene.free:
-            qpos[:, at_q : at_q + 7] = object_pose.to(qpos.dtype)
-            qvel[:, at_v : at_v + 6] = object_velocity.to(qvel.dtype)
-        for index, value in (also or {}).items():
-            qpos[:, index] = value.to(qpos.dtype)
-        if self.hand.couplings.passive:
-            qpos = self._couplings.complete(qpos)
-        e.set_state(mask, qpos, qvel)
-        self.servo.reset(mask, target)
-        self.touch.reset(mask)
-        torch.where(mask[:, None], target, self.target, out=self.target)
-
-    def kernels(self) -> list[wp.Kernel]:
-        """Kernels of a step beside its physics, one of each module at least; a task adds its own."""
-        real = self.engine.real
-        own = [self._read, state_kernels.act, nan_dump.keep_world]
-        write = [] if self.scene.object is None else [object_kernel.write_kernel(real)]
-        return [*own, *write, servos.draw_kernel(real), randomize.spread]
-
-    def _name_kernels(self) -> None:
-        """For `compile_side_by_side`, which asks of a launch only which kernel it is of."""
-        for kernel in self.kernels():
-            wp.launch(kernel, dim=1)
-
-    def _clear_touch(self, mask: torch.Tensor) -> None:
-        """Where mask [N] holds, nothing is touched: no force, centres at the pads' centres (poses are refreshed)."""
-        touch, state = self.touch, self.engine.wp
-        wp.launch(
-            state_kernels.clear_touch,
-            dim=touch.force.shape,
-            inputs=[wp.from_torch(mask), state.xpos, state.xmat, *self._touch_args],
-            device=self.device,
-        )
-        for raw in (touch.raw, touch.raw_clean, touch.raw3):
-            if raw is not None:
-                raw.masked_fill_(mask.view(-1, *(1,) * (raw.dim() - 1)), 0.0)
-
-    # -- state
-    # ---------------------------------------------------------------------------------------------------------------
-    def read_state(self) -> None:
-        """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan`
-        [N]."""
-        wp.launch(self._read, dim=self._read_dim, inputs=self._read_args, device=self.device)
-        if not self.scene.free:
-            self._read_object()
-        if self.servo.misread:  # what a hand's own sensors say is all that a policy will know of them
-            ok = ~self.nan[:, None]
-            for own, reported in ((self.q, self.servo.position()), (self.qd, self.servo.velocity())):
-                own.copy_(torch.where(ok, reported, 0.0))
-        if self.reality is not None:
-            self.reality.read(self)
-
-    def _read_object(self) -> None:
-        """Pose and velocity of an object on a joint; `object_joint` [N] rad or m and `object_speed` [N]."""
-        e = self.engine.t
-        if self.scene.object is None:
-            return
-        body, (at_q, at_v) = self.objects.body, self._object_at
-        turned = rotation.from_matrix(e.xmat[:, body].float())
-        self.object_pose.copy_(torch.nan_to_num(torch.cat([e.xpos[:, body].float(), turned], 1)))
-        self.object_joint.copy_(torch.nan_to_num(e.qpos[:, at_q].float()))
-        self.object_speed.copy_(torch.nan_to_num(e.qvel[:, at_v].float()))
-        self.object_velocity.zero_()
-        part = 0 if isinstance(self.scene.object, Slide) else 3
-        self.object_velocity[:, part : part + 3] = self.object_speed[:, None] * self.object_axis
-
-    def q_of(self, joint: str) -> int:
-        """Index in qpos of a joint of the scene (the first of a free one's seven): "object_joint", "NAME_free" of a
-        further object, "TREE/JOINT" of an imported one."""
-        return int(self.engine.mjm.jnt_qposadr[self.engine.joint(joint)])
-
-    def v_of(self, joint: str) -> int:
-        """The same in qvel."""
-        return int(self.engine.mjm.jnt_dofadr[self.engine.joint(joint)])
-
-    def _index(self) -> None:
-        e, dev, hand = self.engine, self.device, self.hand
-        mjm = e.mjm
-
-        def long(x: Any) -> torch.Tensor:
-            return torch.as_tensor(x, dtype=torch.long, device=dev)
-
-        self._couplings = Couplings(mjm, self.joints)
-        self.joint_q, self.joint_v = long(e.qpos_index(self.joints)), long(e.dof_index(self.joints))
-        self._object_at = 0, 0
-        if self.scene.object is not None:
-            joint = "object_free" if self.scene.free else "object_joint"
-            self._object_at = self.q_of(joint), self.v_of(joint)
-        if self.scene.free:
-            self.object_q = long(range(self._object_at[0], self._object_at[0] + 7))
-            self.object_v = long(range(self._object_at[1], self._object_at[1] + 6))
-        elif self.scene.object is not None:
-            axis = mjm.jnt_axis[e.joint(joint)]
-            self.object_axis = torch.as_tensor(axis, dtype=torch.float32, device=dev)
-        self._alone = self.scene.free and not self.furniture.parts and not self.furniture.joints
-        self._begin_q = torch.as_tensor(mjm.qpos0, dtype=e.t.qpos.dtype, device=dev)[None]
-        bounds, efforts = np.asarray(hand.limits), np.asarray(hand.efforts)
-        base = self.scene.base
-        if base is not None:
-            far = np.repeat([base.travel, base.turn], 3)
-            bounds = np.concatenate([bounds, np.stack([-far, far], 1)])
-            efforts = np.concatenate([efforts, np.repeat(base.limit, 3)])
-        limits = torch.as_tensor(bounds, dtype=torch.float32, device=dev)
-        self.q_low, self.q_high = limits[:, 0], limits[:, 1]
-        self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
-        self.effort = torch.as_tensor(efforts, dtype=torch.float32, device=dev)
-        self.tip_body = long([e.body(b) for b in hand.tip_bodies])
-        self.pad_centre = torch.as_tensor(self.touch.layout.centre(), dtype=torch.float32, device=dev)
-        self.tip_offset = torch.tensor([f.position for f in hand.fingers], dtype=torch.float32, device=dev)
-        # fingers that press against the others, and those; the joints whose torque closes each finger
-        self.opposing, self.others = long(hand.opposing), long(hand.others)
-        self.roots = long([f.flexion[0] for f in hand.fingers])
-
-    def _buffers(self) -> None:
-        n, dev, J, F = self.num_envs, self.device, self.num_actions, self.fingers
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros(n, *shape, dtype=dtype, device=dev)
-
-        self._episode_length = zeros(dtype=torch.long)
-        self.action, self.last_action, self.target = zeros(J), zeros(J), zeros(J)
-        self.q, self.qd, self.torque = zeros(J), zeros(J), zeros(J)
-        self.object_pose, self.object_velocity = zeros(7), zeros(6)
-        self.object_joint, self.object_speed = zeros(), zeros()
-        self.tip_force, self.finger_force, self.self_force, self.palm_force = zeros(F), zeros(F), zeros(F), zeros()
-        self.tips = zeros(F, 3)
-        self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
-        self.reward = zeros()
-        # worlds of which an observation was not finite: of any group, then of each
-        self._blind = torch.zeros(1 + MOST_GROUPS, n, dtype=torch.bool, device=dev)
-        self.last: dict[str, torch.Tensor] = {}  # figures [N] of each world's last ended episode
-        self._wrong = None  # world-steps that were not finite since the last `check`, by source
-        self._sources = ()
-        self._steps_since = 0
-        self._action_in = zeros(J)
-        self._log_names: tuple[str, ...] = ()
-        self._log_values: torch.Tensor | None = None
-        self.graphs, self.keep_final_obs = True, False
-        self.draws_ahead = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
-        # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step.
-        # (The random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
-        self.skip_idle_resets = self.engine.kind == "mujoco"
-        self._runs: dict[str, int] = {}
-        self._recorded: dict[str, torch.cuda.CUDAGraph] = {}
-        self._constants = Constants(self.device)
-        self.obs: dict[str, torch.Tensor] = {}
-        self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
-
-    def _kernels(self) -> None:
-        """What `read_state` and `_clear_touch` launch."""
-        e, state = self.engine, self.engine.wp
-        self._read = state_kernels.read_kernel(e.real)
-        self._read_dim = self.num_envs, self.num_actions + state_kernels.OBJECT_NUMBERS + self.fingers + 1
-        object_q, object_v = self._object_at
-        at = filled(
-            state_kernels.Places, joint_q=self.joint_q, joint_v=self.joint_v, object_q=object_q, object_v=object_v,
-            tip_body=self.tip_body, tip_offset=self.tip_offset,
-        )  # fmt: skip
-        kept = state_kernels.Seen.vars  # type: ignore[attr-defined]  # wp.struct adds it
-        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in kept})
-        self._read_args = [
-            state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
-            state.xmat, at, seen,
-        ]  # fmt: skip
-        base = self.scene.base
-        self._moves: tuple[float, float | None] = (0.0, 0.0)
-        self._reaches = torch.zeros(2, self.num_actions, device=self.device)
-        if base is not None:
-            far = [[x[0]] * 3 + [x[1]] * 3 for x in (base.scale, base.lead)]
-            self._reaches[:, len(self.hand.joints) :] = torch.tensor(far)
-        self._reach = filled(
-            state_kernels.Reach, relative=False, scale=self._reaches[0], lead=self._reaches[1], low=self.q_low,
-            high=self.q_high,
-            middle=self.q_mid, half=self.q_half,
-        )  # fmt: skip
-        self._act_args = [wp.from_torch(x) for x in (self.q, self.action, self.last_action, self.target)]
-        touch = self.touch
-        self._touch_args = [
-            at.tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
-            *map(wp.from_torch, (touch.force, touch.force_clean, touch.force_other)),
-            *(wp.from_torch(x, dtype=wp.vec3) for x in (touch.centre, touch.centre_clean)),
-        ]  # fmt: skip
-
-    # -- bookkeeping
-    # -----------------------------------------------------------------------------------------------------------
     def _log(self, terms: dict, ends: dict, means: torch.Tensor) -> None:
         """means: of the reward terms, of how worlds ended, over all worlds."""
         metrics = self.metrics()
@@ -744,48 +328,6 @@ class HandEnv(VecEnv):
     def metrics(self) -> dict[str, torch.Tensor]:
         """Task metrics for the log, scalars on the device."""
         return {}
-
-    def drawn_model(self, world: int) -> mujoco.MjModel:
-        """A model of one world as it is now, with the shells and skins, to render its qpos; reads from the device."""
-        drawn = self._drawn = self._drawn or self.drawn_spec.compile()
-        model = copy.copy(drawn)
-        for slot in self.objects.scene.slots if self.scene.object is not None else ():
-            g = drawn.geom(slot).id
-            e = self.engine.geom(slot)
-            for name in ("geom_pos", "geom_quat", "geom_size", "geom_dataid"):
-                value = self.engine.field(name)[world, e].cpu().numpy()
-                getattr(model, name)[g] = value
-            model.geom_group[g] = 0
-        return model
-
-    def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
-        """A picture [H, W, 3] uint8 of one world as it is now, without a display; size: width, height. Raises
-        UserError where no OpenGL opens."""
-        from dexsim.view.frames import Frames
-
-        if self._frames is None or self._frames[0].size != size:
-            self._frames = Frames(size, self.camera), {}
-        frames, models = self._frames
-        model = models.get(world)
-        fresh = int(self._episode_length[world]) <= 1  # an episode's object may be another
-        if model is None or fresh:
-            models.clear()
-            model = models[world] = self.drawn_model(world)
-        return frames(model, self.engine.t.qpos[world].double().cpu().numpy())
-
-    def close(self) -> None:
-        """Give back memory and threads at once; afterwards nothing but `close` may be called.
-
-        They refer to each other in circles, so that Python would keep them until it happens to look for such; of 64
-        worlds that is some 100 MB.
-        """
-        for part in ("_recorded", "_nan_dump", "touch", "servo", "objects", "sampler", "engine"):
-            held = self.__dict__.pop(part, None)
-            if hasattr(held, "__dict__"):
-                vars(held).clear()
-        held = None
-        self.__dict__.clear()
-        give_back()
 
     def check(self) -> None:
         """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not
@@ -816,13 +358,6 @@ class HandEnv(VecEnv):
                 f" {100 * MOST_NAN:.0f} % in all. Look at what this task's settings of that name are, or lower"
                 " sim.timestep"
             )
-
-    def action_rows(self) -> list[tuple[str, float, float, str]]:
-        """(joint, lowest, highest, what) of the targets, for the first screen."""
-        what, base = f"rad ({self.task['action']['mode']})", len(self.hand.joints)
-        low, high = self.q_low.tolist(), self.q_high.tolist()
-        return [(j, low[k], high[k], what if k < base or k >= base + 3 else what.replace("rad", "m"))
-                for k, j in enumerate(self.joints)]  # fmt: skip
 
     def usual_ends(self) -> list[tuple[str, str]]:
         """Rows of the ends that every task has."""
@@ -859,94 +394,3 @@ class HandEnv(VecEnv):
         from dexsim.tasks.evaluation import evaluate
 
         return evaluate(self, policy, episodes, seed, progress)
-
-    def hand_notes(self) -> list[str]:
-        """What a reader of the first screen must know of the hand."""
-        guessed = self.hand.file.guessed
-        return [
-            *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
-            *([f"guessed in {self.hand.folder}/hand.yaml, to be checked: {', '.join(guessed)}"] if guessed else []),
-        ]
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        return self.joints
-
-    def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
-        highest."""
-        names = ("action", "last_action", "target", "q", "qd", "torque", "object_pose", "object_velocity", "tips")
-        out = {name: getattr(self, name) for name in (*names, "nan")}
-        out |= {f"obs_{group}": value for group, value in self.obs.items()}
-        return out | {"episode_length": (self._episode_length, 0, 2**31), "width": self.sampler.width}
-
-    def keep_worlds(self) -> dict[str, torch.Tensor]:
-        """A copy of all worlds: with it, a run goes on as if it had not stopped (`tasks/worlds.py`)."""
-        return worlds.keep(self)
-
-    def load_worlds(self, state: dict[str, torch.Tensor]) -> None:
-        """Go on from `keep_worlds()`. Raises ValueError, and changes nothing, for those of another environment."""
-        worlds.put_back(self, state)
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """What a resumed run needs beside the worlds: counters and random state."""
-        return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        rng = state["rng"].cpu()
-        if rng.shape == self.rng.get_state().shape:
-            self.rng.set_state(rng)
-        else:  # learned until now on another kind of device, whose generator is another one
-            self.rng.manual_seed(zlib.crc32(rng.numpy().tobytes()))
-        self.nan_count.copy_(state["nan_count"])
-        self.reset_all()
-
-
-def _periods(sim: dict, task: dict) -> tuple[int, float]:
-    dt, control = float(sim["timestep"]), float(sim["control_period"])
-    if not 1e-4 <= dt <= 0.02:
-        raise UserError(f"sim.timestep={dt}: must lie in [0.0001, 0.02] s")
-    k = round(control / dt)
-    if k < 1 or not math.isclose(k * dt, control, rel_tol=1e-6):
-        raise UserError(
-            f"sim.control_period={control} s is not a multiple of sim.timestep={dt} s; e.g."
-            f" sim.control_period={max(k, 1) * dt:.4g}"
-        )
-    if task["episode_s"] < control:
-        raise UserError(f"task.episode_s={task['episode_s']}: must be at least one control period, {control} s")
-    return k, control
-
-
-def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
-    """The hand's model, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
-
-    Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the
-    hand."""
-    if path is None:
-        return hand.spec()
-    if not os.path.isfile(files.place(path)):
-        raise UserError(f"model_file={path}: no such file")
-    spec = model_file.read(files.place(path), f"model_file={path}")
-    has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
-    missing = [n for n in (*hand.joints, *hand.tip_bodies, *hand.tip_geoms) if n not in has]
-    if missing:
-        raise UserError(
-            f"model_file={path}: is not a model of hand={hand.name}: it lacks {', '.join(missing[:4])}; give the"
-            " model.xml that a diagnosis of this hand wrote"
-        )
-    return spec
-
-
-
-def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str, several: bool) -> None:
-    """several: contacts of two hulls may be, or what lies on a table would rock."""
-    o = spec.option
-    o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    o.impratio = sim["impratio"]
-    o.iterations, o.ls_iterations = newton_iterations(sim, engine), sim["ls_iterations"]
-    o.noslip_iterations = sim["noslip_iterations"]
-    if engine == "warp":  # MuJoCo-Warp then adds up an iteration's Hessian in one kernel, not two: 7 % of the step
-        o.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    if not several:  # one contact a convex pair, so that a fingertip's stiffness is that of one contact
-        o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD

@@ -12,14 +12,16 @@ The command is constant in an episode, uniform in [0, 1] over episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from dexsim import intervals
-from dexsim.tasks import base_path
+from dexsim.errors import UserError
+from dexsim.hand.places import approach
+from dexsim.tasks import base_path, observations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +81,7 @@ def _play_all(
     env: GraspEnv, policy: Policy, episodes: int, rows: torch.Tensor, progress: Progress | None, label: str
 ) -> dict:
     parts: list[dict] = []
-    kept = (env._rows, env._cumulative)
+    kept = (env._rows, env._chances)
     env.draw_from(rows)
     done = 0
     while done < episodes:
@@ -87,7 +89,7 @@ def _play_all(
             _play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes)
         )
         done += env.num_envs
-    env._rows, env._cumulative = kept
+    env._rows, env._chances = kept
     out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
     out["frames"] = parts[0]["frames"]
     return out
@@ -511,3 +513,33 @@ def _hold_plot(ax: Axes, r: dict) -> None:
     ax.set_ylim(0, 100)
     ax.set_title("Held through 5 s")
     ax.legend()
+
+
+def scripted(env: GraspEnv, rate: float, wait: float) -> Callable[[Mapping], torch.Tensor]:
+    """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then
+    close thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd
+    of its maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
+    if env.task["action"]["mode"] != "relative":
+        raise UserError(f"policy=scripted: moves by task.action.mode=relative, not {env.task['action']['mode']}")
+    table = env.describe()["observations"]["actor"]
+    start = {name: part.start for name, part in observations.slices(table).items()}
+    torque, vz, command = start["joint_torque"], start["object_velocity"] + 2, start["force_command"]
+    way, closing = approach(env.hand), np.zeros(env.num_actions)
+    for k in env.hand.others:
+        turned = list(env.hand.fingers[k].flexion[:2])
+        closing[turned] = rate * way[turned]
+    for k in env.hand.opposing:
+        finger = env.hand.fingers[k]
+        for j in finger.joints:
+            closing[j] = (0.8 if j in finger.flexion else 1.0) * rate * way[j]
+    step = torch.as_tensor(closing, dtype=torch.float32, device=env.device)
+    age = torch.zeros(env.num_envs, device=env.device)
+
+    def policy(obs: Mapping) -> torch.Tensor:
+        x = obs["actor"]
+        # a finite difference of a noisy height is exactly zero only where an episode has just begun
+        age.copy_(torch.where(x[:, vz] == 0, torch.zeros_like(age), age + env.dt))
+        light = x[:, torque : torque + env.num_actions].abs() < (0.1 + 0.6 * x[:, command])[:, None]
+        return step * (light & (age >= wait)[:, None])
+
+    return policy

@@ -28,7 +28,9 @@ TERMS = {
     "torque_worst": "ours: torque_near of the finger that is furthest off",
     "thumb_near": "ours: the thumb's force near a command of its own (task.command.thumb)",
 }
-"""Name of each reward and its words for the first screen, in the order of the kernel `rewards`."""
+"""Name of each reward and its words for the first screen."""
+AT = {name: k for k, name in enumerate(TERMS)}
+"""Row of each in what the kernel `rewards` gives."""
 METRICS = ("held", "force_error", "fingers_touching", "force_other")
 """What follows the terms: what the log shows of worlds that are `LATE`, 0 in others; then whether they are."""
 LATE = 2.0
@@ -319,23 +321,23 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     thumb = opposed(w, s, shape)
     squeeze = on_itself(w, s)
     value = Weights()
-    value[0] = force(w, s, shape)
-    value[1] = torque(w, s, shape)
-    value[2] = diff(w, s, shape)
-    value[3] = outer(w, s, shape)
-    value[4] = wp.where(is_dropped(w, s, shape), float(1.0), float(0.0))
-    value[5] = action(w, s)
-    value[6] = velocity(w, s)
-    value[7] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
-    value[8] = near(False, w, s, shape)
-    value[9] = reach(w, s, shape)
-    value[10] = at_most(squeeze / shape.f_max, 5.0)
-    value[11] = still(w, s)
-    value[12] = worst(False, w, s, shape)
-    value[13] = centre(w, s, shape)
-    value[14] = near(True, w, s, shape)
-    value[15] = worst(True, w, s, shape)
-    value[16] = thumb_near(w, s, shape)
+    value[wp.static(AT["force"])] = force(w, s, shape)
+    value[wp.static(AT["torque"])] = torque(w, s, shape)
+    value[wp.static(AT["diff"])] = diff(w, s, shape)
+    value[wp.static(AT["outer"])] = outer(w, s, shape)
+    value[wp.static(AT["termination"])] = wp.where(is_dropped(w, s, shape), float(1.0), float(0.0))
+    value[wp.static(AT["action"])] = action(w, s)
+    value[wp.static(AT["velocity"])] = velocity(w, s)
+    value[wp.static(AT["grip"])] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
+    value[wp.static(AT["force_near"])] = near(False, w, s, shape)
+    value[wp.static(AT["reach"])] = reach(w, s, shape)
+    value[wp.static(AT["self"])] = at_most(squeeze / shape.f_max, 5.0)
+    value[wp.static(AT["still"])] = still(w, s)
+    value[wp.static(AT["worst"])] = worst(False, w, s, shape)
+    value[wp.static(AT["centre"])] = centre(w, s, shape)
+    value[wp.static(AT["torque_near"])] = near(True, w, s, shape)
+    value[wp.static(AT["torque_worst"])] = worst(True, w, s, shape)
+    value[wp.static(AT["thumb_near"])] = thumb_near(w, s, shape)
     for k in range(wp.static(len(TERMS))):
         out[k, w] = weight[k] * value[k]
 

@@ -92,9 +92,9 @@ def drop(env: GraspEnv, place: torch.Tensor) -> Drops:
         aside = torch.stack([angle.cos(), angle.sin(), torch.zeros(n)], 1)  # to which gravity turns
         one, other = env.scripted_policy(RATE, WAIT), cupping(env)
         env.reset_all()
-        env.start.pose[:, :2] = over
+        env.begun.pose[:, :2] = over
         env.first_xy.copy_(over)
-        env.place(everywhere, env.start.hand, env.start.pose, env.start.velocity)
+        env.place(everywhere, env.begun.hand, env.begun.pose, env.begun.velocity)
         env.engine.refresh()
         env.read_state()
         obs, alive = env.get_observations(), everywhere.clone()

@@ -23,7 +23,7 @@ from dexsim.actuator.columns import INDEX
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.tactile.layout import hand_layout, tip_layout
-from dexsim.tasks.env import UNIT_SPAN, hand_of
+from dexsim.tasks.building import UNIT_SPAN, hand_of
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
 

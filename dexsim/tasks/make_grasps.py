@@ -20,7 +20,7 @@ from dexsim import rotation
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.hand.places import approach
-from dexsim.tasks.env import UNIT_SPAN, hand_of
+from dexsim.tasks.building import UNIT_SPAN, hand_of
 from dexsim.tasks.reach import Reach
 from dexsim.tasks.registry import task_class
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_file

@@ -6,12 +6,14 @@ Torch only, no branches on values, no allocation beyond its results: it can be p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 
 from dexsim import rotation
+from dexsim.errors import UserError
 
 ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 
@@ -146,3 +148,68 @@ def next_goal(q: torch.Tensor, axis: torch.Tensor, turn: torch.Tensor, keep_tilt
     if not keep_tilt:
         q = rotation.upright(q, axis)
     return rotation.normalize(rotation.multiply(turn.expand_as(q), q))
+
+
+def relabelled(turn: torch.Tensor) -> dict[str, Callable[[torch.Tensor], torch.Tensor]]:
+    """How rows change where an object's own frame is turned by a matrix [3, 3] in it; see `HandEnv.symmetries`."""
+
+    def orientation(six: torch.Tensor) -> torch.Tensor:
+        """Of R [N, 6]: R turn."""
+        return rotation.six_of_matrix(rotation.matrix_of_six(six) @ turn)
+
+    def relative_(row: torch.Tensor) -> torch.Tensor:
+        """Of R_object^T R_goal: turn^T that turn."""
+        if row.shape[1] != 6:
+            raise UserError("agent=ppo_symmetric: needs task.observe.orientation=6d")
+        return rotation.six_of_matrix(turn.T @ rotation.matrix_of_six(row) @ turn)
+
+    return {"relative_orientation": relative_, "object_orientation": orientation, "object_com": lambda com: com @ turn}
+
+
+def axis_and_turn(goal: Mapping[str, Any], mirror: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit vector [3] that goals are turned about, and the turn from one to the next [4]; mirror: of a mirrored hand,
+    whose goals are the mirror image of those in the settings."""
+    axis = torch.tensor([float(x) for x in goal["axis"]]) * torch.tensor([-1.0, 1.0, -1.0] if mirror else [1.0] * 3)
+    axis = axis / axis.norm()
+    return axis, rotation.about(axis, torch.tensor(math.radians(float(goal["angle"]))))
+
+
+def check(t: Mapping[str, Any]) -> None:
+    """UserError for settings of the task that no rotation can have."""
+    ends, goal, r = t["termination"], t["goal"], t["reward"]
+    what = t["observe"].get("last_action", "step")
+    if what not in ("target", "step"):
+        raise UserError(f"task.observe.last_action={what}: must be target or step")
+    if ends.get("training") is not None and not 0 < ends["training"] <= ends["distance"]:
+        raise UserError(
+            f"task.termination.training={ends['training']}: must be above 0 and at most task.termination.distance,"
+            f" {ends['distance']} m, or null for that one"
+        )
+    if len(goal["axis"]) != 3 or not sum(float(x) ** 2 for x in goal["axis"]) > 0:
+        raise UserError(f"task.goal.axis={goal['axis']}: must be three numbers, not all 0")
+    if not 0 < abs(goal["angle"]) < 180:
+        raise UserError(f"task.goal.angle={goal['angle']}: must lie in (0, 180) degrees, or be its negative")
+    if not r["epsilon"] > 0:
+        raise UserError(f"task.reward.epsilon={r['epsilon']}: must be above 0")
+    if not 0 < r["delta_rot"] < math.radians(abs(goal["angle"])):
+        raise UserError(
+            f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "
+            f"{math.radians(abs(goal['angle'])):.3g} rad, or goals are reached as they are set"
+        )
+
+
+def check_drawn_goals(t: Mapping[str, Any], palms: Sequence[str]) -> None:
+    """UserError for settings of drawn goals, and of where the palm looks, that cannot be."""
+    goal, palm, ends = t["goal"], t["palm"], t["termination"]
+    if not palm or not set(palm) <= set(palms):
+        raise UserError(f"task.palm={palm}: must be a list of {', '.join(palms)}")
+    if not goal["axes"] or not set(goal["axes"]) <= set("xyz"):
+        raise UserError(f"task.goal.axes={goal['axes']}: must be a list of x, y, z")
+    if not goal["angle"] <= goal["reach"] <= 180:
+        raise UserError(
+            f"task.goal.reach={goal['reach']}: must lie between task.goal.angle={goal['angle']} and 180 degrees"
+        )
+    if not goal["patience"] > 0:
+        raise UserError(f"task.goal.patience={goal['patience']}: must be above 0 s")
+    if not ends["lean_s"] >= 0:
+        raise UserError(f"task.termination.lean_s={ends['lean_s']}: must be 0 s or more")

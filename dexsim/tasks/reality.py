@@ -166,6 +166,9 @@ def draw(seed: int, servo: dict[str, Any], hand: Hand | None = None) -> dict[str
             "ripple_per_turn": float(rng.integers(8, 30)), "ripple_phase": u(-3.0, 3.0),
             "position_offset": u(-0.03, 0.03), "position_scale": u(0.985, 1.015),
         }  # fmt: skip
+    from dexsim.tasks import registry
+
+    tasks = {name: registry.load(where) for name, where in reversed(registry.built_in().items())}
     friction = u(0.6, 0.9)
     size = u(0.049, 0.054, 3)
     return {
@@ -189,23 +192,7 @@ def draw(seed: int, servo: dict[str, Any], hand: Hand | None = None) -> dict[str
             "dead": u(0.01, 0.04), "lsb": 0.1, "delay": u(0.015, 0.03), "hysteresis": u(0.1, 0.3),
             "hysteresis_time": u(0.05, 0.4),
         },
-        "tasks": {
-            "rotate": {
-                "randomize": {
-                    "object.size": [round(size, 4), round(size + 0.002, 4)], "object.mass": u(0.06, 0.12, 3),
-                    "object.com": [-0.02, 0.02],
-                    "object.friction": friction, "contact.stiffness": u(6000.0, 8500.0),
-                    "contact.damping_ratio": u(0.6, 0.9),
-                    "sensors.joint_bias": 0.0, "imu.delay": u(0.02, 0.05), "imu.tilt": [-0.03, 0.03],
-                },
-                "sensors": {"joint_noise": 0.001},
-            },
-            "grasp": {
-                "randomize": {"object.friction": [0.5, 1.0], "contact.stiffness": u(6000.0, 8500.0),
-                              "contact.damping_ratio": u(0.6, 0.9)},
-                "sensors": {"joint_noise": 0.001, "torque_noise": 0.01},
-            },
-        },
+        "tasks": {name: own for name, made in tasks.items() if (own := made.another_world(u, friction, size))},
     }  # fmt: skip
 
 

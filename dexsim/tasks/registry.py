@@ -154,6 +154,15 @@ def task_class(cfg: dict[str, Any], source: str = "") -> type[HandEnv]:
     return load(of_config(cfg), source)
 
 
+TERMS = {"observations", "terminations", "commands", "events"}
+"""Parts of a task's settings that its declared terms have."""
+
+
+def terms(cfg: dict[str, Any]) -> dict[str, Any]:
+    """Those parts, as the class of a resolved config's task declares them; empty of a class without terms."""
+    return task_class(cfg).declared()
+
+
 def about(made: type) -> str:
     """The first line of a task's docstring."""
     return ((made.__doc__ or "").strip().splitlines() or [""])[0]

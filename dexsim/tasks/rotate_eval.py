@@ -10,7 +10,7 @@ cap as its time, so the mean time to fall is a restricted mean. Intervals: boots
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -39,6 +39,65 @@ HEADER = (
     "Time to fall (Ave.) s",
 )
 """Columns of the paper's rotation table."""
+
+
+PALMS = ("up", "side", "down")
+"""Where the palm looks; `side`: gravity lies in the palm's plane, in any direction."""
+TOUCH = 0.1  # N on anything but fingertips that counts as touching it
+
+
+class Trials:
+    """How a rotation is evaluated, for its environment to inherit."""
+
+    def trial_facts(self) -> dict[str, torch.Tensor]:
+        """What an evaluation keeps of each trial as it begins, [N] each."""
+        return {}
+
+    def trial_counts(self) -> dict[str, torch.Tensor]:
+        """What an evaluation counts, step by step, while a trial lasts, bool [N] each."""
+        return {}
+
+    def of_trials(self, r: dict) -> dict:
+        """Further metrics of an evaluation, from the arrays [E] of its trials."""
+        return {}
+
+    def evaluate(self, policy: Policy, episodes: int = 256, seed: int = 0, progress: Progress | None = None) -> dict:
+        """Play `episodes` trials; see `evaluate`."""
+        return evaluate(self, policy, episodes, seed, progress)  # type: ignore[arg-type]  # a RotateEnv inherits it
+
+
+class TipTrials(Trials):
+    """The same of a cube held by fingertips."""
+
+    objects: Any
+    other_force: Any
+    palm: Any
+    dt: float
+
+    def trial_facts(self) -> dict[str, torch.Tensor]:
+        return {
+            "palm": self.palm,
+            "edge": 2 * self.objects.size[:, 0],
+            "mass": self.objects.mass,
+            "friction": self.objects.friction,
+        }
+
+    def trial_counts(self) -> dict[str, torch.Tensor]:
+        return {"other_steps": self.other_force > TOUCH}
+
+    def of_trials(self, r: dict) -> dict:
+        """Share of the time in which anything but fingertips touched; and every trial: its successes, seconds, end,
+        palm, edge m, mass kg, friction, seconds in which anything but fingertips touched."""
+        other = r["other_steps"] * self.dt
+        rows = zip(
+            r["successes"].tolist(), np.round(r["time"], 3).tolist(), r["end"].tolist(), r["palm"].tolist(),
+            np.round(r["edge"], 4).tolist(), np.round(r["mass"], 4).tolist(), np.round(r["friction"], 3).tolist(),
+            np.round(other, 3).tolist(), strict=True,
+        )  # fmt: skip
+        return {
+            "touched_by_others": float(other.sum() / max(r["time"].sum(), 1e-9)),
+            "trials": [[*a[:3], PALMS[a[3]], *a[4:]] for a in rows],
+        }
 
 
 @torch.inference_mode()
@@ -70,7 +129,7 @@ def evaluate(
     metrics |= _by_object(env, [r] if kept is None else [r, kept])
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
-    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.ENDS, "capped")}
+    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.end_names[:-1], "capped")}
     metrics |= env.of_trials(r)
 
     def successes(ax: Axes) -> None:
@@ -166,7 +225,8 @@ def _play(
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     count, last_step = torch.zeros(n, dtype=torch.long, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
     end_step = torch.full((n,), steps, dtype=torch.long, device=dev)
-    how = torch.full((n,), len(env.ENDS), dtype=torch.long, device=dev)
+    names = env.end_names[:-1]  # the last is the training's own cap
+    how = torch.full((n,), len(names), dtype=torch.long, device=dev)
     facts = {k: v.clone().cpu().numpy() for k, v in env.trial_facts().items()}  # the next episode writes over them
     sums: dict[str, torch.Tensor] = {}
     shown = list(range(min(SHOWN, n))) if keep_frames else []
@@ -184,7 +244,7 @@ def _play(
         last_step = torch.where(hit, k + 1, last_step)
         ended = dones.bool() & alive
         end_step = torch.where(ended, k + 1, end_step)
-        how = torch.where(ended, env.end_kind(), how)
+        how = torch.where(ended, env.ended_by(), how)
         for name, seen in env.trial_counts().items():
             sums[name] = sums.get(name, torch.zeros_like(count)) + (seen & alive)
         alive = alive & ~ended
@@ -202,7 +262,7 @@ def _play(
                 break
     out = {
         "successes": count.cpu().numpy(), "time": end_step.cpu().numpy() * dt, "last": last_step.cpu().numpy() * dt,
-        "end": np.array([*env.ENDS, "capped"])[how.cpu().numpy()], "object": which, "frames": None,
+        "end": np.array([*names, "capped"])[how.cpu().numpy()], "object": which, "frames": None,
         **facts, **{name: total.cpu().numpy() for name, total in sums.items()},
     }  # fmt: skip
     if shown:

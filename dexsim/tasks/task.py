@@ -23,13 +23,14 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
 import torch
 
 from dexsim import rotation, yaml_text
+from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 from dexsim.tasks import registry
@@ -38,6 +39,7 @@ from dexsim.tasks.scenes import BASE
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, held_poses
 from dexsim.tasks.terms import Memory, Sensing, Term, memories_of, span, terms_of
+from dexsim.tasks.watched import Watched
 
 SWITCHES = ("actor", "critic")
 STATE = (
@@ -62,6 +64,13 @@ class Task(HandEnv):
     """
 
     TAKES_OBJECTS = True
+    choices: ClassVar[Mapping[str, Sequence[Any]]] = {}
+    """Values that a setting of the task may have, by its name below `task`."""
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "object.mass": (1e-3, 5.0), "object.friction": (0.05, 3.0), "object.com": (-0.25, 0.25),
+        "object.scale": (0.05, 20.0), "contact.stiffness": (100.0, 1e5), "contact.damping_ratio": (0.0, 3.0),
+    }  # fmt: skip
+    """In what a range of `randomize` must lie; a subclass adds its own to those of its bases."""
     settings: ClassVar[Mapping[str, Any]] = {}
     weights: ClassVar[Mapping[str, float]] = {}
     randomize: ClassVar[Mapping[str, Any]] = {}
@@ -93,18 +102,16 @@ class Task(HandEnv):
         unknown = sorted(set(weights) - {t.name for t in terms["reward"]})
         if unknown:
             raise UserError(f"task {name}: weights of {', '.join(unknown)}: there is no reward of that name")
-        task["observations"] = {t.name: _observation(t) for t in terms["observe"]}
+        task |= _terms_settings(terms)
         task["rewards"] = {t.name: weights.get(t.name, t.options["weight"]) for t in terms["reward"]}
-        task["terminations"] = {t.name: True for t in terms["done"]}
         for kind, part in (("reward", "reward"), ("done", "termination"), ("metric", "metric")):
             task[part] = {t.name: dict(t.params) for t in terms[kind] if t.params}
-        task["commands"] = {
-            t.name: {"hold_s": _plain(t.options["hold_s"]), **dict.fromkeys(SWITCHES, True), **_only(t), **t.params}
-            for t in terms["command"]
-        }
-        task["events"] = {t.name: {"on": True, "every_s": _plain(t.options["every_s"]), **t.params}
-                          for t in terms["event"]}  # fmt: skip
         return out | {"task": task}
+
+    @classmethod
+    def declared(cls) -> dict[str, Any]:
+        """The settings of its terms as their decorators have them."""
+        return _terms_settings(terms_of(cls))
 
     @classmethod
     def check_deployed(cls, source: str) -> None:
@@ -119,7 +126,7 @@ class Task(HandEnv):
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
         """grasps: what `hold` begins with, instead of the hand's own held poses."""
-        self._grasps = grasps
+        self.grasps = grasps
         super().__init__(cfg, n_worlds, device, seed, engine)
 
     # -- setting up
@@ -128,26 +135,33 @@ class Task(HandEnv):
         n, dev, t = self.num_envs, self.device, self.task
         self._terms = terms_of(type(self))
         self._check_names()
+        self._check_settings()
+        self._complete()
         self._clean_read, self._is_clean = False, False
         for held in memories_of(type(self)).values():
             held.allocate(self)
         self.servo_random = ServoRandomizer(self.servo, self.sampler, BASE if self.scene.base is not None else ())
-        self._gravity = torch.tensor(self.engine.mjm.opt.gravity, dtype=torch.float32, device=dev)
-        self._sensed = [Sensing(x, t["observations"][x.name], f"task.observations.{x.name}")
-                        for x in self._terms["observe"]]  # fmt: skip
+        self.end_names = (*(x.name for x in self._terms["done"] if t["terminations"][x.name]), "nan", "time_out")
+        self.pull = torch.tensor(self.engine.mjm.opt.gravity, dtype=torch.float32, device=dev)
+        self._sensed = []
+        for x in self._terms["observe"]:
+            given = t["observations"][x.name]
+            named = {k: self._named(given[k]) for k in ("noise", "delay")}
+            self._sensed.append(Sensing(x, {**given, **named}, f"task.observations.{x.name}"))
         self._history: torch.Tensor | None = None
-        if not (isinstance(t["history"], int) and 1 <= t["history"] <= 64):
-            raise UserError(f"task.history={t['history']}: must be a whole number in [1, 64]")
         self.commands: dict[str, torch.Tensor] = {}
         self._left: dict[str, torch.Tensor] = {}
         self._due: dict[str, torch.Tensor] = {}
         for x in self._terms["event"]:
             if t["events"][x.name]["every_s"] is not None:
                 self._due[x.name] = torch.zeros(n, device=dev)
-        self.last: dict[str, torch.Tensor] = {x.name: torch.zeros(n, device=dev) for x in self._terms["metric"]}
+        self.learned = torch.zeros((), device=dev)  # control steps of each world while training, for the curriculum
+        self.last: dict[str, torch.Tensor] = {
+            x.name: torch.zeros(n, device=dev) for x in self._terms["metric"] if not x.options["now"]
+        }
         self._figures: dict[str, torch.Tensor] = {}
         if self.scene.object is not None:
-            self._set_objects()
+            self.set_objects()
         self.prepare_task()
         for x in self._terms["command"]:
             value = self._command_value(x)
@@ -157,35 +171,86 @@ class Task(HandEnv):
     def prepare_task(self) -> None:
         """Allocate what the task needs beside declared memory; called once, before the first episode."""
 
+    def adapt(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options of observations, by name, that follow from other settings of the task; what `task.observations` says
+        goes before them. May set `history`, whose setting is `task.history`."""
+        self.history = self.task["history"]
+        return {}
+
+    def _complete(self) -> None:
+        """Every term has its settings: a checkpoint may be older than a term, and a task's file need not list them."""
+        t, follow = self.task, self.adapt()
+        if not (isinstance(self.history, int) and 1 <= self.history <= 64):
+            raise UserError(f"task.history={self.history}: must be a whole number in [1, 64]")
+        every = _terms_settings(self._terms)
+        for name, more in follow.items():
+            every["observations"][name] |= more
+        for part, usual in every.items():
+            _lay(usual, dict.get(t, part) or {})
+            t[part] = Watched(usual, f"task.{part}", t.read)
+
+    def _named(self, value: Any) -> Any:
+        """A value, or the one of the setting of the task that it names."""
+        if not isinstance(value, str):
+            return value
+        node: Any = self.task
+        for part in value.split("."):
+            node = node[part]
+        return node
+
+    def _check_settings(self) -> None:
+        for owner in reversed(type(self).__mro__):
+            for name, (low, high) in vars(owner).get("ranges", {}).items():
+                if name in self.sampler.ranges:
+                    self.sampler.check(name, low, high)
+        c = self.task.get("curriculum") or {"steps": 0, "start": 1.0}
+        if not (c["steps"] >= 0 and 0 <= c["start"] <= 1):
+            raise UserError(f"task.curriculum={c}: steps must be 0 (none) or more, start must lie in [0, 1]")
+        for name, known in self.choices.items():
+            group, _, key = name.rpartition(".")
+            owner = self.task.get(group, {}) if group else self.task  # older checkpoints lack some
+            if (value := owner.get(key, known[0])) not in known:
+                raise UserError(f"task.{name}={_word(value)}: must be {' or '.join(map(_word, known))}")
+
     def _check_names(self) -> None:
         t, known = self.task, {kind: [x.name for x in terms] for kind, terms in self._terms.items()}
         parts = (("observations", "observe"), ("terminations", "done"), ("commands", "command"), ("events", "event"))
         for part, kind in parts:
-            for name in t.get(part) or {}:
+            for name in dict.get(t, part) or {}:
                 if name not in known[kind]:
                     raise UserError(f"task.{part}.{name}: there is no such term; there are"
                                     f" {', '.join(known[kind]) or 'none'}")  # fmt: skip
 
-    def _set_objects(self) -> None:
+    def set_objects(self) -> None:
+        """Find which rows of the scene's table are trained on, and how likely each is: every shape as likely as any,
+        whatever the number of its baked sizes, in training times its `task.objects.emphasis`."""
         t, dev = self.task, self.device
-        train, held = t["objects"]["train"], t["objects"]["held_out"]
         names = [v.shape.name for v in self.objects.scene.variants]
-        rows = [torch.tensor([i for i, x in enumerate(names) if x in group], device=dev) for group in (train, held)]
-        self._rows_of = rows
-        # every shape is equally likely, whatever the number of its baked sizes
+        groups = t["objects"]["train"], t["objects"]["held_out"]
+        self.train_rows, self.held_rows = (
+            torch.tensor([i for i, x in enumerate(names) if x in group], dtype=torch.long, device=dev)
+            for group in groups
+        )
         self._odds = torch.tensor([1.0 / names.count(x) for x in names], device=dev)
+        emphasis = t["objects"].get("emphasis", {})
+        for name, times in emphasis.items():
+            if name not in library() or not 0 < times <= 100:
+                raise UserError(
+                    f"task.objects.emphasis: {name}: {times}: must name a shape ({', '.join(library())}) and be above"
+                    " 0, at most 100"
+                )
+        self.emphasis = torch.tensor([float(emphasis.get(x, 1.0)) for x in names], device=dev)
         self.judge_kept_out(False)
-        for name, low, high in (
-            ("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.com", -0.25, 0.25),
-            ("object.scale", 0.05, 20.0), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
-        ):  # fmt: skip
-            self.sampler.check(name, low, high)
 
     def judge_kept_out(self, kept_out: bool) -> None:
         """Episodes begin with objects kept out of the training from now on, or with those of it."""
-        self._rows = self._rows_of[kept_out]
-        odds = self._odds[self._rows]
-        self._chances = (odds / odds.sum()).cumsum(0)
+        self.draw_from(self.held_rows) if kept_out else self.draw_from(self.train_rows, self.emphasis)
+
+    def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
+        """Objects of new episodes are drawn from these rows of the scene's table [R]: every shape equally often, or by
+        its emphasis (one number a row of the table)."""
+        weight = self._odds[rows] if emphasis is None else (self._odds * emphasis)[rows]
+        self._rows, self._chances = rows, (weight / weight.sum()).cumsum(0)
 
     # -- what terms read
     # ---------------------------------------------------------------------------------------------------------
@@ -233,11 +298,11 @@ class Task(HandEnv):
                 own = self.__dict__[held.name]
                 own.masked_fill_(mask.view(-1, *(1,) * (own.dim() - 1)), 0)
         if self.scene.object is not None:
-            self._draw_object(mask)
+            self.draw_object(mask)
         self.touch.randomize(mask, self.rng)
         self.servo_random.draw(mask)
         gravity = self.engine.field("opt.gravity")
-        torch.where(mask[:, None], self._gravity.to(gravity.dtype), gravity, out=gravity)
+        torch.where(mask[:, None], self.pull.to(gravity.dtype), gravity, out=gravity)
         self.begin(mask)
         if self._terms["command"] or self._terms["event"]:  # which may ask where things are now
             self.engine.refresh()
@@ -257,15 +322,23 @@ class Task(HandEnv):
         else:
             self.start(mask)
 
-    def _draw_object(self, mask: torch.Tensor) -> None:
+    def draw_object(self, mask: torch.Tensor) -> None:
+        """Draw the object of new episodes: which, how large, what of."""
         s = self.sampler
         pick = torch.searchsorted(self._chances, s.uniform()).clamp(max=len(self._chances) - 1)
         scale = self.unit * s.draw("object.scale")[:, None].expand(-1, 3)
+        if "object.aspect" in s.ranges:
+            scale = scale * s.draw("object.aspect", 3)
+        self.draw_physics()
+        self.give_object(mask, self._rows[pick], scale.contiguous())
+
+    def draw_physics(self) -> None:
+        """Draw what the next `give_object` gives beside shape and size."""
+        s = self.sampler
         self._physics = {
             "mass": s.draw("object.mass"), "com": s.draw("object.com", 3), "friction": s.draw("object.friction"),
             "stiffness": s.draw("contact.stiffness"), "damping_ratio": s.draw("contact.damping_ratio"),
         }  # fmt: skip
-        self.give_object(mask, self._rows[pick], scale.contiguous())
 
     def give_object(self, mask: torch.Tensor, row: torch.Tensor, scale: torch.Tensor) -> None:
         """Where mask holds: an object by its row [N] of the scene's table, of `scale` [N, 3] times its shape's size
@@ -320,11 +393,11 @@ class Task(HandEnv):
         """Where mask holds: a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its edge
         is `randomize.object.size`, m. Returns its pose [N, 7]."""
         s = self.sampler
-        if self._grasps is None:
+        if self.grasps is None:
             edges = [self.unit * x for x in s.range("object.size")[:2]]
             with torch.inference_mode(False):
-                self._grasps = held_poses(self.hand, self.task["initial"]["poses"]).within(*edges).to(self.device)
-        g, box = self._grasps, torch.full((1,), self.shape_names.index(CUBE), device=self.device)
+                self.grasps = held_poses(self.hand, self.task["initial"]["poses"]).within(*edges).to(self.device)
+        g, box = self.grasps, torch.full((1,), self.shape_names.index(CUBE), device=self.device)
         pick = (s.uniform() * len(g)).long().clamp(max=len(g) - 1)
         row = torch.full_like(pick, self.shape_names.index(CUBE))
         nominal = self.objects.primitive_size(box, torch.ones(1, 3, device=self.device))
@@ -347,7 +420,11 @@ class Task(HandEnv):
         self._left[name].copy_(torch.where(mask, held, self._left[name]))
 
     def before_physics(self) -> None:
-        """Commands that are held long enough change; events that are due happen."""
+        """Ranges widen; commands that are held long enough change; events that are due happen."""
+        c = self.task.get("curriculum") or {"steps": 0}
+        if c["steps"]:
+            self.learned += 1
+            self.sampler.width.copy_((c["start"] + (1 - c["start"]) * self.learned / c["steps"]).clamp(max=1.0))
         for x in self._terms["command"]:
             low, _ = span(self.task["commands"][x.name]["hold_s"], f"task.commands.{x.name}.hold_s")
             if low != float("inf"):
@@ -375,6 +452,18 @@ class Task(HandEnv):
         term.method(self, now, **self._params("events", term))
         due.copy_(torch.where(now, wait, due))
 
+    def end_curriculum(self) -> None:
+        """From now on all ranges whole (evaluation)."""
+        self.learned.fill_(float((self.task.get("curriculum") or {"steps": 0})["steps"]))
+        self.sampler.width.fill_(1.0)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return super().state_dict() | {"learned": self.learned.clone()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.learned.copy_(state.get("learned", self.learned))
+        super().load_state_dict(state)
+
     def push(self, force: torch.Tensor) -> None:
         """Pull at the object with a force [N, 3] N, in the world, from now until it is changed or an episode begins."""
         applied = self.engine.t.xfrc_applied
@@ -389,8 +478,8 @@ class Task(HandEnv):
         """A term's arguments as the settings have them."""
         if not term.params:
             return {}
-        given = self.task[part][term.name]
-        return {name: given[name] for name in term.params}
+        given = self.task.get(part, {}).get(term.name, {})
+        return {name: given.get(name, usual) for name, usual in term.params.items()}
 
     def terminated(self) -> dict[str, torch.Tensor]:
         """The ends that are switched on."""
@@ -421,59 +510,78 @@ class Task(HandEnv):
 
     def _judge(self, ends: dict, terms: dict) -> tuple[torch.Tensor, torch.Tensor]:
         judged = super()._judge(ends, terms)
-        for name, value in self._figures.items():
-            self.last[name].copy_(torch.where(self.done, torch.nan_to_num(value), self.last[name]))
+        for name, held in self.last.items():
+            held.copy_(torch.where(self.done, torch.nan_to_num(self._figures[name]), held))
         return judged
 
     def figure_units(self) -> dict[str, str]:
-        return {x.name: x.unit for x in self._terms["metric"]}
+        return {x.name: x.unit for x in self._terms["metric"] if x.name in self.last}
 
     def metrics(self) -> dict[str, torch.Tensor]:
-        return {f"task/{name}": value.mean() for name, value in self.last.items()}
+        return {f"task/{name}": value.mean() for name, value in (self._figures | self.last).items()}
 
     # -- observations
     # ------------------------------------------------------------------------------------------------------------
+    def mirror_signs(self) -> torch.Tensor | None:
+        """From the rows that say so (`observe(mirror=)`); None where none does."""
+        rows = [x for x in self._sensed if self._named(self.task["observations"][x.term.name]["actor"])]
+        if not any(x.term.options["mirror"] for x in rows):
+            return None
+        signs: list[int] = []
+        for x in rows:
+            pattern = x.term.options["mirror"] or (1,)
+            signs += [pattern[k % len(pattern)] for k in range(x.width)] * x.frames
+        told = sum(v.shape[1] for k, v in self.commands.items() if self.task["commands"][k]["actor"])
+        return torch.tensor((signs + [1] * told) * self.history, dtype=torch.float32, device=self.device)
+
+    def sense(self, fresh: torch.Tensor) -> None:
+        """Move sensors of the task's own on by a control step, before its observations; fresh [N]: an episode
+        begins."""
+
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
         fresh = self._episode_length == 0
+        if advance:
+            self.sense(fresh)
         actor, critic = [], []
         told = [(x.name, self.task["commands"][x.name]) for x in self._terms["command"]]
         for row in self._sensed:
-            given = self.task["observations"][row.term.name]
-            if not (given["actor"] or given["critic"]):
-                continue
-            self._clean_read = False
-            self._is_clean = False
-            value = self._value(row)
-            if row.width == 0:
-                row.width, row.twice = value.shape[1], self._clean_read
-            if given["actor"]:
+            given, value = self.task["observations"][row.term.name], None
+            if self._named(given["actor"]):
+                self._clean_read = False
+                value = self._value(row, "width")
+                row.twice = self._clean_read
                 actor.append(row(value, self, fresh, advance))
-            if given["critic"]:
-                if row.twice:
+            if self._named(given["critic"]):
+                if value is None or row.twice:
                     self._is_clean = True
-                    value = self._value(row)
+                    value = self._value(row, "clean_width")
                     self._is_clean = False
+                row.clean_width = value.shape[1]
                 critic.append(value)
         actor += [self.commands[name] for name, given in told if given["actor"]]
         critic += [self.commands[name] for name, given in told if given["critic"]]
         if not actor:
             raise UserError(f"task {self.task['name']}: the actor sees nothing; declare or switch on a row")
         seen = torch.where(self.nan[:, None], 0.0, torch.cat(actor, 1))
-        if self.task["history"] > 1:
+        if self.history > 1:
             seen = self._with_past(seen, fresh, advance)
         return {"actor": seen, "critic": torch.nan_to_num(torch.cat(critic, 1)) if critic else seen}
 
-    def _value(self, row: Sensing) -> torch.Tensor:
-        value = row.term.method(self, **row.params)
-        value = _columns(value, self.num_envs, f"observation {row.term.name}").float()
-        if row.width and value.shape[1] != row.width:
-            raise UserError(f"observation {row.term.name}: had {row.width} numbers, now {value.shape[1]}")
+    def _value(self, row: Sensing, width: str) -> torch.Tensor:
+        value, name = row.term.method(self, **row.params), row.term.name
+        if isinstance(value, Mapping):
+            parts = {k: _columns(v, self.num_envs, f"observation {name}, {k}") for k, v in value.items()}
+            row.parts, value = {k: v.shape[1] for k, v in parts.items()}, torch.cat(list(parts.values()), 1)
+        value = _columns(value, self.num_envs, f"observation {name}").float()
+        if getattr(row, width) not in (0, value.shape[1]):
+            raise UserError(f"observation {name}: had {getattr(row, width)} numbers, now {value.shape[1]}")
+        setattr(row, width, value.shape[1])
         return value
 
     def _with_past(self, now: torch.Tensor, fresh: torch.Tensor, advance: bool) -> torch.Tensor:
         if self._history is None:
             with torch.inference_mode(False):
-                self._history = torch.zeros(len(now), self.task["history"], now.shape[1], device=self.device)
+                self._history = torch.zeros(len(now), self.history, now.shape[1], device=self.device)
         moved = torch.cat([now[:, None], self._history[:, :-1]], 1)
         moved = torch.where(fresh[:, None, None], now[:, None].expand_as(moved), moved)
         if advance:
@@ -505,15 +613,16 @@ class Task(HandEnv):
             seen = [row.unit or "1", row.term.text, f"noise {row.noise:g}" if row.noise else ""]
             seen += [f"{row.delay[0]:g}-{row.delay[1]:g} s old" if row.delay[1] else ""]
             seen += [f"{100 * row.dropout:g} % lost" if row.dropout else ""]
-            if given["actor"]:
-                groups["actor"].append((row.term.name, row.width * row.frames * t["history"],
-                                        "; ".join(x for x in seen if x)))  # fmt: skip
-            if given["critic"]:
-                groups["critic"].append((row.term.name, row.width, "; ".join(x for x in (*seen[:2], "clean") if x)))
+            for group, times, width in (("actor", row.frames * self.history, row.width),
+                                        ("critic", 1, row.clean_width)):  # fmt: skip
+                if self._named(given[group]):
+                    text = "; ".join(x for x in (seen if group == "actor" else (*seen[:2], "clean")) if x)
+                    parts = row.parts or {row.term.name: width}
+                    groups[group] += [(name, times * wide, text) for name, wide in parts.items() if wide]
         for x in self._terms["command"]:
             for group in SWITCHES:
                 if t["commands"][x.name][group]:
-                    wide = self.commands[x.name].shape[1] * (t["history"] if group == "actor" else 1)
+                    wide = self.commands[x.name].shape[1] * (self.history if group == "actor" else 1)
                     groups[group].append((x.name, wide, f"{x.unit or '1'}; {x.text or 'command'}"))
         if not groups["critic"]:
             groups["critic"] = groups["actor"]
@@ -524,9 +633,13 @@ class Task(HandEnv):
             "rewards": [row for row in self.reward_rows() if row[1]],
             "terminations": [*ends, *self.usual_ends()],
             "randomization": self.sampler.rows(),
-            "notes": self.hand_notes(),
+            "notes": [*self.notes(), *self.hand_notes()],
             "headline": [f"task/{name}" for name in list(self.last)[:3]],
         }
+
+    def notes(self) -> list[str]:
+        """What else a reader of the first screen must know of the task."""
+        return []
 
 
 def _columns(value: torch.Tensor, n: int, what: str) -> torch.Tensor:
@@ -535,6 +648,19 @@ def _columns(value: torch.Tensor, n: int, what: str) -> torch.Tensor:
         shape = list(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
         raise UserError(f"{what}: gives {shape}, must be a tensor [{n}] or [{n}, ...], one row for each world")
     return value[:, None] if value.dim() == 1 else value.flatten(1)
+
+
+def _terms_settings(terms: Mapping[str, list[Term]]) -> dict[str, dict[str, Any]]:
+    """The settings of terms as their decorators have them."""
+    return {
+        "observations": {t.name: _observation(t) for t in terms["observe"]},
+        "terminations": {t.name: True for t in terms["done"]},
+        "commands": {
+            t.name: {"hold_s": _plain(t.options["hold_s"]), **dict.fromkeys(SWITCHES, True), **_only(t), **t.params}
+            for t in terms["command"]
+        },
+        "events": {t.name: {"on": True, "every_s": _plain(t.options["every_s"]), **t.params} for t in terms["event"]},
+    }
 
 
 def _observation(term: Term) -> dict[str, Any]:
@@ -551,6 +677,11 @@ def _only(term: Term) -> dict[str, bool]:
     return {} if only is None else {s: s == only for s in SWITCHES}
 
 
+def _word(value: Any) -> str:
+    """A value as it is typed."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
@@ -562,7 +693,7 @@ def _start() -> dict[str, Any]:
 
 def _lay(onto: dict[str, Any], over: Mapping[str, Any]) -> None:
     """Lay nested settings over others, in place; ranges and lists as wholes."""
-    for key, value in over.items():
+    for key, value in dict.items(over) if isinstance(over, dict) else over.items():  # of watched ones, none is read
         mine = onto.get(key)
         if isinstance(value, Mapping) and isinstance(mine, dict) and "log" not in (*value, *mine):
             _lay(mine, value)

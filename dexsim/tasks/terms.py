@@ -22,17 +22,19 @@ import torch
 
 from dexsim.errors import UserError
 
-Method = TypeVar("Method", bound=Callable[..., torch.Tensor])
+Method = TypeVar("Method", bound=Callable[..., Any])
 Span = float | tuple[float, float]
 """A number, or the ends of a range from which each episode draws."""
+VECTOR, SIX = (1, -1, 1), (1, -1, 1, -1, 1, -1)
+"""Signs of a mirror image: of a vector in the palm frame, of the first two columns of a rotation matrix."""
 KINDS = ("observe", "reward", "done", "command", "event", "metric")
 _MARK = "_dexsim_term"
 
 
 @dataclass(frozen=True)
 class Term:
-    """A declared term. name: the method's; text: what it is (the first line of its docstring); options: what its
-    decorator was given; params: its keyword arguments with their defaults."""
+    """A declared term. name: the method's, or the one that it was given; text: what it is (the first line of its
+    docstring); options: what its decorator was given; params: its keyword arguments with their defaults."""
 
     kind: str
     name: str
@@ -43,17 +45,20 @@ class Term:
     params: dict[str, Any] = field(default_factory=dict)
 
 
-def _declare(kind: str, method: Callable[..., Any], unit: str, options: dict[str, Any]) -> Any:
+def _declare(
+    kind: str, method: Callable[..., Any], unit: str, options: dict[str, Any], name: str | None = None
+) -> Any:
     text = ((method.__doc__ or "").strip().splitlines() or [""])[0]
     params, skip = {}, {"event": 2}.get(kind, 1)
-    for k, (name, p) in enumerate(inspect.signature(method).parameters.items()):
+    for k, (argument, p) in enumerate(inspect.signature(method).parameters.items()):
         if k < skip:
             continue
         if p.default is inspect.Parameter.empty:
-            raise UserError(f"term {method.__name__}: its argument {name} needs a default: the setting's usual value")
-        else:
-            params[name] = p.default
-    term = Term(kind, method.__name__, method, unit, text.rstrip("."), options, params)
+            raise UserError(
+                f"term {method.__name__}: its argument {argument} needs a default: the setting's usual value"
+            )
+        params[argument] = p.default
+    term = Term(kind, name or method.__name__, method, unit, text.rstrip("."), options, params)
     setattr(method, _MARK, term)
     return method
 
@@ -61,48 +66,61 @@ def _declare(kind: str, method: Callable[..., Any], unit: str, options: dict[str
 def observe(
     unit: str = "",
     *,
-    noise: float = 0.0,
-    delay: Span = 0.0,
+    noise: float | str = 0.0,
+    delay: Span | str = 0.0,
     dropout: float = 0.0,
     frames: int = 1,
     only: Literal["actor", "critic"] | None = None,
     real: str | None = None,
+    name: str | None = None,
+    mirror: tuple[int, ...] | None = None,
 ) -> Callable[[Method], Method]:
-    """Declare a row of the observation: [N] or [N, ...], flattened.
+    """Declare a row of the observation: [N] or [N, ...], flattened; or several, by name, of one method.
 
     What the actor sees passes through value -> noise -> delay -> dropout -> frames; the critic sees the value. A method
     that reads `self.clean`, or touch, is computed for each: touch is clean for the critic.
 
     Args:
         unit: of the value, for the tables.
-        noise: standard deviation of what is added to each number and control step, in `unit`.
-        delay: s that a reading is old; a pair: drawn anew for each episode.
+        noise: standard deviation of what is added to each number and control step, in `unit`; text: the setting of the
+            task that has it, "sensors.joint_noise".
+        delay: s that a reading is old; a pair: drawn anew for each episode; text as above.
         dropout: share of the readings that do not arrive; the one before stays.
         frames: how many of the last readings are seen, the newest first.
         only: who sees it; None: both.
         real: what provides it on a real hand, one of `dexsim.tasks.signals.REAL`, where the method itself cannot be
             computed from what a hand measures.
+        mirror: signs by which its numbers change where hand and world are mirrored (palm y to -y), repeated:
+            `VECTOR` of places and speeds in the palm frame, `SIX` of a 6D orientation; None: they stay.
+        name: of the row, where the method's would hide something of the environment.
     """
-    given = {"noise": noise, "delay": delay, "dropout": dropout, "frames": frames, "only": only, "real": real}
+    given = {"noise": noise, "delay": delay, "dropout": dropout, "frames": frames, "only": only, "real": real,
+             "mirror": mirror}  # fmt: skip
     if callable(unit):
         raise UserError(f'term {getattr(unit, "__name__", "?")}: write @observe("unit"), with the unit of its value')
-    return lambda method: _declare("observe", method, unit, given)
+    return lambda method: _declare("observe", method, unit, given, name)
 
 
 @overload
 def reward(weight: Method) -> Method: ...
 @overload
-def reward(weight: float = 1.0) -> Callable[[Method], Method]: ...
-def reward(weight: Any = 1.0) -> Any:
+def reward(weight: float = 1.0, *, name: str | None = None) -> Callable[[Method], Method]: ...
+def reward(weight: Any = 1.0, *, name: str | None = None) -> Any:
     """Declare a term of the reward, [N]; weight: what a control step's value is multiplied by. 0 leaves it out."""
     if callable(weight):
         return _declare("reward", weight, "", {"weight": 1.0})
-    return lambda method: _declare("reward", method, "", {"weight": weight})
+    return lambda method: _declare("reward", method, "", {"weight": weight}, name)
 
 
-def done(method: Method) -> Method:
+@overload
+def done(method: Method) -> Method: ...
+@overload
+def done(*, name: str) -> Callable[[Method], Method]: ...
+def done(method: Any = None, *, name: str | None = None) -> Any:
     """Declare an end of the episode, bool [N]."""
-    return _declare("done", method, "", {})
+    if method is not None:
+        return _declare("done", method, "", {})
+    return lambda method: _declare("done", method, "", {}, name)
 
 
 def command(unit: str = "", *, hold_s: Span = float("inf"), only: Literal["actor", "critic"] | None = None) -> Any:
@@ -120,10 +138,10 @@ def event(when: Method | Literal["reset"] = "reset", *, every_s: Span | None = N
     return lambda method: _declare("event", method, "", {"every_s": every_s})
 
 
-def metric(unit: str = "") -> Callable[[Method], Method]:
+def metric(unit: str = "", *, now: bool = False, name: str | None = None) -> Callable[[Method], Method]:
     """Declare a figure of an episode, [N], a running value: the log shows that of the worlds' last ended episodes, and
-    an evaluation its mean over episodes with an interval."""
-    return lambda method: _declare("metric", method, unit, {})
+    an evaluation its mean over episodes with an interval. now: the log shows the mean over worlds as they are."""
+    return lambda method: _declare("metric", method, unit, {"now": now}, name)
 
 
 def terms_of(made: type) -> dict[str, list[Term]]:
@@ -160,6 +178,8 @@ class Sensing:
         self.delay = span(given["delay"], f"{where}.delay")
         self.params = {k: given[k] for k in term.params}
         self.width = 0  # of the value, known once it was computed
+        self.clean_width = 0  # of what the critic sees
+        self.parts: dict[str, int] = {}  # of a method of several rows: their widths by name
         self.twice = False  # whether actor and critic get values of their own
         self.lag: torch.Tensor | None = None  # [N] control steps
         self.past: torch.Tensor | None = None  # [N, L, D] readings, newest first, before delay
@@ -229,10 +249,23 @@ def _number(value: Any, where: str, low: float, high: float) -> float:
     return float(value)
 
 
+Size = int | Callable[[Any], int]
+
+
+def joints(env: Any) -> int:
+    """How many joints the hand of an environment has: a size of `memory`."""
+    return int(env.num_actions)
+
+
+def fingers(env: Any) -> int:
+    """How many fingers, likewise."""
+    return int(env.fingers)
+
+
 class Memory:
     """A tensor [N, ...] of a task that one control step leaves to the next; see `memory`. Assigning copies into it."""
 
-    def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, reset: bool):
+    def __init__(self, shape: tuple[Size, ...], dtype: torch.dtype, reset: bool):
         self.shape, self.dtype, self.reset = shape, dtype, reset
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -248,12 +281,14 @@ class Memory:
 
     def allocate(self, env: Any) -> None:
         """Zeros for all worlds of an environment."""
-        env.__dict__[self.name] = torch.zeros(env.num_envs, *self.shape, dtype=self.dtype, device=env.device)
+        shape = [size if isinstance(size, int) else size(env) for size in self.shape]
+        env.__dict__[self.name] = torch.zeros(env.num_envs, *shape, dtype=self.dtype, device=env.device)
 
 
-def memory(*shape: int, dtype: torch.dtype = torch.float32, reset: bool = True) -> Any:
+def memory(*shape: Size, dtype: torch.dtype = torch.float32, reset: bool = True) -> Any:
     """Declare a tensor [N, *shape] that lives from step to step, `turned = memory()`; zero where an episode begins,
-    unless `reset` is False. Kept in checkpoints; `self.turned = ...` copies into it."""
+    unless `reset` is False. Kept in checkpoints; `self.turned = ...` copies into it. A size may be a function of the
+    environment, as `joints` and `fingers` are."""
     return Memory(shape, dtype, reset)
 
 
