@@ -9,14 +9,14 @@ from typing import Any
 from dexsim.errors import UserError
 
 MODELS = ("MLPModel", "RNNModel", "CNNModel")
+PARTS = ("actor", "critic", "student", "teacher")
 DISTRIBUTIONS = ("GaussianDistribution", "HeteroscedasticGaussianDistribution", "BetaDistribution")
 ALLOWED: dict[str, tuple[str, ...]] = {
-    "class_name": ("OnPolicyRunner",),
-    "actor.class_name": MODELS,
-    "critic.class_name": MODELS,
-    "actor.distribution_cfg.class_name": DISTRIBUTIONS,
-    "critic.distribution_cfg.class_name": DISTRIBUTIONS,
-    "algorithm.class_name": ("PPO",),
+    "class_name": ("OnPolicyRunner", "DistillationRunner"),
+    **{f"{part}.class_name": MODELS for part in PARTS},
+    **{f"{part}.distribution_cfg.class_name": DISTRIBUTIONS for part in PARTS},
+    "algorithm.class_name": ("PPO", "Distillation"),
+    "algorithm.symmetry_cfg.data_augmentation_func": ("dexsim.learning.symmetry:augmented",),
     "logger": ("tensorboard",),  # the others send what they log to another machine
 }
 """Settings below `agent` that name code, and the names that need no typing; a setting that is not here has none."""

@@ -16,7 +16,7 @@ from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
 from dexsim.errors import UserError
-from dexsim.learning import names
+from dexsim.learning import names, teacher
 
 Policy = Callable[[TensorDict], torch.Tensor]  # observations -> actions [N, A]
 
@@ -33,6 +33,7 @@ def agent_config(
     if not isinstance(agent, dict):
         raise UserError(f"{where}: agent is {type(agent).__name__}, must be a group of settings")
     names.check(agent, typed, where)
+    agent.get("teacher", {}).pop("checkpoint", None)
     agent["seed"], agent["save_interval"] = cfg["seed"], cfg["save_interval"]
     if agent.get("check_for_nan") is None:
         agent["check_for_nan"] = device == "cpu"
@@ -86,10 +87,14 @@ def load_policy(
     """
     agent = agent_config(data["config"], str(env.device), typed, path)
     with agent_errors():
-        kind, settings = resolve_class(agent["actor"])
-        actor = kind(env.get_observations(), agent["obs_groups"], "actor", env.num_actions, **settings).to(env.device)
+        acts = teacher.parts(agent)[0]
+        kind, settings = resolve_class(agent[acts])
+        actor = kind(env.get_observations(), agent["obs_groups"], acts, env.num_actions, **settings).to(env.device)
+    weights = data["actor"]
+    if hasattr(env, "hand") and env.hand.mirror != bool(data["config"].get("hand_mirror")):
+        weights = mirrored(weights, env, path)
     try:
-        actor.load_state_dict(data["actor"])
+        actor.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: its policy does not fit this environment ({reason})") from None
@@ -113,6 +118,24 @@ def action_noise(actor: dict[str, torch.Tensor]) -> torch.Tensor | None:
     """Standard deviation [A] of a trained actor's actions, by its state; None where it depends on what it sees."""
     own = {k.rsplit(".", 1)[-1]: v for k, v in actor.items() if k.startswith("distribution.")}
     return own["log_std_param"].exp() if "log_std_param" in own else own.get("std_param")
+
+
+def mirrored(weights: dict[str, torch.Tensor], env: Any, path: str) -> dict[str, torch.Tensor]:
+    """Return the weights of the policy that does with the mirrored hand of `env` what these do with the other one:
+    its joints turn as their mirror images do, so that only what is seen changes sign, which the first layer and the
+    running mean take up. Raises UserError where the task does not say what changes."""
+    signs = env.mirror_signs()
+    if signs is None:
+        raise UserError(
+            f"{path}: trained with the mirror image of this hand, and task {env.task['name']} does not say how its"
+            " rows change in a mirror: @observe(mirror=...)"
+        )
+    out = dict(weights)
+    for name, value in weights.items():
+        first = name == "mlp.0.weight" and not any("weight_ih_l0" in k for k in weights)
+        if (first or "weight_ih_l0" in name or name == "obs_normalizer._mean") and value.shape[-1] == len(signs):
+            out[name] = value * signs.to(value.device)
+    return out
 
 
 def by_episode(actor: Any, env: Any) -> Any:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.learning import checkpoint, names, weights_and_biases
+from dexsim.learning import checkpoint, names, teacher, weights_and_biases
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import agent_config, agent_errors, by_episode, scale_first_actions
 from dexsim.learning.ranks import Ranks, seed_all
@@ -59,8 +59,13 @@ class Runner(OnPolicyRunner):
         # Networks of noisy gradients do not need the last bits of a product; the update takes a quarter less time
         # (H200).
         torch.backends.cuda.matmul.allow_tf32 = bool(cfg.get("tf32", True))
+        taught = teacher.fill(cfg)
         with agent_errors():
             super().__init__(env, agent_config(cfg, device, typed), log_dir=None, device=device)
+        if taught is not None:
+            teacher.give(self.alg, taught)
+        # what acts and what helps it to learn; in a checkpoint "actor" and "critic"
+        self._parts = [getattr(self.alg, f"_raw_{part}") for part in teacher.parts(cfg["agent"])]
         scale_first_actions(self.alg.get_policy(), cfg.get("first_actions", 1.0))
         self.iteration, self.steps = 0, 0
         # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
@@ -185,7 +190,7 @@ class Runner(OnPolicyRunner):
 
     def _buffers(self) -> list[torch.Tensor]:
         """Return what the networks keep beside weights: the observations' running normalization."""
-        return [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers()]
+        return [b for part in self._parts for b in part.buffers()]
 
     def _worlds(self) -> dict[str, torch.Tensor]:
         return self.env.keep_worlds() | self._meter.state()
@@ -233,21 +238,14 @@ class Runner(OnPolicyRunner):
     def _finite(self) -> bool:
         """Return whether the weights and the observations' running normalization are finite."""
         weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
-        weights += [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers() if b.is_floating_point()]
+        weights += [b for b in self._buffers() if b.is_floating_point()]
         return bool(torch.stack([w.isfinite().all() for w in weights]).all())
 
     def _first_not_finite(self) -> str:
         """Name of the first weights that are not finite."""
-        state = self.alg.save()
-        return next(
-            (
-                f"{part}.{name}"
-                for part in ("actor", "critic")
-                for name, w in state[f"{part}_state_dict"].items()
-                if not bool(w.isfinite().all())
-            ),
-            "the optimizer's",
-        )
+        named = zip(teacher.parts(self.cfg), self._parts, strict=True)
+        weights = ((f"{kind}.{name}", w) for kind, part in named for name, w in part.state_dict().items())
+        return next((name for name, w in weights if not bool(w.isfinite().all())), "the optimizer's")
 
     def _config(self) -> dict[str, Any]:
         """Return the config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked
@@ -261,7 +259,7 @@ class Runner(OnPolicyRunner):
 
     def payload(self) -> dict[str, Any]:
         """Return the everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
-        learned = self.alg.save()
+        actor, critic = (part.state_dict() for part in self._parts)
         return {
             "kind": "train",
             "config": self._config(),
@@ -270,9 +268,9 @@ class Runner(OnPolicyRunner):
             "layout": self._layout,
             "iteration": self.iteration,
             "steps": self.steps,
-            "actor": learned["actor_state_dict"],
-            "critic": learned["critic_state_dict"],
-            "optimizer": learned["optimizer_state_dict"],
+            "actor": actor,
+            "critic": critic,
+            "optimizer": self.alg.optimizer.state_dict(),
             "env": self.env.state_dict(),
             "rng": checkpoint.rng_state(),
         } | ({"worlds": self._worlds()} if self.saves_worlds else {})
@@ -288,15 +286,9 @@ class Runner(OnPolicyRunner):
             raise UserError(f"{path}: holds only a policy, nothing to resume; use the last.pt of its run folder")
         checkpoint.check_layout(data, self._layout, path)
         try:
-            self.alg.load(
-                {
-                    "actor_state_dict": data["actor"],
-                    "critic_state_dict": data["critic"],
-                    "optimizer_state_dict": data["optimizer"],
-                },
-                None,
-                True,
-            )
+            kinds = zip(teacher.parts(self.cfg), (data["actor"], data["critic"]), strict=True)
+            states = {f"{kind}_state_dict": state for kind, state in kinds}
+            self.alg.load(states | {"optimizer_state_dict": data["optimizer"]}, None, True)
         except Exception as error:  # torch's optimizers meet a wrong state with any of Python's exceptions
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path}: does not fit the networks of this run ({reason})") from None
