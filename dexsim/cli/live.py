@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import threading
+import time
 import webbrowser
 from pathlib import Path
 from typing import Any
 
 from dexsim.cli.start import Start
+from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import Policy, load_policy, plain_policy
 
+PROGRESS = "progress.csv"
 PLAIN = ("scripted", "zero", "random")  # policies that need no checkpoint
 
 
@@ -20,6 +25,7 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     play = start.play
     source = None if start.source is None else Path(start.source)
     files = {} if source is None else {p.name: p for p in beside(source)}
+    run = Run(source, files) if source is not None and (source.parent / PROGRESS).is_file() else None
 
     def load(name: str) -> Policy:
         if name in files:
@@ -31,7 +37,9 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     choices = [*files, *(n for n in PLAIN if n != "scripted" or hasattr(env, "scripted_policy"))]
     name = source.name if source is not None else str(play["policy"])
     host, port = str(play["view_host"]), int(play["view_port"])
-    view = LiveView(env, policy, name, choices, load, host, port)
+    view = LiveView(env, policy, name, choices, load, host, port, run)
+    if play["view_while"] is not None:
+        threading.Thread(target=_end_with, args=(int(play["view_while"]), view), daemon=True).start()
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
     asked = f"/?token={view.token}" if view.token else ""
     print(f"view     http://{name}:{view.port}{asked}   (Ctrl-C ends)", flush=True)
@@ -50,6 +58,48 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     finally:
         view.stop()
     return 0
+
+
+def _end_with(process: int, view: Any) -> None:
+    """Stop the view once its parent is another process than this."""
+    while os.getppid() == process:
+        time.sleep(0.5)
+    view.stop()
+
+
+class Run:
+    """The training that a checkpoint is of, by its folder; see `dexsim.view.live.Followed`. files: of the page, by
+    name; checkpoints that are saved later are added."""
+
+    def __init__(self, source: Path, files: dict[str, Path]):
+        self.newest, self._folder, self._files = source.name, source.parent, files
+        self._stamp = self._time()
+
+    def _time(self) -> float:
+        path = self._folder / self.newest
+        return path.stat().st_mtime if path.is_file() else 0.0
+
+    def names(self) -> list[str]:
+        """Checkpoints by iteration, then the newest policy."""
+        kept = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
+        kept.sort(key=lambda p: int(p.stem.removeprefix("model_")))
+        self._files.update({p.name: p for p in kept})
+        return [*(p.name for p in kept if p.name != self.newest), self.newest]
+
+    def changed(self) -> bool:
+        """Whether the newest policy was saved again."""
+        before, self._stamp = self._stamp, self._time()
+        return self._stamp != before
+
+    def panel(self) -> str:
+        """What progress.csv says."""
+        from dexsim.view.live_panels import training
+        from dexsim.view.plots import read_progress
+
+        try:
+            return training(read_progress(self._folder / PROGRESS))
+        except (OSError, ValueError, UserError):  # in the middle of a line
+            return ""
 
 
 def beside(source: Path) -> list[Path]:

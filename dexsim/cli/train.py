@@ -13,6 +13,7 @@ from dexsim.cli import build, folder, machine
 from dexsim.cli.console import TrainingLines
 from dexsim.cli.replay import replay
 from dexsim.cli.start import Start
+from dexsim.cli.watch import Watch
 from dexsim.console import program
 from dexsim.console.stop import Stop
 from dexsim.console.tables import count, duration
@@ -81,7 +82,10 @@ def _run(
     said = typing(str(cfg["task"]["class"])) if "class" in cfg["task"] else ""
     resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}{said}"
     ranks.on_loss(f"continue: {resume}")
-    log = Log(runner, where, start) if ranks.leader else None
+    watch = Watch(cfg, where) if ranks.leader and cfg.get("view") else None
+    if watch is not None:
+        open_.callback(watch.end)
+    log = Log(runner, where, start, watch) if ranks.leader else None
     stop.gently = True
     try:
         finished = runner.learn(cfg["iterations"], log.iteration if log else lambda row: None, stop.asked)
@@ -137,8 +141,8 @@ def _final_episodes(runner: Runner, cfg: dict[str, Any], where: Path) -> int:
 class Log:
     """Where an iteration's numbers go: the writer (TensorBoard), progress.csv, the console; and when to save."""
 
-    def __init__(self, runner: Runner, where: Path, start: Start) -> None:
-        self._runner, self._where, self._every = runner, where, start.cfg["save_interval"]
+    def __init__(self, runner: Runner, where: Path, start: Start, watch: Watch | None = None) -> None:
+        self._runner, self._where, self._every, self._watch = runner, where, start.cfg["save_interval"], watch
         times = f"{runner.ranks.size} x " if runner.ranks.size > 1 else ""
         self._title = f"{start.cfg['choices']['task']}, {times}{start.cfg['worlds']} worlds, {where}"
         self._writer = runner.open_writer(where)
@@ -170,6 +174,8 @@ class Log:
             checkpoint.write(self._where / name, data)
         checkpoint.save(self._where / "policy.pt", checkpoint.policy_only(payload))
         self._saved_at, self._saved_time = self._runner.iteration, time.perf_counter()
+        if self._watch is not None:
+            self._watch.begin()
 
     def finish(self) -> None:
         """Save what is not saved yet, close the writer, draw the curves, sum up."""

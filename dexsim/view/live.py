@@ -10,12 +10,11 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-import socket
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -35,6 +34,8 @@ MOST_STEPS = 1000  # asked for and not yet taken
 MOST_FAILED_DRAWS = 100  # in a row, before the view gives up
 SCENE_HZ, PANEL_HZ = 30.0, 8.0
 LIFT = 4e-4  # m, taxels are drawn this much above the skin
+RUN_S = 2.0  # between two looks at a training's folder
+MOST_CHECKPOINTS = 10**6
 FULL_TAXEL = 0.25  # N, darkest colour until more was felt
 
 
@@ -52,6 +53,22 @@ class Wishes:
     changed: threading.Event = field(default_factory=threading.Event)
 
 
+class Followed(Protocol):
+    """A training, seen from its folder."""
+
+    newest: str
+    """Name of the policy that it saves over and over."""
+
+    def names(self) -> list[str]:
+        """Names of its checkpoints, the oldest first, the newest policy last."""
+
+    def changed(self) -> bool:
+        """Whether the newest policy is another than when this was last asked."""
+
+    def panel(self) -> str:
+        """HTML: how it learns."""
+
+
 class LiveView:
     """One environment, one policy, one page.
 
@@ -60,6 +77,7 @@ class LiveView:
         policy: observations to actions [N, 12]. name: its name among `choices`.
         choices: names of policies to switch to. load: name to policy; may raise UserError, which the page then shows.
         host, port: where to serve. Raises UserError where that cannot be.
+        run: the training that the policies are of: its checkpoints come to the page as they are saved.
     """
 
     def __init__(
@@ -71,12 +89,14 @@ class LiveView:
         load: Callable[[str], Policy],
         host: str,
         port: int,
+        run: Followed | None = None,
     ) -> None:
         viser: Any = importlib.import_module("viser")  # slow to load
 
-        _check_free(host, port)
+        live_gate.check_free(host, port)
         self.env, self.policy, self.name, self._load = env, policy, name, load
-        self.wishes = Wishes()
+        self.wishes, self._run = Wishes(), run
+        self._asked_run = 0.0
         self.fingers = list(env.hand.finger_names)
         self._map = panels.TaxelMap(env.touch.layout)
         self._full_taxel, self._full_force, self._full_reward = (
@@ -97,6 +117,7 @@ class LiveView:
         # its banner; the address is ours to say
         with contextlib.redirect_stdout(io.StringIO()), live_gate.gated(self.gate):
             self.server = viser.ViserServer(host=host, port=port, label="dexsim", verbose=False)
+        self._names: list[str] = []
         self._nodes: dict[int, Any] = {}
         self._object: list[Any] = []
         self._lay_out(choices)
@@ -144,6 +165,7 @@ class LiveView:
                 disabled=self.env.num_envs == 1,
             )
             policy = gui.add_dropdown("policy", choices, initial_value=self.name)
+            at = gui.add_slider("checkpoint", min=0, max=1, step=1, initial_value=1, visible=self._run is not None)
             own = gui.add_checkbox("own command", initial_value=False, visible=hasattr(self.env, "fixed_command"))
             command = gui.add_slider(
                 "command",
@@ -162,6 +184,9 @@ class LiveView:
                 self._map.image(np.zeros(self.env.touch.layout.area.shape), 1.0), format="png", visible=feels
             )
             self._forces = gui.add_html("")
+        with gui.add_folder("Training", visible=self._run is not None):
+            self._training = gui.add_html("")
+        self._policy_choice, self._checkpoint, self._choices = policy, at, choices
         with gui.add_folder("Rewards"):
             self._reward_html = gui.add_html("")
         self._pause = pause
@@ -176,6 +201,7 @@ class LiveView:
                     (speed, live_gate.one_of(SPEEDS)),
                     (world, live_gate.number(0, max(self.env.num_envs - 1, 1))),
                     (policy, live_gate.one_of(choices)),
+                    (at, live_gate.number(0, MOST_CHECKPOINTS)),
                     (command, live_gate.number(0, 1)),
                 )
             },
@@ -210,6 +236,13 @@ class LiveView:
         def _(_: Any) -> None:
             w.policy = policy.value if policy.value in choices else None
             w.changed.set()
+
+        @at.on_update
+        def _(_: Any) -> None:
+            names = self._names
+            if names:
+                w.policy = names[int(min(max(at.value, 0), len(names) - 1))]
+                w.changed.set()
 
         @own.on_update
         @command.on_update
@@ -326,6 +359,27 @@ class LiveView:
         }
         return rows | ({"": self._message} if self._message else {})
 
+    def _follow(self) -> None:
+        """Bring what the run has saved and logged since to the page: a slider position for each checkpoint, the last
+        for the newest policy, which is played anew as it changes."""
+        now = time.perf_counter()
+        if self._run is None or now - self._asked_run < RUN_S:
+            return
+        self._asked_run = now
+        names, at = self._run.names(), self._checkpoint
+        if names != self._names and names:
+            last = at.value >= len(self._names) - 1
+            self._names = names
+            self._choices[:] = [*reversed(names), *(x for x in self._choices if x not in names)]
+            self._policy_choice.options = tuple(self._choices)
+            at.max = max(len(names) - 1, 1)
+            if last:
+                at.value = len(names) - 1
+        if self._run.changed() and self.name == self._run.newest:
+            with contextlib.suppress(UserError):
+                self.policy = self._load(self.name)
+        self._training.content = self._run.panel()
+
     # -- the loop
     # ----------------------------------------------------------------------------------------------------------------
     def _keep_rewards(self) -> dict[str, torch.Tensor]:
@@ -335,12 +389,14 @@ class LiveView:
     def run(self, seconds: float | None = None) -> None:
         """Step and draw until Ctrl-C (or for `seconds`, or until `stop`)."""
         env, w = self.env, self.wishes
+        self._asked_run = 0.0
         end = None if seconds is None else time.perf_counter() + seconds
         drawn = shown_at = 0.0
         due = time.perf_counter()
         with torch.no_grad():
             obs = env.get_observations()
             while not self._stopped.is_set() and (end is None or time.perf_counter() < end):
+                self._follow()
                 if self._obey():
                     obs = env.get_observations()
                     self.draw(panels_too=True)
@@ -417,17 +473,3 @@ def _lighter(rgba: tuple[float, float, float, float]) -> tuple[float, float, flo
     """Return a black hand shows no form in a browser's plain light: dark colours are lifted."""
     r, g, b = (c + 0.16 * (1 - c) ** 2 for c in rgba[:3])
     return r, g, b
-
-
-def _check_free(host: str, port: int) -> None:
-    """Raise UserError where nothing can be served at host:port."""
-    try:
-        family, kind, proto, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, proto) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        raise UserError(
-            f"view_host={host} view_port={port}: cannot serve there ({error.strerror or error}); choose another"
-            " view_port="
-        ) from None

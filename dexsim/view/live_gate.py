@@ -10,11 +10,14 @@ import ipaddress
 import logging
 import math
 import secrets
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+
+from dexsim.errors import UserError
 
 MOST_CLIENTS = 24
 """Pages open at once; one more is told to wait."""
@@ -196,9 +199,8 @@ def number(low: float, high: float) -> Callable[[Any], bool]:
 
 
 def one_of(choices: Any) -> Callable[[Any], bool]:
-    """Return whether a value is one of these texts."""
-    known = frozenset(choices)
-    return lambda v: isinstance(v, str) and v in known
+    """Return whether a value is one of these texts, as they are when it comes."""
+    return lambda v: isinstance(v, str) and v in choices
 
 
 def truth(v: Any) -> bool:
@@ -247,3 +249,17 @@ def _query_token(path: str) -> str:
 def _same(a: str, b: str) -> bool:
     # a header's bytes that are no text come as halves of characters
     return hmac.compare_digest(a.encode("utf-8", "surrogatepass"), b.encode("utf-8", "surrogatepass"))
+
+
+def check_free(host: str, port: int) -> None:
+    """Raise UserError where nothing can be served at host:port."""
+    try:
+        family, kind, proto, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, proto) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise UserError(
+            f"view_host={host} view_port={port}: cannot serve there ({error.strerror or error}); choose another"
+            " view_port="
+        ) from None

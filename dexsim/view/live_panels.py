@@ -126,6 +126,36 @@ def reward_bars(terms: Mapping[str, float], totals: Mapping[str, float], full: f
     )
 
 
+def training(rows: Mapping[str, Sequence[float]]) -> str:
+    """Return how a run learns: facts of its last iteration, then by term the mean reward of a control step over all
+    worlds, as a line over the iterations. rows: columns of progress.csv by name."""
+    if not rows or not rows.get("iteration"):
+        return facts({"": "no iteration yet"})
+    known = {k: [x for x in v if np.isfinite(x)] for k, v in rows.items()}  # no episode ends in some iterations
+    last = {k: v[-1] for k, v in known.items() if v}
+    said = {"iteration": f"{last['iteration']:.0f}", "steps": f"{last['steps']:.3g}"}
+    said |= {k: f"{last[k]:.4g}" for k in ("reward", "length") if k in last}
+    said |= {k.removeprefix("task/").replace("_", " "): f"{v:.4g}" for k, v in last.items() if k.startswith("task/")}
+    terms = {k.removeprefix("reward/"): v for k, v in known.items() if k.startswith("reward/") and v}
+    lines = [_row(name, _line(values), _signed(values[-1], 4)) for name, values in terms.items()]
+    return facts(said) + _block("training", "reward of a step by term, over the iterations", lines)
+
+
+def _line(values: Sequence[float]) -> str:
+    """A curve as SVG, its whole range high."""
+    y = np.nan_to_num(np.asarray(values, float))
+    y = y[:: max(1, len(y) // 120)]
+    low, high = float(y.min()), float(y.max())
+    points = " ".join(
+        f"{100 * k / max(len(y) - 1, 1):.1f},{10 - 9 * (v - low) / max(high - low, 1e-12):.2f}" for k, v in enumerate(y)
+    )
+    return (
+        '<svg viewBox="0 0 100 11" preserveAspectRatio="none" style="position:absolute;width:100%;height:100%">'
+        f'<polyline points="{points}" fill="none" stroke="{BAR}" stroke-width="1" vector-effect="non-scaling-stroke"/>'
+        "</svg>"
+    )
+
+
 def facts(rows: Mapping[str, object]) -> str:
     """Names and values, two columns."""
     cells = "".join(
