@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 """Before NumPy is loaded, here and in programs that tests start. Its threads wait for each other by spinning: where
@@ -43,3 +50,51 @@ def pytest_collection_finish(session) -> None:
     gc.collect()
     gc.freeze()
     gc.unfreeze = lambda: None
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory) -> Path:
+    """Return the wheel, built from a copy so that nothing is left in the repository."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    shutil.copytree(ROOT / "dexsim", source / "dexsim", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "checkpoints", source / "checkpoints")
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "--wheel-dir",
+        out,
+        source,
+    ]
+    subprocess.run(command, check=True)
+    (made,) = out.glob("dexsim-*.whl")
+    return made
+
+
+@pytest.fixture(scope="session")
+def installed(wheel, tmp_path_factory) -> Path:
+    """Return the `bin` folder of a fresh environment with this wheel, and the dependencies of the one that runs the
+    tests."""
+    home = tmp_path_factory.mktemp("fresh")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True)
+    python = home / "bin" / "python"
+    subprocess.run(
+        [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel],
+        check=True,
+    )
+    ask = [python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"]
+    own = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
+    theirs = sorted({sysconfig.get_paths()[k] for k in ("purelib", "platlib")})
+    # their .pth files, this checkout among them, are not read
+    (own / "dependencies.pth").write_text("\n".join(theirs) + "\n")
+    return home / "bin"

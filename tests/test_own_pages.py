@@ -1,14 +1,15 @@
-"""The code of the pages on a driver and an effect of one's own, out of the page into an empty folder."""
+"""The code of the pages on a task, a driver, an effect and a reader of one's own: out of the page, beside an installed
+wheel, in an empty folder outside the checkout."""
 
 from __future__ import annotations
 
-import os
+import json
+import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from fresh import call, provide
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK = '''
@@ -30,45 +31,83 @@ class Still(Task):
     def one(self):
         return torch.ones(self.num_envs)
 '''
+GYM = """
+import gymnasium
+import dexsim.gym
+
+batch = gymnasium.make("dexsim/CatchIt-v0", num_envs=3, device="cpu", settings=["preset=none"])
+seen = batch.reset(seed=1)[0]
+assert len(seen) == 3 and batch.step(batch.action_space.sample())[1].shape == (3,)
+one = gymnasium.make("dexsim/CatchIt-v0", device="cpu", settings=["preset=none"])
+assert one.reset(seed=1)[0].shape == seen.shape[1:]
+"""
 
 
 def code_of(page: str) -> str:
-    return re.search(r"```python\n(.*?)```", (ROOT / "docs" / "howto" / page).read_text(encoding="utf-8"), re.S)[1]
-
-
-def provide(folder: Path, group: str, line: str) -> None:
-    """What pip leaves of an installed package: its entry points."""
-    made = folder / "mine-1.0.dist-info"
-    made.mkdir()
-    (made / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (made / "entry_points.txt").write_text(f"[{group}]\n{line}\n")
-
-
-def run(folder: Path, *words: str) -> str:
-    env = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
-    done = subprocess.run([sys.executable, "-m", "dexsim", *words], cwd=folder, capture_output=True, text=True, env=env)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    return done.stdout
+    return re.search(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.S)[1]
 
 
 @pytest.mark.slow
-def test_a_driver_of_ones_own(tmp_path):
-    (tmp_path / "my_hand.py").write_text(code_of("own_driver.md"))
+def test_a_task_of_ones_own(installed, tmp_path):
+    """By the commands of the page; then as an installed package's, by name, in gymnasium too."""
+    page = (ROOT / "docs" / "tutorials" / "own_task.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(from dexsim.tasks import Task, done.*?)```", page, re.S)[1]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 40
+    (tmp_path / "catch_it.py").write_text(code)
+    own = "task=catch_it:CatchIt"
+
+    def run(*words):
+        return call(installed, tmp_path, "dexsim", *words)
+
+    run("train", "worlds=4", "iterations=2", "device=cpu", "final_episodes=0", "out=run", own)
+    said = run("play", "checkpoint=run/policy.pt", "episodes=4", "device=cpu", "video=false", "out=play", own)
+    assert "height_at_the_end" in said and (tmp_path / "play" / "metrics.json").is_file()
+    assert "largest difference 0 over" in run("export", "checkpoint=run/policy.pt", "out=bundle", own)
+    (tmp_path / "catch_it.py").unlink()
+    provide(installed, "catch_it.py", code, "dexsim.tasks", "catch_it = catch_it:CatchIt")
+    assert "catch_it" in run("tasks")
+    run("play", "checkpoint=run/policy.pt", "episodes=4", "device=cpu", "video=false", "out=again")
+    call(installed, tmp_path, "python", "-c", GYM)
+
+
+@pytest.mark.slow
+def test_a_driver_of_ones_own(installed, tmp_path):
+    provide(installed, "my_hand.py", code_of("howto/own_driver.md"), "dexsim.drivers",
+            "my_hand = my_hand:MyHand")  # fmt: skip
     (tmp_path / "still.py").write_text(TASK)
-    provide(tmp_path, "dexsim.drivers", "my_hand = my_hand:MyHand")
     own = "task=still:Still"
-    run(tmp_path, "train", own, "worlds=2", "iterations=1", "device=cpu", "final_episodes=0", "out=run",
-        "agent.num_steps_per_env=8")  # fmt: skip
-    run(tmp_path, "export", "checkpoint=run/policy.pt", own, "out=bundle", "steps=4")
+    call(installed, tmp_path, "dexsim", "train", own, "worlds=2", "iterations=1", "device=cpu", "final_episodes=0",
+         "out=run", "agent.num_steps_per_env=8")  # fmt: skip
+    call(installed, tmp_path, "dexsim", "export", "checkpoint=run/policy.pt", own, "out=bundle", "steps=4")
     for name in ("my_hand", "my_hand:MyHand"):
-        said = run(tmp_path, "deploy", "bundle=bundle", f"driver={name}", "seconds=0.5", "record=none", "settle=0.1",
-                   "late=5", "stale=5", "hang=5", "overruns=1000")  # fmt: skip
+        said = call(installed, tmp_path, "dexsim", "deploy", "bundle=bundle", f"driver={name}", "seconds=0.5",
+                    "record=none", "settle=0.1", "late=5", "stale=5", "hang=5", "overruns=1000")  # fmt: skip
         assert "ended    done after" in said and "my hand" in said
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own(tmp_path):
-    (tmp_path / "run_in.py").write_text(code_of("own_effect.md"))
-    provide(tmp_path, "dexsim.effects", "run_in = run_in:RunIn")
-    said = run(tmp_path, "diagnose", "demo=coulomb_friction", "effects=[run_in,coulomb_friction]", "out=found")
+def test_an_effect_of_ones_own(installed, tmp_path):
+    provide(installed, "run_in.py", code_of("howto/own_effect.md"), "dexsim.effects", "run_in = run_in:RunIn")
+    said = call(installed, tmp_path, "dexsim", "diagnose", "demo=coulomb_friction",
+                "effects=[run_in,coulomb_friction]", "out=found")  # fmt: skip
     assert "coulomb_friction" in said and (tmp_path / "found" / "diagnosis.json").is_file()
+
+
+@pytest.mark.slow
+def test_a_reader_of_ones_own(installed, tmp_path):
+    provide(installed, "lab_files.py", code_of("howto/own_reader.md"), "dexsim.readers",
+            "lab = lab_files:LabFiles")  # fmt: skip
+    rows = [{"joints": ["shoulder", "elbow"]}]
+    for k in range(300):
+        goal = [40 * math.sin(0.02 * k), 30 + 20 * math.sin(0.02 * k + 1)]
+        late = [40 * math.sin(0.02 * (k - 4)), 30 + 20 * math.sin(0.02 * (k - 4) + 1)]
+        rows.append({"ms": 10 * k, "goal": goal, "angle": late})
+    (tmp_path / "run.lab").write_text("\n".join(map(json.dumps, rows)) + "\n")
+    said = call(installed, tmp_path, "dexsim", "audit", "run.lab")
+    assert "shoulder" in said and "elbow" in said
+    call(installed, tmp_path, "dexsim", "convert", "run.lab", "out=run.mcap")
+    assert (tmp_path / "run.mcap").is_file()
+    (tmp_path / "run.lab").write_text('{"joints": ["shoulder"]}\n{"ms": 1}\n')
+    with pytest.raises(AssertionError, match="run.lab") as error:
+        call(installed, tmp_path, "dexsim", "audit", "run.lab")
+    assert "Traceback" not in str(error.value)

@@ -8,7 +8,6 @@ import importlib.metadata
 import json
 import os
 import runpy
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fresh import call
 
 from dexsim.cli.main import COMMANDS, dispatch, first_screen
 from dexsim.console import program
@@ -72,61 +72,6 @@ def test_hints_name_what_was_typed(monkeypatch):
         assert program.words(text) == said
     monkeypatch.setattr(sys, "argv", ["train.py"])
     assert program.torchrun("train", 2) == "torchrun --nproc_per_node=2 train.py"
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Return the wheel, built from a copy so that nothing is left in the repository."""
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    shutil.copytree(ROOT / "dexsim", source / "dexsim", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "checkpoints", source / "checkpoints")
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--no-build-isolation",
-        "--wheel-dir",
-        out,
-        source,
-    ]
-    subprocess.run(command, check=True)
-    (made,) = out.glob("dexsim-*.whl")
-    return made
-
-
-@pytest.fixture(scope="module")
-def installed(wheel, tmp_path_factory) -> Path:
-    """Return the `bin` folder of a fresh environment with this wheel, and the dependencies of the one that runs the
-    tests."""
-    home = tmp_path_factory.mktemp("fresh")
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True)
-    python = home / "bin" / "python"
-    subprocess.run(
-        [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel],
-        check=True,
-    )
-    ask = [python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"]
-    own = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
-    theirs = sorted({sysconfig.get_paths()[k] for k in ("purelib", "platlib")})
-    # their .pth files, this checkout among them, are not read
-    (own / "dependencies.pth").write_text("\n".join(theirs) + "\n")
-    return home / "bin"
-
-
-def call(installed: Path, folder: Path, *argv: str | Path) -> str:
-    """Return what a command of the fresh environment says, run in a folder."""
-    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    done = subprocess.run(
-        [installed / argv[0], *argv[1:]], cwd=folder, capture_output=True, text=True, timeout=600, env=clean
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    return done.stdout
 
 
 @pytest.mark.slow
