@@ -130,10 +130,8 @@ def typing(where: str) -> str:
 
 
 def _imported(where: str, about: str) -> type[HandEnv]:
-    from dexsim.tasks.env import HandEnv
-
     made = door.load(where, about)
-    if not (isinstance(made, type) and issubclass(made, HandEnv)):
+    if not (isinstance(made, type) and hasattr(made, "check_deployed")):  # what every HandEnv has
         raise UserError(f"{about}: {where.partition(':')[2]} is no task: derive it from dexsim.tasks.Task")
     return made
 
