@@ -24,12 +24,16 @@ def steps(env, count: int) -> list[dict]:
     return [env.step(still)[0] for _ in range(count)]
 
 
+def rows(env):
+    return env.describe()["observations"]["actor"]
+
+
 def test_without_touch_the_actor_lacks_its_rows_and_the_critic_does_not():
     felt, blind = grasp_env(*FEW), grasp_env(*FEW, "task.observe.touch=false")
-    names = [row[0] for row in blind.describe()["observations"]["actor"]]
-    assert [row[0] for row in felt.describe()["observations"]["actor"] if row[0] not in names] == ["contact_force", "contact_centre"]
+    names = [row[0] for row in rows(blind)]
+    assert [row[0] for row in rows(felt) if row[0] not in names] == ["contact_force", "contact_centre"]
     a, b = steps(felt, 2)[-1], steps(blind, 2)[-1]
-    assert b["actor"].shape[1] == sum(row[1] for row in blind.describe()["observations"]["actor"]) == a["actor"].shape[1] - 4 * felt.pads
+    assert b["actor"].shape[1] == sum(row[1] for row in rows(blind)) == a["actor"].shape[1] - 4 * felt.pads
     assert b["critic"].shape == a["critic"].shape
     assert ["contact_force" in [r[0] for r in blind.describe()["observations"][k]] for k in ("actor", "critic")] == [
         False, True]  # fmt: skip
