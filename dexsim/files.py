@@ -12,6 +12,7 @@ import socket
 import stat
 import time
 import zipfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,8 +100,8 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
-    if odd := [n for n in names if names.count(n) > 1 or not n.endswith(".npy")]:
-        raise UserError(f"its entry '{odd[0]}' is there twice, or is no array (.npy)")
+    if odd := next((n for n, count in Counter(names).items() if count > 1 or not n.endswith(".npy")), ""):
+        raise UserError(f"its entry '{odd}' is there twice, or is no array (.npy)")
     with np.load(path, allow_pickle=False) as stored:
         try:
             return {str(k): stored[k] for k in stored.files}

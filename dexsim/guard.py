@@ -31,6 +31,7 @@ import re
 import signal
 import stat
 import sys
+import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -41,7 +42,7 @@ from dexsim import system, typed
 from dexsim.errors import UserError
 
 T = TypeVar("T")
-SECONDS, BYTES = 6.0, 1 << 30
+SECONDS, BYTES = 4.0, 1 << 30
 """Processor time and memory of a call."""
 SECONDS_A_MIB, TIMES_SIZE = 3.0, 16
 """What is added for a file's size: s a MiB, and bytes a byte."""
@@ -125,7 +126,7 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         if spent != used or not asleep:
             used, moved = spent, now
         if now - moved > WAITING_S:
-            return LOCKED if system.at_lock(pid) else WAITS
+            return LOCKED if threading.active_count() > 1 else WAITS
         if now - begun > wall:
             return f"takes more than {wall:.0f} s to read"
     try:

@@ -174,15 +174,6 @@ def at_work(pid: int) -> tuple[bool, int]:
     return fields[0] == "S", int(fields[11]) + int(fields[12])
 
 
-def at_lock(pid: int) -> bool:
-    """Return whether a process that sleeps may wait for another thread, and not for a file."""
-    try:
-        where = Path(f"/proc/{pid}/wchan").read_text()
-    except OSError:
-        return True
-    return where in ("", "0") or "futex" in where  # "0": not to be known here
-
-
 def crashed(status: int) -> bool:
     """Return whether an exit status says that a process was brought down by its driver."""
     return status in _CRASHES

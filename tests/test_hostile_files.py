@@ -119,6 +119,16 @@ def test_a_class_that_a_checkpoint_names_is_neither_imported_nor_called(payload,
     assert not trap.exists() and "trap" not in sys.modules
 
 
+@pytest.mark.parametrize("sizes", [[10**9] * 3, [16_384] * 9, [], "x", [0.5]])
+def test_a_network_that_no_memory_holds_is_not_built(payload, sizes):
+    from dexsim.learning import ppo
+
+    big = copy.deepcopy(payload["config"])
+    big["agent"]["actor"]["hidden_dims"] = sizes
+    with pytest.raises(UserError, match="x.pt: agent.actor.hidden_dims"):
+        ppo.agent_config(big, "cpu", where="x.pt")
+
+
 def test_a_class_that_the_user_types_is_used(payload, trap, tmp_path, capsys):
     """play.py with the checkpoint refuses; the same with the name typed calls it."""
     evil = copy.deepcopy(payload)

@@ -10,10 +10,9 @@ from typing import Any
 
 from dexsim import typed
 from dexsim.errors import UserError
+from dexsim.learning import names
 
 INF = math.inf
-MOST_LAYERS, MOST_UNITS = 32, 16_384
-"""Of a network."""
 # setting: (lowest, highest, whole number?); a missing or null setting is not checked
 LIMITS: dict[str, tuple[float, float, bool]] = {
     "worlds": (1, 1 << 20, True),
@@ -62,12 +61,8 @@ def check(cfg: dict[str, Any]) -> None:
             f"sim.control_period={period}: must be a multiple of sim.timestep={step}, e.g."
             f" {max(round(period / step), 1) * step:g}"
         )
-    for key in ("agent.actor.hidden_dims", "agent.critic.hidden_dims"):
-        sizes = get(cfg, key)
-        if sizes is not None and (not isinstance(sizes, list) or not 1 <= len(sizes) <= MOST_LAYERS):
-            raise UserError(f"{key}={sizes}: must be a list of 1 to {MOST_LAYERS} whole numbers, e.g. [512,256,128]")
-        for size in sizes or ():
-            typed.number(key, size, 1, MOST_UNITS, exact=True)
+    if isinstance(agent := cfg.get("agent"), dict):
+        names.check_sizes(agent)
     worlds, steps = cfg.get("worlds"), get(cfg, "agent.num_steps_per_env")
     batches = get(cfg, "agent.algorithm.num_mini_batches")
     if worlds and steps and batches and worlds * steps < 2 * batches:

@@ -33,7 +33,9 @@ def agent_config(
     if not isinstance(agent, dict):
         raise UserError(f"{where}: agent is {type(agent).__name__}, must be a group of settings")
     names.check(agent, typed, where)
-    agent.get("teacher", {}).pop("checkpoint", None)
+    names.check_sizes(agent, "agent" if where == "agent settings" else f"{where}: agent")
+    if isinstance(agent.get("teacher"), dict):
+        agent["teacher"].pop("checkpoint", None)
     agent["seed"], agent["save_interval"] = cfg["seed"], cfg["save_interval"]
     if agent.get("check_for_nan") is None:
         agent["check_for_nan"] = device == "cpu"

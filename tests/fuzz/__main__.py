@@ -1,11 +1,11 @@
-"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [processes=1] [out=FOLDER]`:
-damaged files without end.
+"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [start=0] [processes=1]
+[out=FOLDER]`: damaged files without end.
 
 Each case has a limit of 20 s and 2 GiB of memory, what its readers take included; one that is taken must be taken as it
 stands, or something said of it (`silence.py`). What breaks is kept in out= (out/fuzz) with its
 seed; `python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke.
 kind=ci: every third a recording, as continuous integration runs it. from=source: a seed that is read off the code of
-dexsim and of these tests, new after each change and nobody's choice.
+dexsim and of these tests, new after each change and nobody's choice; start=N begins N seeds later.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ SECONDS, BYTES = 20.0, 2 << 30
 KIB = 1024 if sys.platform == "linux" else 1
 """Bytes that `ru_maxrss` counts in."""
 BATCH = 200
+MADE = ("model", "robot")  # of a schema, not of files
 CI = [k for a, b in zip(OTHERS[::2], OTHERS[1::2], strict=True) for k in ("recording", a, b)]
 """Kinds in turn."""
 
@@ -182,15 +183,16 @@ def source_seed() -> int:
 
 def main(argv: list[str]) -> int:
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if set(given) - {"minutes", "cases", "kind", "from", "processes", "out"} or any("=" not in a for a in argv):
+    if set(given) - {"minutes", "cases", "kind", "from", "start", "processes", "out"} or any("=" not in a for a in argv):
         print(__doc__)
         return 2
-    kinds = given.get("kind", ",".join(targets.TARGETS)).split(",")
-    kinds = CI if kinds == ["ci"] else kinds
     until = time.monotonic() + 60 * float(given.get("minutes", 60))
     with tempfile.TemporaryDirectory() as folder:
         files = corpus.build(Path(folder))  # once, and with it what reading them needs is loaded before the forks
+        kinds = given["kind"].split(",") if "kind" in given else [k for k in targets.TARGETS if k in {*files, *MADE}]
+        kinds = CI if kinds == ["ci"] else kinds
         first = source_seed() if given.get("from") == "source" else int(given.get("from", 0))
+        first += int(given.get("start", 0))
         print(f"from={first}", flush=True)
         run = Run(kinds, first, int(given.get("cases", 10**12)), Path(given.get("out", "out/fuzz")), files)
         run.go(int(given.get("processes", 1)), until)

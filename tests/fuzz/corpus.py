@@ -182,11 +182,60 @@ def build(folder: Path) -> dict[str, list[Path]]:
     (folder / "overrides.txt").write_text("\n".join(OVERRIDES))
     out |= {
         "object": objects(folder),
+        "network": [folder / "bundle" / "policy.onnx"],
         "checkpoint": [folder / "checkpoint.pt"],
         "manifest": [folder / "bundle" / "manifest.yaml"],
         "overrides": [folder / "overrides.txt"],
     }
+    with contextlib.suppress(ImportError):  # without pyarrow, h5py or zarr
+        out["dataset"] = data_sets(folder / "sets")
     return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
+
+
+def data_sets(folder: Path) -> list[Path]:
+    """Return a bag of SQLite, an HDF5 file, a Zarr archive, a LeRobot folder and a dictionary of tensors."""
+    import h5py
+    import torch
+    import zarr
+    from pyarrow import parquet, table
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as BagWriter
+    from rosbags.typesys import Stores, get_typestore
+
+    from dexsim.recording import cdr
+
+    folder.mkdir(exist_ok=True)
+    t = np.arange(0, 1, 0.02)
+    x = np.stack([0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t)], 1)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with BagWriter(folder / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        topics = [bag.add_connection(n, schema.JOINT_STATE, typestore=store) for n in (schema.STATES, schema.COMMANDS)]
+        for i, q in enumerate(x):
+            ns = 10**18 + i * 20_000_000
+            for topic in topics:
+                bag.write(topic, ns, cdr.joint_state(ns, JOINTS, q, None, q))
+    (folder / "bag" / "bag.db3").rename(folder / "bag.db3")
+    with h5py.File(folder / "aloha.h5", "w") as file:
+        file.attrs["fps"] = 50
+        for name in ("observations/qpos", "action"):
+            file.create_dataset(name, data=x, chunks=(10, 2), compression="gzip")
+    with zarr.storage.ZipStore(folder / "rig.zarr.zip", mode="w") as zipped:
+        group = zarr.create_group(zipped, attributes={"fps": 50, "joint_names": list(JOINTS)})
+        for name in ("state", "action"):
+            group.create_array(name, data=x, chunks=(10, 2))
+    torch.save({"time": torch.tensor(t)} | {k: torch.tensor(x) for k in ("dof_pos", "des_dof_pos")}, folder / "pace.pt")
+    parts = folder / "lerobot" / "data" / "chunk-000", folder / "lerobot" / "meta"
+    for part in parts:
+        part.mkdir(parents=True)
+    feature = {"dtype": "float32", "shape": [2], "names": list(JOINTS)}
+    (parts[1] / "info.json").write_text(json.dumps({
+        "codebase_version": "v2.1", "total_episodes": 1, "fps": 50, "chunks_size": 1000,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "features": {"observation.state": feature, "action": feature},
+    }))  # fmt: skip
+    rows = {"observation.state": x.tolist(), "action": x.tolist(), "timestamp": t, "frame_index": range(len(t))}
+    parquet.write_table(table(rows | {"episode_index": [0] * len(t)}), parts[0] / "episode_000000.parquet")
+    return sorted(p for p in folder.iterdir() if p.name != "bag")
 
 
 def objects(folder: Path) -> list[Path]:

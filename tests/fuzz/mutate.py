@@ -4,6 +4,7 @@ makes a case."""
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -214,6 +215,10 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
         return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](
             rng, files[kind][0], folder
         )
+    if kind == "dataset":
+        return _dataset(rng, files[kind][int(rng.integers(0, len(files[kind])))], folder)
+    if kind == "network":
+        return _network(rng, files[kind][0], folder)
     if kind in ("model", "robot"):
         path = folder / "case.xml"
         mjcf.write(path, rng)
@@ -233,6 +238,39 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
     path = folder / f"case{source.suffix}"
     path.write_bytes(bytes_(source.read_bytes(), rng, [p.read_bytes() for p in files[kind]]))
     return path
+
+
+def _dataset(rng: np.random.Generator, source: Path, folder: Path) -> Path:
+    """A damaged file, or a folder with one."""
+    path = folder / f"case{''.join(source.suffixes)}"
+    if source.is_file():
+        path.write_bytes(bytes_(source.read_bytes(), rng, [source.read_bytes()]))
+        return path
+    shutil.copytree(source, path)
+    inside = sorted(p for p in path.rglob("*") if p.is_file())
+    one = inside[int(rng.integers(0, len(inside)))]
+    if one.suffix == ".json" and rng.random() < 0.7:
+        one.write_text(json.dumps(tree(json.loads(one.read_text()), rng), default=str))
+    else:
+        one.write_bytes(bytes_(one.read_bytes(), rng, [one.read_bytes()]))
+    return path
+
+
+def _network(rng: np.random.Generator, source: Path, folder: Path) -> Path:
+    """A bundle whose network is damaged, and its digest that of the damaged one."""
+    case = folder / "case"
+    case.mkdir()
+    for name in ("golden.npz", "config.yaml"):
+        (case / name).symlink_to(source.with_name(name).resolve())
+    data = source.read_bytes()
+    head = 4000 if rng.random() < 0.7 else len(data)  # names, shapes and operators stand among few bytes of weights
+    at = int(rng.choice([0, len(data) - head]))
+    data = data[:at] + bytes_(data[at : at + head], rng, [data[-4000:]]) + data[at + head :]
+    (case / "policy.onnx").write_bytes(data)
+    manifest = yaml.load(source.with_name("manifest.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    manifest["policy"]["sha256"] = hashlib.sha256(data).hexdigest()
+    (case / "manifest.yaml").write_text(yaml.dump(manifest, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
+    return case
 
 
 def _checkpoint(rng: np.random.Generator, source: Path, folder: Path) -> Path:

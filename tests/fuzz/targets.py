@@ -26,6 +26,7 @@ from dexsim.import_hand import source
 from dexsim.paths import CONFIGS
 from dexsim.recording import metadata, read, write
 from dexsim.recording.mechanism import Mechanism, mechanism
+from dexsim.recording.readers import expanded
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 from dexsim.tactile import file as tactile_file
 from dexsim.tactile.layout import hand_layout
@@ -201,6 +202,18 @@ def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
     return ""
 
 
+def dataset(path: Path) -> str:
+    """Return the first episode of a data set, or a bag, read and audited."""
+    read(expanded(path)[0])
+    return ""
+
+
+def network(path: Path) -> str:
+    """A bundle's network."""
+    bundle.load(path)
+    return ""
+
+
 def model(path: Path) -> str:
     """A model of MuJoCo's, as a diagnosis takes it."""
     m = mechanism(path, corpus.SERVO | {"joints": {"*": {"kp": 1.0}}, "loop_encoder": "motor", "current_per_torque": 1})
@@ -226,6 +239,8 @@ TARGETS: dict[str, Callable[[Path], str]] = {
     "overrides": overrides,
     "hand": hand,
     "object": object_,
+    "dataset": dataset,
+    "network": network,
     "model": model,
     "robot": robot,
 }

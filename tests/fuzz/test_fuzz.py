@@ -38,9 +38,12 @@ def quiet():
 def test_the_corpus_itself_is_sound(files, tmp_path):
     for kind, paths in files.items():
         for path in paths:
-            copy = tmp_path / f"case{path.suffix}"
-            if kind == "manifest":
+            mutate.clean(tmp_path)
+            copy = tmp_path / f"case{''.join(path.suffixes)}"
+            if kind in ("manifest", "network"):
                 shutil.copytree(path.parent, copy := tmp_path / "case")
+            elif path.is_dir():
+                shutil.copytree(path, copy)
             else:
                 copy.write_bytes(path.read_bytes())
             assert targets.verdict(kind, copy) == "fine", path

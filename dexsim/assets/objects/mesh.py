@@ -21,7 +21,7 @@ from dexsim.errors import UserError
 SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold
 _CELLS = 62  # along the longest side of the grid, margin included
 _FINE_CELLS = 90  # the same of what is split into many parts
-PATIENCE = 40.0
+PATIENCE = 60.0
 """Times the usual limits for a sound surface: CoACD splits a hollow one by a search, and a distance grid is baked."""
 MOST_PARTS = 32  # convex parts of one object
 
