@@ -52,8 +52,8 @@ def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: s
 
 
 def check_sizes(agent: dict[str, Any], where: str = "agent") -> None:
-    """Raise UserError where actor or critic would be no network, or one that no memory holds. where: before the key."""
-    for part in ("actor", "critic"):
+    """Raise UserError where a part would be no network, or one that no memory holds. where: before the key."""
+    for part in PARTS:
         group, key = agent.get(part), f"{where}.{part}"
         if not isinstance(group, dict):
             continue

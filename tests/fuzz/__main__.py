@@ -183,7 +183,8 @@ def source_seed() -> int:
 
 def main(argv: list[str]) -> int:
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if set(given) - {"minutes", "cases", "kind", "from", "start", "processes", "out"} or any("=" not in a for a in argv):
+    known = {"minutes", "cases", "kind", "from", "start", "processes", "out"}
+    if set(given) - known or any("=" not in a for a in argv):
         print(__doc__)
         return 2
     until = time.monotonic() + 60 * float(given.get("minutes", 60))
