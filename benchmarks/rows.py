@@ -1,12 +1,12 @@
 """Rows of the paper's ablation tables, and of ours: each is trained and judged by the same commands.
 
-    python -m benchmarks.rows table=rotation|grasp|fingertips [rows=full,no_touch] [seeds=1,2] [gpus=0,1]
+    python -m benchmarks.rows table=rotation|grasp|fingertips|skin [rows=full,no_touch] [seeds=1,2] [gpus=0,1]
                               [iterations=N] [out=out/rows] [judge=KEY=VALUE,...] [on=slurm|dask]
                               [any setting of train.py]
 
 table: `rotation` and `grasp` are the paper's tables, `fingertips` asks with less help from the palm what each sense is
-worth. rows: by name (all). seeds: one training each. gpus: as many trainings at a time as there are names; none: one,
-on the CPU. judge: settings of `dexsim play`, such as episodes=256. Goes on where it was interrupted: what was judged is
+worth, `skin` what touch on palm and links adds to a grasp. rows: by name (all). seeds: one training each. gpus: as many
+trainings at a time as there are names; none: one, on the CPU. judge: settings of `dexsim play`, such as episodes=256. Goes on where it was interrupted: what was judged is
 not repeated, and a training resumes from its last.pt.
 
 Prints a table beside the paper's numbers, and every ordering that the paper claims: the difference of means over seeds
@@ -86,6 +86,16 @@ TABLES = {
             ),
         },
         (("both", "force"), ("force", "torque")),
+    ),
+    "skin": Table(  # ours: does touch on palm and links pay?
+        "grasp",
+        "hold_rate",
+        {
+            "fingertips": Row("600 taxels on fingertips", ("hand=xhand",)),
+            "whole": Row("200 more on palm and links", ("hand=xhand_skin",)),
+            "none": Row("no touch", ("task.observe.touch=false",)),
+        },
+        (),
     ),
     "fingertips": Table(
         "rotate_fingertips",

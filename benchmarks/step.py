@@ -6,8 +6,9 @@ All worlds are driven into a grasp of moderate force. From that state, the same 
   bare    physics steps only, driven by the torques, damping and friction that the servo wrote in the same steps of a
           run with the servo (recorded, and copied back by one small kernel before each physics step);
   servo   physics steps with the servo kernel before each;
-  touch   the same with the touch kernel (600 taxels) after the last;
-  full    the environment's step: also actions, terminations, rewards, masked reset, randomization, observations.
+  touch   the same with the touch kernel (the hand's taxels) after the last;
+  full    the environment's step: also actions, terminations, rewards, masked reset, randomization, observations;
+  feel    the touch kernel alone, in the grasp.
 `rounds` times in turns; medians. Prints milliseconds a control step and `overhead`, full over bare minus one.
 """
 
@@ -43,6 +44,7 @@ def measure(env: Any, steps: int, rounds: int) -> dict[str, list[float]]:
         "servo": lambda: e.step(k, env.servo.before_each),
         "touch": lambda: e.step(k, env.servo.before_each, env.touch.launch),
         "full": lambda: env.step(action),
+        "feel": env.touch.launch,
     }
     for call in calls.values():  # compiled and recorded before anything is timed
         back()
@@ -70,14 +72,14 @@ def main(argv: list[str]) -> dict:
     ready = time.perf_counter() - begin
     tools.close_hand(env)
     times = measure(env, steps, rounds)
-    bare, driven, touched, full = (1e3 * statistics.median(t) for t in times.values())
+    bare, driven, touched, full, feel = (1e3 * statistics.median(t) for t in times.values())
     e, k = env.engine, env.decimation
     peaks = e.peaks()
     return tools.report({
         "benchmark": "step", **tools.about(device), "engine": e.kind, "worlds": worlds, "physics_steps": k,
         "ready_s": ready,
         "bare_ms": bare, "servo_ms": driven - bare, "touch_ms": touched - driven, "rest_ms": full - touched,
-        "full_ms": full,
+        "full_ms": full, "feel_ms": feel, "taxels": int(env.touch.layout.count.sum()),
         "overhead": full / bare - 1, "overhead_over_driven": full / driven - 1, "env_steps_per_s": 1e3 * worlds / full,
         "physics_steps_per_s": 1e3 * worlds * k / bare, "contacts": peaks["contacts"], "rows": peaks["rows"],
         "rounds_ms": {name: [round(1e3 * t, 3) for t in ts] for name, ts in times.items()},

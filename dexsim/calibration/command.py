@@ -190,7 +190,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> di
     from dexsim.recording.reader import read
 
     layout = pads_of(hand)
-    if not layout.rows:
+    if not all(layout.rows[: len(hand.fingers)]):
         raise UserError(
             f"touch={s['touch']}: the pads of hand={hand.name} form no lattice (rows: 0 in hand.yaml): which taxels lie"
             " side by side is not known, and their faults cannot be told"
@@ -226,7 +226,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> di
         found[finger] = taxels.inspect(
             values[mine, f, : layout.count[f]],
             load[mine] if measured and (winner == f).sum() > 50 else None,
-            rows=layout.rows,
+            rows=layout.rows[f],
         )
     result: dict[str, Any] = {"dead": {}, "swapped": {}, "gain": {}, "bias": {}, "hysteresis": {}}
     scales = [p.scale for p in found.values() if p.scale]

@@ -108,7 +108,7 @@ class Calibration:
     def __post_init__(self) -> None:
         order = np.tile(np.arange(self.gain.shape[1]), (len(self.gain), 1))
         for finger, pairs in self.swapped.items():
-            f = self.hand.finger_names.index(finger)
+            f = [p.name for p in self.hand.pads].index(finger)
             for a, b in pairs:
                 order[f, [a, b]] = order[f, [b, a]]
         self._order = order
@@ -253,7 +253,7 @@ def _content(raw: Any, where: str, hand: Hand) -> Content:
 
 def _touch(touch: Touch, assumed: list[str], where: str, hand: Hand) -> dict[str, Any]:
     pads, taxels = touch_shape(hand)
-    names = hand.finger_names[:pads]
+    names = [p.name for p in hand.pads]
     for key in ("gain", "bias", "dead", "swapped"):
         for finger, values in (getattr(touch, key) or {}).items():
             at = f"{where}: touch.{key}.{finger}"

@@ -275,9 +275,9 @@ def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, fl
     way = motion(joint) * (hand.closing[joint] or 1.0)
     size = np.linalg.norm(way, axis=1)
     good = (way * normal).sum(1) / size
-    if layout.rows:  # away from both ends of the pad
-        row = np.arange(count) % layout.rows
-        good = good - 10.0 * ((row < layout.rows // 4) | (row > 2 * layout.rows // 3))
+    if rows := layout.rows[finger]:  # away from both ends of the pad
+        row = np.arange(count) % rows
+        good = good - 10.0 * ((row < rows // 4) | (row > 2 * rows // 3))
     k = int(good.argmax())
     arms = {i: float(motion(i)[k] @ normal[k]) for i in hand.fingers[finger].joints}
     return point[k] + normal[k] * (RADIUS + GAP), arms

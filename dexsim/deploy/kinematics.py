@@ -25,7 +25,8 @@ class HandKinematics:
         self.data = mujoco.MjData(self.model)
         m = self.model
         self._couplings = Couplings(m, hand.joints)
-        self._body = np.array([m.body(b).id for b in hand.tip_bodies])
+        bodies = [*hand.tip_bodies, *(p.body for p in hand.pads[len(hand.fingers) :])]
+        self._body = np.array([m.body(b).id for b in bodies])
         self._offset = np.array([f.position for f in hand.fingers])
         layout = hand_layout(hand)
         # taxels where the simulated ones are: on the surface that is pressed
@@ -33,12 +34,14 @@ class HandKinematics:
         self.pad_centre = np.zeros((0, 3)) if layout is None else layout.centre()
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Angles [J] rad -> (tips [F, 3] m, positions [F, 3] m and rotations [F, 3, 3] of the tips' bodies)."""
+        """Angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and
+        skin)."""
         d = self.data
         self._couplings.put(d, q)
         mujoco.mj_kinematics(self.model, d)
         position, turn = d.xpos[self._body].copy(), d.xmat[self._body].reshape(-1, 3, 3).copy()
-        return position + np.einsum("fij,fj->fi", turn, self._offset), position, turn
+        f = len(self._offset)
+        return position[:f] + np.einsum("fij,fj->fi", turn[:f], self._offset), position, turn
 
     def touch(
         self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True

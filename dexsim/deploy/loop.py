@@ -439,7 +439,7 @@ class Loop:
         self.report.counts.update({"error_codes": int(coded.any())} if coded.any() else {})
         self._coded.note(bool(coded.any()), now, f"{self.bundle.hand.joints[j]} reports error code {state.error[j]}")
         for i in np.flatnonzero(state.silent) if state.silent is not None else ():
-            name = self.bundle.hand.finger_names[i]
+            name = self.bundle.hand.pads[i].name
             if not self.report.counts[f"silent_{name}"]:
                 self.say(f"the taxels of {name} give nothing: they count as untouched, and the run goes on")
             self.report.counts[f"silent_{name}"] += 1

@@ -28,7 +28,7 @@ def check(m: Any, source: object, again: str) -> None:
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
     """Rows of the observation as this dexsim builds it."""
-    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0)
+    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.pads))
 
 
 def settings(m: dict[str, Any]) -> float:

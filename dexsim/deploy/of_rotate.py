@@ -35,7 +35,7 @@ def check(m: Any, source: object, again: str) -> None:
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
     """Rows of the observation as this dexsim builds it."""
-    sizes = len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0
+    sizes = len(hand.joints), len(hand.fingers), len(hand.pads)
     return observations_rotate.rows(m["task_settings"], *sizes)
 
 

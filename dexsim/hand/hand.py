@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexsim.hand.couplings import Couplings
+from dexsim.hand.model import HAND_BIT, OBJECT_BIT
 from dexsim.hand.schema import HandFile, Pad
 
 if TYPE_CHECKING:
@@ -32,6 +33,17 @@ class Finger:
     normal: tuple[float, float, float]
     geoms: tuple[str, ...]
     pad: Pad | None
+
+
+@dataclass(frozen=True)
+class TouchPad:
+    """A touch pad: `taxels`, kind and rows as in the file; body: what carries it."""
+
+    name: str
+    body: str
+    taxels: str
+    kind: str
+    rows: int = 0
 
 
 @dataclass(frozen=True)
@@ -110,6 +122,25 @@ class Hand:
     def touches(self) -> bool:
         """Whether its fingertips carry touch pads."""
         return self.fingers[0].pad is not None
+
+    @property
+    def pads(self) -> tuple[TouchPad, ...]:
+        """Its touch pads: pad f on finger f, then those of `skin`; none where its fingertips have none."""
+        tips = [TouchPad(f.name, f.body, f.pad.taxels, f.pad.kind, f.pad.rows) for f in self.fingers if f.pad]
+        return (*tips, *(TouchPad(p.name, p.body, p.taxels, p.kind) for p in self.file.skin))
+
+    @cached_property
+    def links(self) -> dict[str, tuple[str, ...]]:
+        """Geoms that press objects, by body, without those of fingertips; a body that has none of its own is left
+        out."""
+        out: dict[str, tuple[str, ...]] = {}
+        m, tips = self.compiled, set(self.tip_geoms)
+        for g in range(m.ngeom):
+            name = m.geom(g).name
+            if m.geom_contype[g] & HAND_BIT and m.geom_conaffinity[g] & OBJECT_BIT and name not in tips:
+                body = m.body(m.geom_bodyid[g]).name
+                out[body] = (*out.get(body, ()), name)
+        return out
 
     @property
     def finger_of_joint(self) -> tuple[int, ...]:

@@ -127,7 +127,7 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
         )
     names = [f.name for f in file.fingers]
     opposing = tuple(names.index(f) for f in file.opposing)
-    return Hand(
+    hand = Hand(
         folder=path.parent,
         file=file,
         mirror=mirror,
@@ -143,6 +143,14 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
         force=float(file.force) if isinstance(file.force, (int, float)) else file.force,
         _spec=spec,
     )
+    presses = {*hand.links, *hand.tip_bodies}
+    for pad in file.skin:
+        if pad.body not in presses:
+            raise UserError(
+                f"{where}: skin.{pad.name}.body ({pad.body}): no link whose geoms press objects;"
+                f" {_near(pad.body, sorted(presses))}"
+            )
+    return hand
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:
@@ -162,6 +170,7 @@ def _names(file: HandFile, where: str) -> None:
         ("fingers.*.tip.body", [f.tip.body for f in file.fingers]),
         ("fingers.*.joints", [j for f in file.fingers for j in f.joints]),
         ("opposing", file.opposing),
+        ("skin and fingers", [*fingers, *(p.name for p in file.skin)]),
     ):
         if (twice := _twice(names)) is not None:
             raise UserError(f"{where}: {key}: '{twice}' twice; each must be there once")
@@ -186,7 +195,7 @@ def _names(file: HandFile, where: str) -> None:
             raise UserError(f"{where}: opposing: '{name}' is not a finger; {_near(name, fingers)}")
     if len(file.opposing) == len(fingers):
         raise UserError(f"{where}: opposing names every finger; leave out those that they press against")
-    _pads([f.pad for f in file.fingers], fingers, where)
+    _pads([f.pad for f in file.fingers], fingers, bool(file.skin), where)
     forward, normal = np.array(file.palm.forward), np.array(file.palm.normal)
     if not np.linalg.norm(np.cross(normal, forward)) > 0.1 * np.linalg.norm(normal) * np.linalg.norm(forward) > 0:
         raise UserError(
@@ -195,12 +204,14 @@ def _names(file: HandFile, where: str) -> None:
         )
 
 
-def _pads(pads: list[Pad | None], fingers: list[str], where: str) -> None:
+def _pads(pads: list[Pad | None], fingers: list[str], skin: bool, where: str) -> None:
     bare = [name for name, pad in zip(fingers, pads, strict=True) if pad is None]
     if bare and len(bare) < len(fingers):
         raise UserError(
             f"{where}: fingers.{bare[0]}.pad: has none, but others have; give every finger a pad, or none (pad: null)"
         )
+    if bare and skin:
+        raise UserError(f"{where}: skin: needs pads on the fingertips; fingers.{bare[0]}.pad is null")
 
 
 def _near(name: str, names: list[str]) -> str:

@@ -33,6 +33,9 @@ def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, lis
         for item in list(group):
             spec.delete(item)
     tips = _tips(spec, file, where)
+    for body in spec.bodies:
+        for k, g in enumerate(g for g in body.geoms if g.contype or g.conaffinity):
+            g.name = g.name or f"link_{body.name}_{k}"
     _collide(spec, {g for names in tips for g in names})
     _place(spec, file, where)
     return spec, tips

@@ -65,6 +65,16 @@ class Pad(msgspec.Struct, forbid_unknown_fields=True):
     skin: Text | None = None
 
 
+class SkinEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """A further touch pad, on any `body`: `taxels`, a CSV file as of a fingertip's pad, in that body's frame. Several
+    may lie on one body."""
+
+    name: Name
+    body: Text
+    taxels: Text
+    kind: Text = "finger"
+
+
 class FingerEntry(msgspec.Struct, forbid_unknown_fields=True):
     """A finger. joints: driven ones root to tip, then drives that pull it by a tendon; none of a finger that follows
     another; flexion: those that close it, root to tip; closes: the sign of the motion of each
@@ -98,8 +108,8 @@ class PlacesEntry(msgspec.Struct, forbid_unknown_fields=True):
 class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     """The file. Paths are relative to its folder. force: N that a fingertip can press with; None: from the servo's
     torque limits and the levers, press: from a simulated press (pads with a lattice); span: m, width of what the
-    hand can grasp; held_cubes: poses that rotation begins with (dexsim stable-grasps), None: searched for; guessed:
-    places of this file that a program guessed; source: free."""
+    hand can grasp; skin: touch beyond the fingertips; held_cubes: poses that rotation begins with (dexsim
+    stable-grasps), None: searched for; guessed: places of this file that a program guessed; source: free."""
 
     format: Literal["dexsim-hand"]
     version: Literal[1]
@@ -114,6 +124,7 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     poses: Poses
     span: Metre
     force: Positive | Literal["press"] | None = None
+    skin: Annotated[list[SkinEntry], msgspec.Meta(max_length=256)] = []
     places: PlacesEntry | None = None
     held_cubes: Text | None = None
     guessed: list[str] = []
@@ -137,8 +148,8 @@ def to_yaml(file: HandFile) -> str:
     for finger in data["fingers"]:
         if finger["closes"] is None:
             del finger["closes"]
-    for name in ("places", "held_cubes"):
-        if data[name] is None:
+    for name in ("skin", "places", "held_cubes"):
+        if not data[name]:
             del data[name]
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=116, default_flow_style=False)
 

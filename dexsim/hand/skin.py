@@ -1,4 +1,4 @@
-"""The surface of a fingertip that presses objects, as points whose convex hull it is."""
+"""The surfaces of fingertips and links that press objects, as points whose convex hull each is."""
 
 from __future__ import annotations
 
@@ -25,6 +25,15 @@ def tip_skin(hand: Hand, finger: Finger) -> np.ndarray:
         flip = S if hand.mirror else np.ones(3)
         return obj_vertices(hand.folder / finger.pad.skin) * flip * hand.scale
     return geom_points(hand, finger.geoms)
+
+
+def link_skins(hand: Hand) -> list[tuple[str, np.ndarray]]:
+    """(body, corners [V, 3] m in its frame) of every link that presses objects: what touches the rest of the hand."""
+    tips = {f.body: tip_skin(hand, f) for f in hand.fingers}
+    own = {body: geom_points(hand, geoms) for body, geoms in hand.links.items()}
+    return [
+        (body, np.concatenate([x[body] for x in (tips, own) if body in x])) for body in dict.fromkeys((*tips, *own))
+    ]
 
 
 def tip_skins(hand: Hand) -> list[np.ndarray]:

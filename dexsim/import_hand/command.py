@@ -11,6 +11,7 @@ from dexsim.errors import UserError
 
 USAGE = """usage: dexsim import-hand MODEL out=FOLDER [key=value ...]  MODEL: URDF or MJCF file, or menagerie:NAME
        dexsim import-hand check FOLDER [key=value ...]
+       dexsim import-hand skin FOLDER skin=LINK:TAXELS,... [out=FOLDER2]
 
 Make a hand of a robot's file: find its palm, fingers and tips, guess the palm's frame, an open and a cupped pose, give
 it collision shapes and touch pads, and write a folder that every task takes: dexsim train task=grasp hand=FOLDER
@@ -29,6 +30,7 @@ settings (key=default):
   palm=             body to take for the palm (default: the last one that all fingers share)
   pads=8x6          taxels of a fingertip, rows (along the finger) x columns; pads=none; pads=FILE.csv with columns
                     finger,x,y,z,nx,ny,nz (m, in the tip body's frame)
+  skin=             touch on further links, e.g. palm:80/4,links:20 (dexsim import-hand skin says more)
   effort= speed=    N m and rad/s of the joints for which the file says none
   density=          kg/m3 of links without an inertia
   inertia=          of links whose moments no body has: shapes (those of its shapes) or balance (the mean of the three)
@@ -45,6 +47,7 @@ KEYS = (
     "name",
     "palm",
     "pads",
+    "skin",
     "effort",
     "speed",
     "density",
@@ -67,6 +70,10 @@ def main(argv: Sequence[str]) -> int:
         from dexsim.import_hand import moves
 
         return moves.main(argv[1:])
+    if argv[0] == "skin":
+        from dexsim.import_hand import skin
+
+        return skin.main(argv[1:])
     model, given, said = arguments(argv)
     if "out" not in given:
         raise UserError("say where to write: out=FOLDER, e.g. out=hands/mine")
@@ -127,7 +134,7 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
             raise UserError(f"{key}={given[key]}: must be {' or '.join(allowed)}")
     out = Settings(said=said)
     out.coupled, out.holes = given.get("coupled", "keep"), given.get("holes", "hull")
-    out.inertia = given.get("inertia")
+    out.inertia, out.skin = given.get("inertia"), given.get("skin") or None
     out.palm, out.name = given.get("palm") or None, given.get("name") or None
     for key, low, high, unit in (
         ("effort", 0.001, 100.0, "N m"),

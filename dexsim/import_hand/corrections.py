@@ -44,7 +44,7 @@ def flat(data: Any, place: str = "") -> dict[str, Any]:
     out: dict[str, Any] = {}
     if isinstance(data, dict):
         for key, value in data.items():
-            if place == "" and key in ("guessed", "source"):
+            if place == "" and key in ("guessed", "source", "skin"):
                 continue
             out |= flat(value, f"{place}.{key}" if place else str(key))
     elif isinstance(data, list) and data and all(isinstance(x, dict) and "name" in x for x in data):

@@ -28,6 +28,7 @@ from dexsim.import_hand import (
     taxels,
     tree,
 )
+from dexsim.import_hand import skin as links
 from dexsim.import_hand.corrections import Corrections
 from dexsim.import_hand.drives import Pull
 from dexsim.import_hand.text import yaml_text as hand_text
@@ -41,7 +42,8 @@ class Settings:
     """packages: where package:// is looked for; palm: body to take for the palm; coupled: "keep" or "independent";
     density: kg/m3 of links without inertia; inertia: "shapes" or "balance", where one is none; effort
     N m, speed rad/s: of joints whose file says none; pads: (rows,
-    columns), None for none, or a CSV file; holes: "hull" or "refuse"; drops: objects let fall to find where the hand
+    columns), None for none, or a CSV file; skin: touch on further links (`dexsim.import_hand.skin`), None: as before;
+    holes: "hull" or "refuse"; drops: objects let fall to find where the hand
     holds them, 0: its cupped pose alone tells; name of the hand; said: places of hand.yaml and their values."""
 
     packages: Sequence[Path] = ()
@@ -52,6 +54,7 @@ class Settings:
     effort: float | None = None
     speed: float | None = None
     pads: tuple[int, int] | Path | None = (8, 6)
+    skin: str | None = None
     holes: str = "hull"
     drops: int = field(default_factory=lambda: DROPS)
     name: str | None = None
@@ -192,6 +195,13 @@ def import_hand(
             _drop_region(stage, hand, settings.drops, tell)
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         loaded = _loads(stage)
+        asked = settings.skin or (((note or {}).get("hand") or {}).get("source") or {}).get("skin")
+        if asked:
+            hand["skin"], hand["source"]["skin"] = links.write_pads(loaded, stage, asked, tell), asked
+            (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+            loaded = _loads(stage)
+            if picture:
+                links.show(loaded, stage, tell)
         for line in moves.faults(moves.moves(loaded)):
             tell(f"check:   {line}")
         if picture:

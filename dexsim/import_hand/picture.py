@@ -12,7 +12,7 @@ import numpy as np
 from dexsim import files
 from dexsim.hand import Hand
 from dexsim.hand.places import places
-from dexsim.tactile.layout import load_layout
+from dexsim.tactile.layout import hand_layout, load_layout
 from dexsim.view.stills import Shot, render
 
 AXES = (("x forward", "#d62728"), ("y", "#2ca02c"), ("z normal", "#1f77b4"))
@@ -98,6 +98,39 @@ def draw(hand: Hand, path: Path) -> None:
         f" {hand.file.handedness} hand; span {1e3 * hand.span:.0f} mm",
         fontsize=12,
     )
+    files.picture(figure, path)
+
+
+def draw_skin(hand: Hand, path: Path) -> None:
+    """Write the picture (PNG) of all taxels on the open hand, a colour a pad, from three sides: those that look at the
+    camera. Raises `dexsim.view.video.NoRenderer` where nothing can be rendered."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    model, layout = hand.spec().compile(), hand_layout(hand)
+    assert layout is not None  # asked for only with touch
+    q = qpos(hand, model, hand.pose("open"))
+    data = posed(model, q)
+    middle, radius = bounds(model, data)
+    shots = [Shot(0, q, middle, 2.3 * radius, azimuth, elevation, (720, 640)) for _, azimuth, elevation in VIEWS]
+    figure = Figure(figsize=(19.5, 6.6), dpi=100, layout="constrained")
+    colours = colormaps["tab20"].colors  # type: ignore[attr-defined]
+    for k, (shot, image) in enumerate(zip(shots, render([model], shots), strict=True)):
+        axes = figure.add_subplot(1, len(shots), k + 1)
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[], xlim=(0, shot.size[0]), ylim=(shot.size[1], 0))
+        axes.set_title(f"open, {VIEWS[k][0]}", fontsize=9)
+        az, el = np.radians(shot.azimuth), np.radians(shot.elevation)
+        ahead = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
+        for f, name in enumerate(layout.names):
+            n, b = int(layout.count[f]), model.body(layout.bodies[f]).id
+            turn = data.xmat[b].reshape(3, 3)
+            facing = layout.normal[f, :n] @ turn.T @ ahead < 0.0
+            at = shot.project(layout.point[f, :n] @ turn.T + data.xpos[b])[facing]
+            axes.plot(*at.T, ".", ms=5, color=colours[f % 20], label=f"{name}: {n}")
+        if k == 0:
+            axes.legend(fontsize=7, loc="upper left", framealpha=0.8)
+    figure.suptitle(f"{hand.name}: {int(layout.count.sum())} taxels in {layout.pads} pads", fontsize=12)
     files.picture(figure, path)
 
 

@@ -16,6 +16,7 @@ ABOUT = {
     "fingers": "joints root to tip; flexion: those that close it, closes: the sign of the motion that does",
     "opposing": "fingers that press against the others",
     "poses": "open: ready to catch; cupped: closed around an object in the palm",
+    "skin": "touch pads beyond the fingertips, as `source: skin` says them; taxels: in the frame of `body`",
     "places": "palm frame; catch: on the palm, objects are let fall over it (searched for: most were held there)",
     "span": "how wide a thing it can grasp: the reach of its fingers, at most the gap of the open hand",
     "force": "N a fingertip can press with; null: from the motors' torques and the levers",

@@ -16,10 +16,10 @@ from dexsim.sim.engine import ContactPair, geoms_of
 _SCALE = 65536.0  # 1.5e-5 N resolution, +-32 kN range
 
 
-def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair], slots: int = 2) -> np.ndarray:
-    """Return, for geoms (a, b), the pairs they belong to, int32 [ngeom, ngeom, slots]; +p+1 if a is of the pair's first
+def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair]) -> np.ndarray:
+    """Return, for geoms (a, b), the pairs they belong to, int32 [ngeom, ngeom, most]; +p+1 if a is of the pair's first
     member, -(p+1) if b is, 0 = none."""
-    table = np.zeros((model.ngeom, model.ngeom, slots), dtype=np.int32)
+    table = np.zeros((model.ngeom, model.ngeom, 2), dtype=np.int32)
     for p, pair in enumerate(pairs):
         for a in geoms_of(model, *pair.first):
             for b in geoms_of(model, *pair.second):
@@ -30,7 +30,7 @@ def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair], slots: int =
                     if abs(s) in np.abs(table[i, j]):
                         continue
                     if len(free) == 0:
-                        raise ValueError(f"geoms {i} and {j} belong to more than {slots} contact pairs")
+                        free, table = [table.shape[2]], np.pad(table, ((0, 0), (0, 0), (0, 1)))
                     table[i, j, free[0]] = s
     return table
 

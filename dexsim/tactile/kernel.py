@@ -82,7 +82,9 @@ class Surroundings:
     shape_id: wp.array2d(dtype=int)  # [N, O] -1: no object
     shape_size: wp.array2d(dtype=wp.vec3)  # [N, O] m, of grids the scale first
     pair_column: wp.array2d(dtype=int)  # [F, O] the pair of a pad and an object
-    tip_column: wp.array2d(dtype=int)  # [F, F] of a pad and another one's tip; -1: not declared
+    link_body: wp.array(dtype=int)  # [L] bodies of the hand whose surfaces pads may touch
+    tip_column: wp.array2d(dtype=int)  # [F, L] the pair of a pad and such a body; -1: not declared
+    self_column: wp.array(dtype=int)  # [F] the pair of a pad's body and the rest of the hand
 
 
 @wp.struct
@@ -91,7 +93,7 @@ class Felt:
 
     force: wp.array2d(dtype=float)  # [N, F] N
     centre: wp.array2d(dtype=wp.vec3)  # [N, F] m, world frame
-    force_other: wp.array2d(dtype=float)  # [N, F] N, of other pads' tips
+    force_other: wp.array2d(dtype=float)  # [N, F] N, of the rest of the hand
     felt: wp.array3d(dtype=float)  # [N, F, T] N, where every taxel's force is asked for
     distance: wp.array3d(dtype=float)  # [N, F, T] m: scratch, where the solver's force is spread
 
@@ -186,9 +188,9 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 
 @wp.func
-def may_meet(f: int, g: int, here: Surroundings, w: int):
-    """Whether pad f may touch the tip of pad g: another one, and pressed where the physics says so."""
-    near = g != f
+def may_meet(f: int, g: int, here: Surroundings, pads: Pads, w: int):
+    """Whether pad f may touch link g: another body, and pressed where the physics says so."""
+    near = here.link_body[g] != pads.body[f]
     if near and here.tip_column[f, g] >= 0:
         near = here.pair_normal[w, here.tip_column[f, g]] > 0.0
     return near
@@ -196,8 +198,60 @@ def may_meet(f: int, g: int, here: Surroundings, w: int):
 
 @wp.func
 def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3):
-    """Whether pad f, whose body has rotation a and origin b in that of pad g, surely does not touch g's tip."""
+    """Whether pad f, whose body has rotation a and origin b in that of link g, surely does not touch it."""
     return boxes_apart(a, b, pads.middle[f], pads.half[f], tips.middle[g], tips.half[g])
+
+
+@wp.func
+def nearest_link(here: Surroundings, tips: Shapes, w: int, body: int, point: wp.vec3):
+    """Signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links."""
+    out = float(1.0e9)
+    for g in range(here.link_body.shape[0]):
+        other = here.link_body[g]
+        if other != body:
+            q = wp.transpose(here.xmat[w, other]) * (point - here.xpos[w, other])
+            out = wp.min(out, sd_grid(tips, g, 1.0, q))
+    return out
+
+
+@wp.func
+def beside_object(
+    here: Surroundings, pads: Pads, shapes: Shapes, shape: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, f: int, o: int,
+    first: int, step: int, level: float,
+):  # fmt: skip
+    """Of every step-th taxel from `first` of the other pads that share pad f's pair with object o: the least distance
+    [m], and the sum of weights under `level`."""
+    nearest = float(1.0e9)
+    weight = float(0.0)
+    for g in range(pads.body.shape[0]):
+        if g != f and here.pair_column[g, o] == here.pair_column[f, o]:
+            t = int(first)
+            while t < pads.count[g]:
+                d = distance(shapes, shape, size, a * xyz(pads.taxel[g, t]) + b)
+                nearest = wp.min(nearest, d)
+                weight += spread_weight(d, pads.taxel[g, t][3], level)
+                t += step
+    return wp.vec2(nearest, weight)
+
+
+@wp.func
+def beside_links(
+    here: Surroundings, pads: Pads, tips: Shapes, w: int, f: int, first: int, step: int, level: float
+):
+    """The same for the rest of the hand: of the other pads on pad f's body."""
+    nearest = float(1.0e9)
+    weight = float(0.0)
+    body = pads.body[f]
+    for g in range(pads.body.shape[0]):
+        if g != f and pads.body[g] == body:
+            t = int(first)
+            while t < pads.count[g]:
+                point = here.xmat[w, body] * xyz(pads.taxel[g, t]) + here.xpos[w, body]
+                d = nearest_link(here, tips, w, body, point)
+                nearest = wp.min(nearest, d)
+                weight += spread_weight(d, pads.taxel[g, t][3], level)
+                t += step
+    return wp.vec2(nearest, weight)
 
 
 @cache
@@ -212,17 +266,23 @@ def touch_kernel(
     taxels: int = 120,
     objects: int = 1,
     feel_others: bool = False,
+    links: int = 5,
+    selves: bool = False,
+    shared: bool = False,
     registers: int = 0,
 ) -> wp.Kernel:
     """The kernel for one choice of options; dimensions: [N, F] threads (serial) or N * F * 32 (lanes).
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
-    other pads' tips as well; feel_others: and write them into the taxels' forces. pads, taxels, objects: the layout's
-    sizes F and T, and the objects in each world. registers: CUDA, at most so many a thread (0: as the compiler likes).
+    the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the
+    solver's, spread. pads, taxels, objects, links: the layout's sizes F and T, the objects in each world, and links L.
+    shared: pads on one body share its force. registers: CUDA, at most so many a thread (0: as the compiler likes).
     """
     rounds = -(-taxels // LANES)
     make = _lanes if lanes else _serial
-    kernel = make(solver, raw, others, LAWS[law], pads, taxels, objects, feel_others, rounds)
+    kernel = make(
+        solver, raw, others, LAWS[law], pads, taxels, objects, feel_others, links, selves, shared, rounds
+    )
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
     return wp.kernel(
         kernel,
@@ -236,7 +296,7 @@ def touch_kernel(
 
 def _serial(
     solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
-    rounds: int,
+    links: int, selves: bool, shared: bool, rounds: int,
 ) -> Callable:  # fmt: skip
     def serial(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: Felt):
         w, f = wp.tid()
@@ -263,13 +323,20 @@ def _serial(
                         d = distance(shapes, shape, size, a * xyz(pads.taxel[f, t]) + b)
                         out.distance[w, f, t] = d
                         nearest = wp.min(nearest, d)
+                    if wp.static(shared):
+                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, 0, 1, 0.0)
+                        nearest = wp.min(nearest, beside[0])
                     level = spread_level(nearest, law.reach)
                     s = wp.vec4(0.0, 0.0, 0.0, 0.0)
                     for t in range(n):
                         p = pads.taxel[f, t]
                         c = spread_weight(out.distance[w, f, t], p[3], level)
                         s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
-                    c = pressed / s[3]
+                    whole = s[3]
+                    if wp.static(shared):
+                        whole += beside_object(here, pads, shapes, shape, size, a, b, f, o, 0, 1, level)[1]
+                        pressed = pressed * s[3] / whole
+                    c = here.pair_normal[w, here.pair_column[f, o]] / whole
                     total += wp.vec4(c * s[0], c * s[1], c * s[2], pressed)
                     if wp.static(raw):
                         for t in range(n):
@@ -287,12 +354,38 @@ def _serial(
                                     out.felt[w, f, t] = out.felt[w, f, t] + c
         out.force[w, f] = total[3]
         out.centre[w, f] = here.xmat[w, body] * centre_of(pads, f, total) + here.xpos[w, body]
-        if wp.static(others):
+        if wp.static(others and selves):
+            other = here.pair_normal[w, here.self_column[f]]
+            if other > 0.0:
+                nearest = float(1.0e9)
+                for t in range(n):
+                    point = here.xmat[w, body] * xyz(pads.taxel[f, t]) + here.xpos[w, body]
+                    d = nearest_link(here, tips, w, body, point)
+                    out.distance[w, f, t] = d
+                    nearest = wp.min(nearest, d)
+                if wp.static(shared):
+                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, 0, 1, 0.0)[0])
+                level = spread_level(nearest, law.reach)
+                own = float(0.0)
+                for t in range(n):
+                    own += spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
+                whole = own
+                if wp.static(shared):
+                    whole += beside_links(here, pads, tips, w, f, 0, 1, level)[1]
+                c = other / whole
+                if wp.static(raw and feel_others):
+                    for t in range(n):
+                        share = spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
+                        out.felt[w, f, t] = out.felt[w, f, t] + c * share
+                if wp.static(shared):
+                    other = c * own
+            out.force_other[w, f] = other
+        elif wp.static(others):
             other = float(0.0)
-            for g in range(pads.body.shape[0]):
-                if may_meet(f, g, here, w):
-                    a = turn_in(here.xmat, w, body, pads.body[g])
-                    b = pose_in(here.xpos, here.xmat, w, body, pads.body[g])
+            for g in range(here.link_body.shape[0]):
+                if may_meet(f, g, here, pads, w):
+                    a = turn_in(here.xmat, w, body, here.link_body[g])
+                    b = pose_in(here.xpos, here.xmat, w, body, here.link_body[g])
                     if not tips_apart(pads, tips, f, g, a, b):
                         for t in range(n):
                             p = pads.taxel[f, t]
@@ -311,7 +404,7 @@ def _serial(
 
 def _lanes(
     solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
-    rounds: int,
+    links: int, selves: bool, shared: bool, rounds: int,
 ) -> Callable:  # fmt: skip
     Reals = wp.types.vector(length=rounds, dtype=float)
     width = rounds * LANES
@@ -356,12 +449,19 @@ def _lanes(
         py = Reals()
         pz = Reals()
         area = Reals()
-        for r in range(wp.static(rounds)):
-            v = load4(pads.taxel, f * wp.static(width) + 32 * r + lane)
-            px[r] = v[0]
-            py[r] = v[1]
-            pz[r] = v[2]
-            area[r] = v[3]
+        wanted = bool(wp.static(not solver or (others and not selves)))
+        if wp.static(solver):  # a pad that nothing presses asks for none of its taxels
+            for o in range(wp.static(objects)):
+                wanted = wanted or here.pair_normal[w, here.pair_column[f, o]] > 0.0
+            if wp.static(others and selves):
+                wanted = wanted or here.pair_normal[w, here.self_column[f]] > 0.0
+        if wanted:
+            for r in range(wp.static(rounds)):
+                v = load4(pads.taxel, f * wp.static(width) + 32 * r + lane)
+                px[r] = v[0]
+                py[r] = v[1]
+                pz[r] = v[2]
+                area[r] = v[3]
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force; the same in all lanes
         mine = Reals()  # forces of this lane's taxels
         for o in range(wp.static(objects)):
@@ -377,6 +477,9 @@ def _lanes(
                     nearest = d[0]
                     for r in range(1, wp.static(rounds)):
                         nearest = wp.min(nearest, d[r])
+                    if wp.static(shared):
+                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, lane, 32, 0.0)
+                        nearest = wp.min(nearest, beside[0])
                     level = spread_level(lanes_min(nearest), law.reach)
                     s = wp.vec4(0.0, 0.0, 0.0, 0.0)
                     for r in range(wp.static(rounds)):
@@ -384,7 +487,13 @@ def _lanes(
                         s += wp.vec4(c * px[r], c * py[r], c * pz[r], c)
                         d[r] = c
                     s = lanes_sum4(s, lane)
-                    scale = pressed / s[3]
+                    whole = s[3]
+                    scale = pressed / whole
+                    if wp.static(shared):
+                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, lane, 32, level)
+                        whole += lanes_sum(beside[1])
+                        scale = pressed / whole
+                        pressed = scale * s[3]
                     total += wp.vec4(scale * s[0], scale * s[1], scale * s[2], pressed)
                     mine += scale * d
             else:
@@ -406,24 +515,50 @@ def _lanes(
         if lane == 0:
             out.force[pad] = total[3]
             out.centre[pad] = rot * centre_of(pads, f, total) + pos
-        if wp.static(others):
-            # Lane j asks whether tip j is near, all at once; then the warp feels the tips that are.
+        if wp.static(others and selves):
+            other = here.pair_normal[w, here.self_column[f]]
+            if other > 0.0:
+                d = Reals()
+                for r in range(wp.static(rounds)):
+                    d[r] = nearest_link(here, tips, w, body, rot * wp.vec3(px[r], py[r], pz[r]) + pos)
+                nearest = d[0]
+                for r in range(1, wp.static(rounds)):
+                    nearest = wp.min(nearest, d[r])
+                if wp.static(shared):
+                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, lane, 32, 0.0)[0])
+                level = spread_level(lanes_min(nearest), law.reach)
+                own = float(0.0)
+                for r in range(wp.static(rounds)):
+                    d[r] = spread_weight(d[r], area[r], level)
+                    own += d[r]
+                own = lanes_sum(own)
+                whole = own
+                if wp.static(shared):
+                    whole += lanes_sum(beside_links(here, pads, tips, w, f, lane, 32, level)[1])
+                if wp.static(raw and feel_others):
+                    mine += other / whole * d
+                if wp.static(shared):
+                    other = other / whole * own
+            if lane == 0:
+                out.force_other[pad] = other
+        elif wp.static(others):
+            # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
             other = float(0.0)
-            for block in range(wp.static(-(-pad_count // LANES))):
+            for block in range(wp.static(-(-links // LANES))):
                 j = wp.static(32) * block + lane
-                near = j < wp.static(pad_count)
+                near = j < wp.static(links)
                 if near:
-                    near = may_meet(f, j, here, w)
+                    near = may_meet(f, j, here, pads, w)
                 if near:
-                    turn = wp.transpose(here.xmat[w, pads.body[j]])
-                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - here.xpos[w, pads.body[j]]))
+                    turn = wp.transpose(here.xmat[w, here.link_body[j]])
+                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - here.xpos[w, here.link_body[j]]))
                 left = lane_ballot(near)
                 while left != 0:
                     g = 32 * block + lowest_bit(left)
                     left = left & (left - 1)
-                    turn = wp.transpose(here.xmat[w, pads.body[g]])
+                    turn = wp.transpose(here.xmat[w, here.link_body[g]])
                     a = turn * rot
-                    b = turn * (pos - here.xpos[w, pads.body[g]])
+                    b = turn * (pos - here.xpos[w, here.link_body[g]])
                     middle = tips.middle[g]
                     half = tips.half[g]
                     offset = tips.offset[g]

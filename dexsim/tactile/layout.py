@@ -27,9 +27,8 @@ class TaxelLayout:
     constants such as the foundation stiffness. count: taxels of each pad [F].
     point [F, T, 3]: positions [m]; normal, tx, ty [F, T, 3]: unit directions (z, x and y of a taxel's frame; tx and ty
     lie in the tangent plane). Both in the frame of the carrying body.
-    area [F, T]: area that a taxel stands for [m^2]. rows: of the lattice that a pad's taxels form, index k = column *
-    rows + row;
-    0: none is known.
+    area [F, T]: area that a taxel stands for [m^2]. rows: of the lattice that each pad's taxels form, index k = column
+    * rows + row; 0: none is known.
     """
 
     names: tuple[str, ...]
@@ -41,7 +40,7 @@ class TaxelLayout:
     tx: np.ndarray
     ty: np.ndarray
     area: np.ndarray
-    rows: int = 0
+    rows: tuple[int, ...] = ()
 
     @property
     def pads(self) -> int:
@@ -60,13 +59,13 @@ class TaxelLayout:
     def beside(self, pad: int) -> np.ndarray:
         """Taxels beside each taxel of a pad in its lattice, [count, 4], -1 where there is none. UserError without a
         lattice."""
-        n = int(self.count[pad])
-        if not self.rows or n % self.rows:
+        n, rows = int(self.count[pad]), self.rows[pad]
+        if not rows or n % rows:
             raise UserError(
                 f"tactile.pads.{self.names[pad]}.crosstalk: which taxels lie beside one another is not known of this"
                 " layout; use 0"
             )
-        lattice = np.pad(np.arange(n).reshape(-1, self.rows), 1, constant_values=-1)
+        lattice = np.pad(np.arange(n).reshape(-1, rows), 1, constant_values=-1)
         return np.stack([lattice[:-2, 1:-1], lattice[2:, 1:-1], lattice[1:-1, :-2], lattice[1:-1, 2:]], -1).reshape(
             n, 4
         )
@@ -81,9 +80,9 @@ class TaxelLayout:
         return centre, radius
 
     def lifted(self, tips: Sequence[np.ndarray], limit: float = 1e-3) -> TaxelLayout:
-        """The taxels moved along their normals onto the convex hulls of `tips` ([F] of [V, 3] m, body frames), the
+        """The taxels moved along their normals onto the convex hulls of `tips` ([V, 3] m each, body frames), the
         surfaces that the physics presses, so that a taxel is in an object where that surface is. Fails if one would
-        move farther than `limit` [m]: the tip then does not follow the pad.
+        move farther than `limit` [m]: the tip then does not follow the pad. Pads beyond the tips stay.
         """
         point = self.point.copy()
         for f, tip in enumerate(tips):
@@ -101,8 +100,8 @@ class TaxelLayout:
     @staticmethod
     def build(pads: Sequence[dict]) -> TaxelLayout:
         """Pads as dicts with name, body, kind (default: name), point, normal and optionally tx, ty (default:
-        normal x tx), area (default 1 mm^2 each); lists of any length. Fails with UserError on shapes that do not agree
-        or vectors not of unit length.
+        normal x tx), area (default 1 mm^2 each), rows (default 0); lists of any length. Fails with UserError on shapes
+        that do not agree or vectors not of unit length.
         """
         if not pads:
             raise UserError("taxel layout: no pads given; at least one is needed")
@@ -146,6 +145,7 @@ class TaxelLayout:
             normal=out["normal"],
             tx=out["tx"],
             ty=out["ty"],
+            rows=tuple(p.get("rows", 0) for p in pads),
         )
 
 
@@ -249,21 +249,20 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
 
 
 def hand_layout(hand: Hand) -> TaxelLayout | None:
-    """The taxels of a hand's pads, pad f on finger f; None where it has none. Mirrored and scaled as the hand is: a
-    mirrored pad keeps its y axis, its x axis turns round, so that taxel frames stay right-handed. Raises UserError."""
+    """The taxels of a hand's pads, pad f on finger f, then its skin's; None where it has none. Mirrored and scaled as
+    the hand is: a mirrored pad keeps its y axis, its x axis turns round, so that taxel frames stay right-handed. Raises
+    UserError."""
     if not hand.touches:
         return None
-    pads, rows = [], set()
-    for finger in hand.fingers:
-        own = finger.pad
-        assert own is not None  # a hand that touches has one on every finger
-        pad = load_layout(hand.folder / own.taxels, finger.body, finger.name, own.kind)
+    pads = []
+    for own in hand.pads:
+        pad = load_layout(hand.folder / own.taxels, own.body, own.name, own.kind)
         if own.rows and len(pad["point"]) % own.rows:
             raise UserError(
-                f"hand {hand.folder}: fingers.{finger.name}.pad.rows={own.rows}: its {len(pad['point'])} taxels are no"
+                f"hand {hand.folder}: fingers.{own.name}.pad.rows={own.rows}: its {len(pad['point'])} taxels are no"
                 " multiple of it; 0 where they form no lattice"
             )
-        rows.add(own.rows)
+        pad["rows"] = own.rows
         if hand.mirror:
             flip = np.array([1.0, -1.0, 1.0])
             pad["point"], pad["normal"] = pad["point"] * flip, pad["normal"] * flip
@@ -272,7 +271,7 @@ def hand_layout(hand: Hand) -> TaxelLayout | None:
             pad["point"] = pad["point"] * hand.scale
             pad["area"] = None if pad["area"] is None else pad["area"] * hand.scale**2
         pads.append(pad)
-    return replace(TaxelLayout.build(pads), rows=rows.pop() if len(rows) == 1 else 0)
+    return TaxelLayout.build(pads)
 
 
 def touch_shape(hand: Hand) -> tuple[int, int]:

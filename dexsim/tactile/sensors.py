@@ -8,18 +8,18 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.hand import Hand
-from dexsim.hand.skin import tip_skins
+from dexsim.hand.skin import link_skins, tip_skins
 from dexsim.tactile.layout import TaxelLayout, hand_layout, neighbours
 from dexsim.tactile.pressing import Skin, skin_of
 
 
 class Sensors:
-    """The pads of a hand, pad f on finger f. names [F]; layout: None for a hand without touch; bodies: what carries
-    the pads."""
+    """The pads of a hand, pad f on finger f, then its skin's. names: theirs, or the fingers' where it has none; layout:
+    None for a hand without touch; bodies: what carries the pads."""
 
     def __init__(self, hand: Hand):
         self.hand = hand
-        self.names = hand.finger_names
+        self.names = tuple(p.name for p in hand.pads) or hand.finger_names
         self.layout: TaxelLayout | None = hand_layout(hand)
 
     @property
@@ -39,23 +39,24 @@ class Sensors:
 
     @cached_property
     def tips(self) -> list[np.ndarray]:
-        """Corners [V, 3] m of each fingertip, body frames."""
-        return tip_skins(self.hand)
+        """Corners [V, 3] m of each pad's fingertip or link, body frames."""
+        tips, links = tip_skins(self.hand), dict(link_skins(self.hand) if self.hand.file.skin else [])
+        return [*tips, *(links[p.body] for p in self.hand.pads[len(tips) :])]
 
     @cached_property
     def lifted(self) -> TaxelLayout:
         """The taxels on the surfaces that the physics presses; where they are where a tip does not follow its pad, as
         with `tactile.lift=false`. Only with touch."""
         try:
-            return self._pads.lifted(self.tips)
+            return self._pads.lifted(tip_skins(self.hand))
         except UserError:
             return self._pads
 
     def lattice(self, pad: int) -> tuple[int, int] | None:
         """Columns and rows of the lattice that a pad's taxels form, k = column * rows + row; None where none is
         known."""
-        own = self.hand.fingers[pad].pad
-        return (int(self._pads.count[pad]) // own.rows, own.rows) if own is not None and own.rows else None
+        rows = self._pads.rows[pad]
+        return (int(self._pads.count[pad]) // rows, rows) if rows else None
 
     def beside(self, pad: int) -> list[list[int]]:
         """Taxels beside each taxel of a pad: in its lattice, or by where they lie where there is none."""

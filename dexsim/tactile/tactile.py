@@ -47,8 +47,12 @@ class Tactile:
     (its frame is the shape's frame), or several names. cfg: see dexsim/configs/tactile/default.yaml.
     pairs: for sum=solver, name of the engine's contact pair (pad, object) of each pad, [F] (or [F][O] for O objects).
     tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
-    other pads feel (others=true).
+    other pads feel (others=true); pads beyond them lie where they are.
     other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
+    Pads whose pairs have one name share its force, whole.
+    links: in place of the tips, (body, points [V, 3] m of its surface) of all that pads may feel of the hand itself;
+    selves: with sum=solver, name of the contact pair of each pad's body and the rest of the hand [F]: what pads on one
+    body feel of the hand is then this force, spread by the distance to the nearest link.
     lanes: a warp for each pad, on CUDA with at most 512 taxels a pad (default), else a thread; block_dim, registers:
     threads of its blocks and most registers of a thread (0: free), for CUDA only.
 
@@ -70,6 +74,8 @@ class Tactile:
         pairs: Sequence | None = None,
         tips: Sequence[np.ndarray] | None = None,
         other_pairs: Sequence[Sequence[str]] | None = None,
+        links: Sequence[tuple[str, np.ndarray]] | None = None,
+        selves: Sequence[str] | None = None,
         seed: int = 0,
         lanes: bool | None = None,
         registers: int = REGISTERS,
@@ -83,7 +89,10 @@ class Tactile:
         fits = t <= MAX_ROUNDS * LANES
         self.lanes = (self.device != "cpu" and fits) if lanes is None else lanes and fits
         self.block_dim = block_dim if self.device != "cpu" else LANES
-        others = cfg.others and tips is not None and f > 1
+        if links is None and tips is not None:
+            links = list(zip(layout.bodies, tips, strict=True))
+        near = links if cfg.others and links is not None and f > 1 else []
+        others = bool(near)
         if cfg.feel_others and not others:
             raise UserError("tactile.feel_others=true: this hand gives no tip surfaces to feel")
         solver = cfg.sum == "solver"
@@ -96,7 +105,11 @@ class Tactile:
                 if len(names) != o:
                     raise UserError(f"contact pairs of pad '{layout.names[i]}': {len(names)} given for {o} objects")
                 columns[i] = [engine.pair(name) for name in names]
-        tip_columns = np.full((f, f), -1, dtype=np.int32)
+        selves = selves if solver and others else None
+        self_columns = np.array([engine.pair(name) for name in selves or []], dtype=np.int32)
+        shared = len({tuple(row) for row in columns}) < f if solver else False
+        shared |= selves is not None and len(set(layout.bodies)) < f
+        tip_columns = np.full((f, max(f, len(near))), -1, dtype=np.int32)
         if other_pairs is not None:
             for i in range(f):
                 for j in range(f):
@@ -108,14 +121,16 @@ class Tactile:
 
         with wp.ScopedDevice(self.device):
             self._pads = _pads(engine, layout, layout.lifted(tips) if cfg.lift and tips is not None else layout)
-            self._law = _law(cfg, layout, needed=not solver or others)
-            self.tips = ShapeSet(_tip_shapes(layout, tips) if others and tips is not None else [], self.device)
+            self._law = _law(cfg, layout, needed=not solver or (others and selves is None))
+            self.tips = ShapeSet(_link_shapes(near), self.device)
             a = SimpleNamespace(
                 object_body=wp.array([engine.body(b) for b in bodies], dtype=int),
                 shape_id=wp.full((n, o), -1, dtype=int),
                 shape_size=wp.zeros((n, o), dtype=wp.vec3),
                 pair_column=wp.array(columns, dtype=int),
+                link_body=wp.array([engine.body(body) for body, _ in near], dtype=int),
                 tip_column=wp.array(tip_columns, dtype=int),
+                self_column=wp.array(self_columns, dtype=int),
                 params=wp.zeros((len(COLUMNS), n), dtype=float),
                 force=wp.zeros((n, f), dtype=float),
                 centre=wp.zeros((n, f), dtype=wp.vec3),
@@ -139,6 +154,7 @@ class Tactile:
         self._fixed = torch.tensor(low, dtype=torch.float32, device=self.device)  # [C, 1], what is not drawn
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
+        options |= {"links": len(near), "selves": selves is not None, "shared": shared}
         self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
         felt: Any = FlatFelt if self.lanes else Felt
         self._out = felt()
@@ -149,7 +165,7 @@ class Tactile:
         self._around = here = Surroundings()
         here.xpos, here.xmat = engine.wp.xpos, engine.wp.xmat
         here.pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
-        for name in ("object_body", "shape_id", "shape_size", "pair_column", "tip_column"):
+        for name in ("object_body", "shape_id", "shape_size", "pair_column", "link_body", "tip_column", "self_column"):
             setattr(here, name, getattr(a, name))
         if measured:
             if cfg.shear and o != 1:
@@ -157,8 +173,11 @@ class Tactile:
             self.by_pad = (
                 ByPad(cfg, layout, n, self.device, seed, {k: self.column(k) for k in OF_WORLD}) if cfg.pads else None
             )
-            if self.by_pad is not None and self.by_pad.rubber and o != 1:
-                raise UserError(f"tactile.pads: rubber works with one object, {o} were given")
+            if self.by_pad is not None and self.by_pad.rubber and (o != 1 or shared):
+                raise UserError(
+                    f"tactile.pads: rubber works with one object and one pad a link; {o} objects, {f} pads on"
+                    f" {len(set(layout.bodies))} links were given"
+                )
             self._measure(seed)
         everyone = torch.ones(n, dtype=torch.bool, device=self.device)
         self.randomize(everyone)
@@ -302,17 +321,17 @@ class Tactile:
             wp.launch(m.report, dim=grid, inputs=args, device=self.device)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def _baked(corners: bytes) -> Grid:
-    grid = bake_convex(np.frombuffer(corners).reshape(-1, 3))
+    points = np.frombuffer(corners).reshape(-1, 3)
+    grid = bake_convex(points, spacing=max(0.5e-3, float(np.ptp(points, 0).max()) / 128))
     grid.data.flags.writeable = False  # whoever asks has this one
     return grid
 
 
-def _tip_shapes(layout: TaxelLayout, tips: Sequence[np.ndarray]) -> list[TouchShape]:
-    """Distance grids of the tips; equal tips share one, whoever asks."""
-    grids = [_baked(np.ascontiguousarray(corners, dtype=float).tobytes()) for corners in tips]
-    return [TouchShape(f"tip_{name}", "grid", grid) for name, grid in zip(layout.names, grids, strict=True)]
+def _link_shapes(links: Sequence[tuple[str, np.ndarray]]) -> list[TouchShape]:
+    """Distance grids of links; equal ones share one, whoever asks."""
+    return [TouchShape(body, "grid", _baked(np.ascontiguousarray(x, dtype=float).tobytes())) for body, x in links]
 
 
 def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:

@@ -21,7 +21,7 @@ from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.couplings import Couplings
 from dexsim.hand.places import places
-from dexsim.hand.skin import tip_skins
+from dexsim.hand.skin import link_skins, tip_skins
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.memory import give_back
@@ -54,21 +54,38 @@ UNIT_PALM = 0.025
 
 def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[ContactPair, ...]:
     """Contact pairs of the hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object (F .. 2F-1),
-    palm on object (2F), distal link on the hand itself (2F+1 .. 3F), then fingertips on each of the bodies `parts`. A
-    fingertip of several geoms counts as its whole distal link. root: the hand's root body."""
-    obj = ("body", OBJECT)
+    palm on object (2F), distal link on the hand itself (2F+1 .. 3F); of links with skin, on the object and on the hand
+    itself; then fingertips and those links on each of the bodies `parts`. A fingertip of several geoms counts as its
+    whole distal link. root: the hand's root body."""
+    obj, own = ("body", OBJECT), ("subtree", root)
     tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
+    felt = dict(pad_pairs(hand))
+    links = {p.body: name for p, name in zip(hand.pads, self_pairs(hand), strict=True) if p.body not in hand.tip_bodies}
     return (
         *(ContactPair(f"tip_{f.name}", tip, obj) for f, tip in zip(hand.fingers, tips, strict=True)),
         *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
         ContactPair("palm", ("body", hand.palm_body), obj),
-        *(ContactPair(f"self_{f.name}", ("body", f.body), ("subtree", root)) for f in hand.fingers),
-        *(
-            ContactPair(f"tip_{f.name}:{body}", tip, ("body", body))
-            for body in parts
-            for f, tip in zip(hand.fingers, tips, strict=True)
-        ),
+        *(ContactPair(f"self_{f.name}", ("body", f.body), own) for f in hand.fingers),
+        *(ContactPair(name, first, obj) for name, first in felt.items() if name.startswith("link_")),
+        *(ContactPair(name, ("body", body), own) for body, name in links.items()),
+        *(ContactPair(f"{name}:{body}", first, ("body", body)) for body in parts for name, first in felt.items()),
     )
+
+
+def pad_pairs(hand: Hand) -> list[tuple[str, tuple[str, str]]]:
+    """Name of the contact pair with the object whose force each pad feels (each fingertip, without touch), and its
+    first member: the fingertip; where a link has skin, the link, whose pads share its force."""
+    skin = {p.body for p in hand.file.skin}
+    tips = {f.body: ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers}
+    names = dict(zip(hand.tip_bodies, hand.finger_names, strict=True))
+    bodies = [*hand.tip_bodies, *(p.body for p in hand.file.skin)]
+    return [(f"link_{b}", ("body", b)) if b in skin else (f"tip_{names[b]}", tips[b]) for b in bodies]
+
+
+def self_pairs(hand: Hand) -> list[str]:
+    """Name of the contact pair of each pad's body and the rest of the hand."""
+    tips = dict(zip(hand.tip_bodies, hand.finger_names, strict=True))
+    return [f"self_{tips[p.body]}" if p.body in tips else f"hand_{p.body}" for p in hand.pads]
 
 
 def hand_of(cfg: dict) -> Hand:
@@ -106,7 +123,7 @@ class Built(VecEnv):
         base = self.scene.base
         self.joints = self.hand.joints if base is None else (*self.hand.joints, *BASE)
         self.num_envs, self.device, self.num_actions = n_worlds, device, len(self.joints)
-        self.fingers, self.pads = len(self.hand.fingers), len(self.hand.fingers) if self.hand.touches else 0
+        self.fingers, self.pads = len(self.hand.fingers), len(self.hand.pads)
         self.decimation, self.dt = _periods(sim, self.task)
         if self.task["action"]["mode"] not in ("relative", "absolute"):
             raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
@@ -195,7 +212,8 @@ class Built(VecEnv):
                 self.engine.mjm, self.objects.hand_geoms.tolist()
             )
         shown = [v.shape for v in table.variants] if table is not None else []
-        pairs = [[f"tip_{f}", *(f"tip_{f}:{body}" for body in bodies)] for f in self.hand.finger_names]
+        pairs = [[name, *(f"{name}:{body}" for body in bodies)] for name, _ in pad_pairs(self.hand)]
+        skin = bool(self.hand.file.skin)
         self.touch = Tactile(
             self.engine,
             hand_layout(self.hand) or tip_layout(self.hand),
@@ -204,6 +222,8 @@ class Built(VecEnv):
             cfg["tactile"],
             pairs=pairs,
             tips=tip_skins(self.hand) if self.hand.touches else None,
+            links=link_skins(self.hand) if skin else None,
+            selves=self_pairs(self.hand) if skin else None,
         )
         for k, part in enumerate(self.furniture.parts, 1):
             self.touch.shape_id[:, k] = len(shown) + k - 1
@@ -272,6 +292,7 @@ class Built(VecEnv):
         self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self.effort = torch.as_tensor(efforts, dtype=torch.float32, device=dev)
         self.tip_body = long([e.body(b) for b in hand.tip_bodies])
+        self.pad_body = long([e.body(b) for b in self.touch.layout.bodies])
         self.pad_centre = torch.as_tensor(self.touch.layout.centre(), dtype=torch.float32, device=dev)
         self.tip_offset = torch.tensor([f.position for f in hand.fingers], dtype=torch.float32, device=dev)
         # fingers that press against the others, and those; the joints whose torque closes each finger

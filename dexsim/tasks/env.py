@@ -34,7 +34,8 @@ class HandEnv(Kept):
     """N hands with one object each. A task subclasses it; see `tasks/grasp.py`.
 
     Shapes: actions [N, J] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
-    dones [N]. J joints, F fingers, P touch pads (F, or 0 without touch) in the hand's order. Positions are in the palm
+    dones [N]. J joints, F fingers, P touch pads (F and those of its skin,
+    or 0 without touch) in the hand's order. Positions are in the palm
     frame, which is the world frame (the hand is fixed; gravity turns). `unit`: the hand's span over UNIT_SPAN;
     `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """

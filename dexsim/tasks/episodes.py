@@ -161,7 +161,7 @@ class Episodes(Built):
         self._act_args = [wp.from_torch(x) for x in (self.q, self.action, self.last_action, self.target)]
         touch = self.touch
         self._touch_args = [
-            at.tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
+            wp.from_torch(self.pad_body.to(torch.int32)), wp.from_torch(self.pad_centre, dtype=wp.vec3),
             *map(wp.from_torch, (touch.force, touch.force_clean, touch.force_other)),
             *(wp.from_torch(x, dtype=wp.vec3) for x in (touch.centre, touch.centre_clean)),
         ]  # fmt: skip

@@ -95,7 +95,7 @@ def _play(
         alive = alive & ~over
         if shown and k * env.dt < SHOWN_S:
             qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
-            forces.append(env.touch.force_clean[shown].cpu().numpy())
+            forces.append(env.touch.force_clean[shown][:, : env.fingers].cpu().numpy())
         if k % 20 == 19:
             if progress is not None:
                 at = before + min(n, episodes - before) * (k + 1) // env.max_episode_length

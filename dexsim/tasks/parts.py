@@ -193,21 +193,21 @@ class TipMotion(Task):
         self.tip_rot, self.tip_last = rot, self.tips
 
     def taxels(self) -> torch.Tensor:
-        """Places of all taxels [F, T, 3] m in the frames of the fingertips' links."""
+        """Places of all taxels [P, T, 3] m in the frames of their pads' links."""
         layout = hand_layout(self.hand) or tip_layout(self.hand)
         lifted = layout.lifted(tip_skins(self.hand)) if self.touch.cfg.lift and self.pads else layout
         return torch.as_tensor(lifted.point, dtype=torch.float32, device=self.device)
 
     def plain_centre(self, point: torch.Tensor) -> torch.Tensor:
-        """Contact centres [N, F, 3] without force weighting: the mean position of the taxels, `taxels()`, that feel
+        """Contact centres [N, P, 3] without force weighting: the mean position of the taxels, `taxels()`, that feel
         anything."""
         assert self.touch.raw is not None  # asked for by the task
         on = (self.touch.raw > 0).float()
         count = on.sum(-1, keepdim=True)
         mean = torch.einsum("nft,ftc->nfc", on, point) / count.clamp(min=1)
-        return self.of_tips(torch.where(count > 0, mean, self.pad_centre))
+        return self.of_pads(torch.where(count > 0, mean, self.pad_centre))
 
-    def of_tips(self, local: torch.Tensor) -> torch.Tensor:
-        """Places [N, F, 3] in the palm frame of those in the frames of the fingertips' links."""
-        pos, rot = self.engine.t.xpos[:, self.tip_body].float(), self.engine.t.xmat[:, self.tip_body].float()
+    def of_pads(self, local: torch.Tensor) -> torch.Tensor:
+        """Places [N, P, 3] in the palm frame of those in the frames of the pads' links."""
+        pos, rot = self.engine.t.xpos[:, self.pad_body].float(), self.engine.t.xmat[:, self.pad_body].float()
         return pos + (rot @ local[..., None])[..., 0]

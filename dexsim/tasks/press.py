@@ -72,12 +72,12 @@ def _pressed(hand: Hand, finger: Finger, limit: list[float], stiffness: float, f
     middle of the pad's distal half; the other joints hold. Static: C MuJoCo until at rest.
     """
     layout = hand_layout(hand)
-    if layout is None or not layout.rows or len(finger.flexion) < 2:
+    own = hand.fingers.index(finger)
+    if layout is None or not layout.rows[own] or len(finger.flexion) < 2:
         raise UserError(
             f"hand {hand.folder}: force (press): needs pads whose taxels form a lattice (rows) and two flexion joints;"
             " state a force [N], or null"
         )
-    own = hand.fingers.index(finger)
     root, second = (hand.joints[j] for j in finger.flexion[:2])
     spec = hand.spec()
     spec.option.timestep = 0.001
@@ -96,8 +96,8 @@ def _pressed(hand: Hand, finger: Finger, limit: list[float], stiffness: float, f
     mujoco.mj_forward(model, data)
     body = data.body(finger.body)
     points = layout.point[own, : layout.count[own]]
-    half = layout.rows // 2
-    centre = body.xmat.reshape(3, 3) @ points.reshape(-1, layout.rows, 3)[:, half:].mean((0, 1)) + body.xpos
+    half = layout.rows[own] // 2
+    centre = body.xmat.reshape(3, 3) @ points.reshape(-1, layout.rows[own], 3)[:, half:].mean((0, 1)) + body.xpos
     normal = body.xmat.reshape(3, 3) @ np.array(finger.normal)
     top = (body.xmat.reshape(3, 3) @ points.T).T @ normal + body.xpos @ normal
     data.mocap_pos[0] = centre + normal * (top.max() - centre @ normal + RADIUS)

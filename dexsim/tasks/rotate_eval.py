@@ -250,7 +250,7 @@ def _play(
         alive = alive & ~ended
         if shown and k * dt < SHOWN_S:
             qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
-            force.append(env.touch.force_clean[shown].cpu().numpy())
+            force.append(env.touch.force_clean[shown][:, : env.fingers].cpu().numpy())
             score.append(count[shown].cpu().numpy())
             if env.touch.raw is not None:
                 taxels.append(env.touch.raw[shown].cpu().numpy())

@@ -255,7 +255,7 @@ class FingertipEnv(TipTrials, RotateEnv):
         """force-weighted mean of taxel positions, palm frame; of observe.taxels where they are set"""
         if self.clean or self.patches is None:
             return super().contact_centre()
-        return self.of_tips(self.patches.read(self.touch.raw)[1])
+        return self.of_pads(self.patches.read(self.touch.raw)[1])
 
     @observe("N")
     def contact_force(self) -> torch.Tensor:

@@ -92,7 +92,7 @@ def clear_touch(
     mask: wp.array(dtype=wp.bool),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
-    tip_body: wp.array(dtype=int),
+    pad_body: wp.array(dtype=int),
     pad_centre: wp.array(dtype=wp.vec3),
     # out
     force: wp.array2d(dtype=float),
@@ -107,7 +107,7 @@ def clear_touch(
         force[w, f] = float(0.0)
         force_clean[w, f] = float(0.0)
         force_other[w, f] = float(0.0)
-        b = tip_body[f]
+        b = pad_body[f]
         here = xpos[w, b] + xmat[w, b] * pad_centre[f]
         centre[w, f] = here
         centre_clean[w, f] = here

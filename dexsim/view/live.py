@@ -179,7 +179,7 @@ class LiveView:
         self._facts = gui.add_html("")
         with gui.add_folder("Touch"):
             feels = bool(self.env.pads)
-            self._labels = gui.add_html(panels.pad_labels(self.fingers), visible=feels)
+            self._labels = gui.add_html(panels.pad_labels(list(self.env.touch.layout.names)), visible=feels)
             self._image = gui.add_image(
                 self._map.image(np.zeros(self.env.touch.layout.area.shape), 1.0), format="png", visible=feels
             )
@@ -327,7 +327,8 @@ class LiveView:
         if raw is not None:
             self._image.image = self._map.image(forces, self._full_taxel)
         force = env.touch.force[w].cpu().numpy()
-        self._forces.content = panels.force_bars(self.fingers, force, self._commanded(w), self._full_force)
+        fingers = force[: len(self.fingers)]
+        self._forces.content = panels.force_bars(self.fingers, fingers, self._commanded(w), self._full_force)
         terms = {k: float(v[w]) for k, v in self._terms.items()}
         self._full_reward = max([0.99 * self._full_reward, 0.05, *(abs(v) for v in terms.values())])
         if terms:

@@ -148,6 +148,7 @@ class Tile:
         pads = None
         if self._taxels is not None:
             pads = self._map.pictures(self._taxels[k], self._full_taxel, np.array(DARK, np.uint8))
+            pads = pads[: len(self._settings["names"])]  # fingers'
         lines = self._clip["text"]
         text = "   ".join(t for t in (self._clip["label"], lines[min(k, len(lines) - 1)] if lines else "") if t)
         return annotate(
