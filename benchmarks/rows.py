@@ -6,8 +6,8 @@
 
 table: `rotation` and `grasp` are the paper's tables, `fingertips` asks with less help from the palm what each sense is
 worth, `skin` what touch on palm and links adds to a grasp. rows: by name (all). seeds: one training each. gpus: as many
-trainings at a time as there are names; none: one, on the CPU. judge: settings of `dexsim play`, such as episodes=256. Goes on where it was interrupted: what was judged is
-not repeated, and a training resumes from its last.pt.
+trainings at a time as there are names; none: one, on the CPU. judge: settings of `dexsim play`, such as episodes=256.
+Goes on where it was interrupted: what was judged is not repeated, and a training resumes from its last.pt.
 
 Prints a table beside the paper's numbers, and every ordering that the paper claims: the difference of means over seeds
 with its 95 % interval (Welch), which needs two seeds of each row. Writes OUT/TABLE.json.
