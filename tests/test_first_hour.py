@@ -9,7 +9,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from bundles import make_checkpoint
 
+from dexsim import export
 from dexsim.cli import first_hour
 from dexsim.cli.main import main
 from dexsim.deploy.driver import PASSIVE, VirtualClock
@@ -23,12 +25,12 @@ JOINTS = "thumb_bend_joint,index_joint1"
 STEPS = ["connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "lowest"]
 
 
-def walk(out, hand=LaggingHand, steps=STEPS, **faults):
+def walk(out, hand=LaggingHand, steps=STEPS, more=(), **faults):
     """(status, check.json, the fake, what was said)."""
     clock, said = VirtualClock(5.0), []
     package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0, "press": 11} | faults))
     driver = VendorXHand("auto", clock, package, side="right")
-    given = first_hour.KEYS | {"yes": "true", "joints": JOINTS, "port": "fake"}
+    given = first_hour.KEYS | {"yes": "true", "joints": JOINTS, "port": "fake"} | dict(more)
     status = first_hour.walk(driver, load_hand("xhand"), clock, steps, given, out, said.append)
     return status, json.loads((out / "check.json").read_text()), driver.body._sdk, "\n".join(said)
 
@@ -125,9 +127,40 @@ def test_the_command_line_is_checked_before_anything_moves(tmp_path, capsys):
         first_hour.make_driver(first_hour.KEYS | {"driver": "x"}, load_hand("xhand"))
 
 
+SERVO = """
+drive: torque
+joints:
+  "*": {kp: 4.0, torque_limit: 1.1}
+  index_joint1: {kp: {value: 1.9, low: 1.7, high: 2.1}, delay: {value: 0.05, low: 0.045, high: 0.055}}
+fitted: {index_joint1: {kp: 1.9}}
+"""
+
+
+@pytest.mark.slow
+def test_a_hand_is_held_against_what_a_bundle_was_trained_for(tmp_path):
+    """Slower by 60 ms, softer by its fitted drive, and short of its range by half a radian: each is said."""
+
+    class Short(Sticky):
+        def advance(self, t):
+            self.target[4] = min(self.target[4], 1.4)
+            super().advance(t)
+
+    made = export.export(str(make_checkpoint(tmp_path / "policy.pt")), tmp_path / "bundle", steps=2)
+    (tmp_path / "servo.yaml").write_text(SERVO)
+    given = {"bundle": str(made), "joints": "index_joint1"}
+    _, found, _, said = walk(tmp_path, partial(Short, dead=0.06), ["cycles", "signs", "latency", "bundle"], given)
+    step = found["steps"]["bundle"]
+    assert step["verdict"] == "look" and "your hand is slower than what this policy was trained for" in said
+    assert step["figures"]["latency_ms"] - step["figures"]["trained_ms"] > 30
+    assert "index_joint1: kp is 1.9 N.m/rad, training drew 3 to 5" in said
+    assert "index_joint1: delay is 0.05 s, training drew 0.01 to 0.025" in said
+    assert "the policy's targets go farther than the hand: index_joint1" in said and "short of their range" in said
+    assert "encoders at rest 0.0014 rad, in training 0.003" in said
+
+
 @pytest.mark.slow
 def test_the_whole_hour_on_the_fake_with_the_simulated_hand(tmp_path):
-    """In real time, the hand in its own process, with the excitation, its audit and its diagnosis."""
+    """In simulated time, with the excitation, its audit, its diagnosis and the calibration of touch."""
     done = subprocess.run(
         [sys.executable, "-m", "dexsim", "deploy", "check", "port=fake:press=11", "yes=true", f"out={tmp_path / 'o'}",
          "joints=index_joint1,index_joint2", "excite_current=1500", "kinds=steps", "limit=60"],
@@ -135,4 +168,4 @@ def test_the_whole_hour_on_the_fake_with_the_simulated_hand(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     names = {p.name for p in (tmp_path / "o").iterdir()}
-    assert names >= {"report.html", "check.json", "check.mcap", "excite.mcap", "servo.yaml", "audit.txt"}
+    assert names >= {"report.html", "check.json", "check.mcap", "excite.mcap", "servo.yaml", "audit.txt", "calibration"}

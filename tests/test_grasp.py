@@ -411,7 +411,7 @@ def test_nan_actions_are_harmless(env):
 
 
 def test_relative_actions_move_the_target_within_limits_and_lead(env):
-    scale, lead = env.task["action"]["scale"], env.task["action"]["lead"]
+    scale, lead = env.task["action"]["scale"], env.lead()
     start, q = env.target.clone(), env.q.clone()
     a = torch.linspace(-2, 2, 12).expand(N, 12)
     env.step(a)

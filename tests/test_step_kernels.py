@@ -192,7 +192,7 @@ def test_actions_become_targets(env, mode):
         assert env.action[0, 0] == 0 and env.action[1, 1] == 1 and env.action[2, 2] == -1
         if mode == "relative":
             target = target + a * setting["scale"]
-            target = torch.maximum(torch.minimum(target, env.q + setting["lead"]), env.q - setting["lead"])
+            target = torch.maximum(torch.minimum(target, env.q + env.lead()), env.q - env.lead())
         else:
             target = env.q_mid + a * env.q_half
         target = torch.maximum(torch.minimum(target, env.q_high), env.q_low)
@@ -204,7 +204,7 @@ def test_actions_become_targets(env, mode):
 
 def test_a_lead_that_follows_from_the_torque_loses_none_of_it(env):
     """Targets run ahead to where the drive is at its limit, and no further: the drive pushes as hard as it can."""
-    env.task["action"]["lead"], kept = None, env.task["action"]["lead"]
+    assert env.task["action"]["lead"] is None, "the default"
     try:
         limit, kp = (env.servo.nominal[:, INDEX[k]] for k in ("torque_limit", "kp"))
         torch.testing.assert_close(env.lead(), (limit / kp).float())
@@ -214,7 +214,6 @@ def test_a_lead_that_follows_from_the_torque_loses_none_of_it(env):
         ahead = torch.minimum((limit / kp).float(), env.q_high - env.q_low)
         torch.testing.assert_close(env.target - env.q, ahead.expand(N, -1))
     finally:
-        env.task["action"]["lead"] = kept
         env.reset_all()
 
 

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 import torch
 from bundles import make_checkpoint
+from worlds import task_cfg
 
 from dexsim import export
 from dexsim.calibration.file import Calibration
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, VirtualClock
-from dexsim.deploy.fake_xhand import FakeXHand, Faults, LaggingHand
+from dexsim.deploy.fake_xhand import ENCODER_JITTER, FakeXHand, Faults, LaggingHand
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.recorder import Recorder
 from dexsim.deploy.vendor import VendorXHand, VendorXHands, XHandBus
@@ -261,6 +262,21 @@ def test_opening_is_tried_three_times():
     assert 5.0 < d.clock.now() < 7.0 and time.perf_counter() - before < 2.0
     with pytest.raises(UserError, match="does not open"):
         opened(opens=6)
+
+
+def test_ethercat_is_tried_three_times_and_goes_to_init_before_it_is_closed():
+    d = driver(VirtualClock(1.0), port="ethercat", ethercat=1, opens=2)
+    assert d.open()["port"] == "eth9" and 7.0 < d.clock.now() < 8.0, "two pauses of 3 s"
+    d.close()
+    fake = d.body._sdk
+    assert [state for _, state in fake.firmware] == [1] and fake.firmware[0][0] + 0.1 < fake.closed[-1]
+    with pytest.raises(UserError, match="cap_net_raw"):
+        driver(VirtualClock(1.0), port="ethercat:eth9", ethercat=1, opens=3).open()
+
+
+def test_training_draws_more_noise_than_the_encoders_have():
+    for task in ("grasp", "rotate"):
+        assert task_cfg(task=task)["task"]["sensors"]["joint_noise"] > ENCODER_JITTER
 
 
 def test_a_hand_that_is_plugged_in_again_is_found_at_its_new_port():

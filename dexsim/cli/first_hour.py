@@ -247,7 +247,7 @@ class Hour:
         strains."""
         step = Step("signs", "Signs and ranges, joint by joint")
         self.s.move(_still(self.middle), 4.0, self.amps)
-        rows = {}
+        rows: dict[str, Any] = {}
         for j in self.joints:
             low, high = self.hand.limits[j]
             reach = 0.6 * min(self.middle[j] - low, high - self.middle[j])
@@ -531,15 +531,17 @@ class Hour:
         if not (self.out / "servo.yaml").is_file():
             return [], {}
         fitted, trained = ServoTable.load(self.out / "servo.yaml"), ServoTable.from_dict(b.config["servo"])
-        drawn, words, rows = b.config.get("randomize", {}).get("servo") or {}, [], {}
+        drawn = b.config.get("randomize", {}).get("servo") or {}
+        words: list[str] = []
+        rows: dict[str, Any] = {}
         for joint in fitted.fitted or ():
             for column, unit in DRIVE.items():
                 here, there = fitted.value(joint, column), trained.value(joint, column)
                 range_ = drawn.get(column, 1.0 if column in RELATIVE else 0.0)
                 range_ = range_["log"] if isinstance(range_, dict) else np.broadcast_to(range_, 2)
+                if here.value is None or there.value is None or not np.isfinite([here.value, there.value]).all():
+                    continue  # not known, or without a limit
                 low, high = (there.value * r if column in RELATIVE else there.value + r for r in map(float, range_))
-                if not np.isfinite([here.value, low, high]).all():
-                    continue
                 rows.setdefault(joint, {})[column] = {"here": here.value, "low": here.low, "high": here.high,
                                                       "trained": [low, high]}  # fmt: skip
                 if here.low > high or here.high < low:

@@ -42,7 +42,8 @@ class Faults:
     refused with the code `refuse`; unplug_s: the cable is out for two seconds, and the port's number is another then;
     outlier: share of round trips of 111 ms; opens: how often opening fails first; limp: what makes the hand limp
     (passive: mode 0, torque: a torque limit of 0, never); sdk: version, 0.10.3 has unsigned currents; side, serial;
-    second: serial number of a second hand on the same bus, of the other side;
+    second: serial number of a second hand on the same bus, of the other side; ethercat: 1: its bus is EtherCAT, on
+    `eth9`, and no serial port has it;
     press: the taxel that is felt when somebody presses a finger, later presses of it wander over its pad, -1: none;
     dead: a taxel that says nothing, on every board; jitter rad of the encoders; seed; log: a
     file to which a line is added for each command that the hand has taken, its time (monotonic, s), mode and largest
@@ -66,6 +67,7 @@ class Faults:
     side: str = "R"
     serial: str = "FAKE0001"
     second: str = ""
+    ethercat: int = 0
     press: int = -1
     dead: int = -1
     jitter: float = ENCODER_JITTER
@@ -134,6 +136,8 @@ class FakeXHand:
                 hand.advance(k * TRIP)  # compiles what is left
         self.zero = clock.now()
         self._slip = -self.hand.time
+        self.firmware: list[tuple[float, int]] = []  # when it was asked to go to which EtherCAT state
+        self.closed: list[float] = []
         self.opened, self.pressed, self.presses = 0, (-1, 0.0), [0] * BOARDS
         # when a command went over the wire, and what, by hand; of the first
         self.by_hand: list[list[tuple[float, tuple]]] = [[] for _ in self.hands]
@@ -178,6 +182,8 @@ class FakeXHand:
 
     def ports(self) -> dict[str, bool]:
         """Serial ports now, and whether the hand's bus is on it: the other is its auxiliary one."""
+        if self.faults.ethercat:
+            return {"eth9": True}
         if self.faults.unplug_s <= self.time < self.faults.unplug_s + 2.0:
             return {}
         first = 2 if self.time >= self.faults.unplug_s else 0
@@ -240,8 +246,8 @@ class _Control:
     # -- the package's calls
     # ---------------------------------------------------------------------------------------------------------------
     def enumerate_devices(self, kind: str) -> list[str]:
-        """Ports of a kind: RS485."""
-        return list(self._fake.ports()) if kind == "RS485" else []
+        """Ports of a kind: RS485, EtherCAT."""
+        return list(self._fake.ports()) if kind == ("EtherCAT" if self._fake.faults.ethercat else "RS485") else []
 
     def open_serial(self, port: str, baud: int) -> SimpleNamespace:
         """Error object."""
@@ -254,8 +260,17 @@ class _Control:
         return _error()
 
     def open_ethercat(self, name: str) -> SimpleNamespace:
-        """Error object: there is none."""
-        return _error(CLOSED, f"no EtherCAT on {name}")
+        """Error object."""
+        self._fake.opened += 1
+        if not self._fake.faults.ethercat or name != "eth9" or self._fake.opened <= self._fake.faults.opens:
+            return _error(CLOSED, f"no EtherCAT on {name}")
+        self._port = name
+        return _error()
+
+    def set_firmware_state(self, hand: int, state: int, *_: int) -> SimpleNamespace:
+        """Of EtherCAT; error object."""
+        self._fake.firmware.append((self._fake.time, state))
+        return _error()
 
     def list_hands_id(self) -> list[int]:
         """Ids on the bus; none on the auxiliary port."""
@@ -304,6 +319,7 @@ class _Control:
 
     def close_device(self) -> None:
         """The hand keeps its last command."""
+        self._fake.closed.append(self._fake.time)
         self._port = ""
 
     # -- the wire

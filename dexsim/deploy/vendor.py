@@ -484,13 +484,14 @@ class VendorXHands(BusDriver):
         make = partial(XHandsBus, port=port, serials=serials, sides=sides, package=package)
         super().__init__(make, n * JOINTS, (n * TAXELS[0], TAXELS[1]), clock, hang)
         labels = map(_label, serials, sides)
+        self._parts: list[HandCommand | None] = [None] * n
         self.hands = [OneOfTwo(self, k, label) for k, label in enumerate(labels)]
 
     def open(self) -> dict[str, str]:
         """Connect, whichever hand asks first; returns what to log. Raises UserError."""
         with self._parts_lock:
             if not self._opened:
-                self._info, self._parts, self._opened = super().open(), [None] * len(self.hands), True
+                self._info, self._opened = super().open(), True
             return self._info
 
     _opened, _info = False, {}  # type: ignore[var-annotated]
