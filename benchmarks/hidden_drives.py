@@ -4,11 +4,12 @@
     [out=out/hidden_drives]
 
 Each case draws a hand, a drive that other joints follow (by mimic, equality or tendon; any drive where none does), and
-play, dry friction or elasticity between that drive and its joints. Three drives move, the one with the effect among
-them. The hand is C MuJoCo's model with all of its coupled joints, which the diagnosis does not simulate; its gains,
-limits and friction are each up to 3 % off what is believed; readings come as a bus gives them (rate, jitter, counts,
-milliamperes). seed: a number, or `source`: read off the sources. Named: the first finding is this effect of this drive
-and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case, and one of JSON.
+play, dry friction or elasticity between that drive and its joints. Two drives move, the one with the effect and
+another. The effect alone changes a recording by 16 to 32 times the noise of the readings. The hand is C MuJoCo's model
+with all of its coupled joints, which the diagnosis does not simulate; its loop reads the motor, the recording has the
+joint; its gains, limits and friction are each up to 3 % off what is believed; readings come as a bus gives them (rate,
+jitter, counts, milliamperes). seed: a number, or `source`: read off the sources. Named: the first finding is this
+effect of this drive and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case, and one of JSON.
 """
 
 from __future__ import annotations
@@ -33,8 +34,11 @@ SETTINGS = {"hands": "", "cases": 20, "seed": "1", "jobs": 1, "limit": 600, "out
 KINDS = {"play": "backlash", "friction": "coulomb_friction", "elasticity": "compliance"}
 """What is hidden, and the effect of the catalogue that it is."""
 OFF = 0.03  # how far off each believed figure may be
-MOVED = 3  # drives that a recording moves
-RECORDINGS = {"a": ("triangles", "ladder", "steps"), "b": ("chirp", "random", "holds"), "c": ("random", "triangles")}
+MOVED = 2  # drives that a recording moves
+NOISE = 6e-4  # rad: of the readings, a 4096th of a turn and its jitter
+LARGE = (16.0, 32.0)  # times that, in what the effect alone changes; what a refit leaves of it is about half
+SIZED = 40.0  # s of the first recording that it is sized on
+RECORDINGS = {"a": ("triangles", "steps"), "b": ("chirp", "ladder"), "c": ("random", "triangles")}
 """Kinds of motion of each; the last is held out."""
 
 
@@ -47,14 +51,26 @@ def drives(hand: Any) -> list[str]:
     return led or list(hand.joints)
 
 
-def size(kind: str, rng: np.random.Generator, span: float, limit: float) -> dict[str, float]:
-    """Return the column of the servo that has the effect, and its value: added to what is there. Play: 4 to 10 % of the
-    drive's range; friction: 15 to 35 % of its torque limit; elasticity: 6 to 15 % of its range at the torque limit."""
-    if kind == "play":
-        return {"backlash": float(rng.uniform(0.04, 0.10) * span)}
-    if kind == "friction":
-        return {"coulomb_friction": float(rng.uniform(0.15, 0.35) * limit)}
-    return {"softness": float(rng.uniform(0.06, 0.15) * span / limit)}
+def sized(true: Any, hidden: str, kind: str, least: float, p: Any, span: float, limit: float) -> dict[str, float]:
+    """Return the column of the servo that has the effect, and what is added to it. It grows from a hundredth of the
+    drive's range (play), of its torque limit (friction), or of the range at that limit (elasticity), in steps of a
+    half, until the motion of a plan `p` differs by `least` rad or m (rms) from the one without."""
+    from dexsim.recording.mechanism import drive
+    from dexsim.recording.schema import Series
+
+    column, unit = {"play": ("backlash", span), "friction": ("coulomb_friction", limit),
+                    "elasticity": ("softness", span / limit)}[kind]  # fmt: skip
+    before, k = true.table.value(hidden, column).value or 0.0, true.joints.index(hidden)
+
+    def moved(value: float) -> np.ndarray:
+        true.table.set(hidden, column, before + value)
+        run = drive(true, Series(p.t, p.value), true.joints, min(float(p.t[-1]), SIZED), initial=p.home, timestep=0.002)
+        return run.position[:, k]
+
+    plain, value = moved(0.0), 0.01 * unit
+    while np.sqrt(np.mean((moved(value) - plain) ** 2)) < least and value < unit:
+        value *= 1.5
+    return {column: value}
 
 
 def make(folder: Path, which: Path, kind: str, rng: np.random.Generator) -> dict[str, Any]:
@@ -69,7 +85,8 @@ def make(folder: Path, which: Path, kind: str, rng: np.random.Generator) -> dict
 
     quiet_warp("cpu")
     hand = load_hand(which)
-    believed, true = of_hand(hand), of_hand(hand)
+    servo = of_hand(hand).table.to_dict() | {"loop_encoder": "motor"}
+    believed, true = of_hand(hand, servo), of_hand(hand, servo)
     hidden = str(rng.choice(drives(hand)))
     others = [j for j in hand.joints if j != hidden]
     moved = [hidden, *(str(j) for j in rng.permutation(others)[: MOVED - 1])]
@@ -79,21 +96,18 @@ def make(folder: Path, which: Path, kind: str, rng: np.random.Generator) -> dict
             if (value := true.table.value(joint, column).value) is not None:
                 true.table.set(joint, column, value * (1 + rng.uniform(-OFF, OFF)))
     k = hand.joints.index(hidden)
-    changed = size(kind, rng, float(np.ptp(hand.limits[k])), float(hand.efforts[k]))
-    for column, value in changed.items():
-        true.table.set(hidden, column, value + (true.table.value(hidden, column).value or 0.0))
     folder.mkdir(parents=True, exist_ok=True)
-    seconds = 0.0
-    for name, kinds in RECORDINGS.items():
-        p = plan(believed, moved, kinds, seed=int(rng.integers(1 << 30)))
+    plans = [plan(believed, moved, kinds, seed=int(rng.integers(1 << 30))) for kinds in RECORDINGS.values()]
+    least = float(rng.uniform(*LARGE)) * NOISE
+    changed = sized(true, hidden, kind, least, plans[0], float(np.ptp(hand.limits[k])), float(hand.efforts[k]))
+    for name, p in zip(RECORDINGS, plans, strict=True):
         run = drive(true, Series(p.t, p.value), hand.joints, float(p.t[-1]), initial=p.home)
         dense = recorded(run, believed, Series(p.t, p.value, COMMANDS), hand.joints, rate=500.0)
         seen = realistic(dense, seed=int(rng.integers(1 << 30)))
         seen.meta["source"] = "real"
         write(folder / f"{name}.mcap", seen)
-        seconds += float(p.t[-1])
     return {"hand": str(which), "kind": kind, "effect": KINDS[kind], "joint": hidden, "moved": moved, **changed,
-            "seconds": round(seconds, 1)}  # fmt: skip
+            "seconds": round(sum(float(p.t[-1]) for p in plans), 1)}  # fmt: skip
 
 
 def score(truth: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:

@@ -92,6 +92,7 @@ def replay_recording(
         raise UserError(f"timestep={timestep}: must be a number from 0.0001 to 0.02 s")
     quiet_warp("cpu")
     m = mechanism.for_recording(recording, model, servo)
+    recording = mechanism.driven(recording, m)
     run = mechanism.replay(recording, m, timestep)
     return mechanism.recorded(run, m, recording.commands, recording.joints)
 

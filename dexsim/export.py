@@ -422,7 +422,8 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
 
     if hasattr(of, "SIGNALS"):
         own = of.SIGNALS
-        signals = own.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in own.Signals._fields))
+        there = {k: rows[f"signal_{k}"] for k in own.Signals._fields if f"signal_{k}" in rows}  # an older one has fewer
+        signals = own.Signals(**{k: torch.from_numpy(x) for k, x in there.items()})
         return own.build(signals, of.settings(b.manifest)).numpy()
     from dexsim.calibration.file import Calibration
 

@@ -133,6 +133,8 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         return pickle.loads(receive.recv_bytes())
     except EOFError:
         return ""
+    except ValueError:  # MuJoCo writes a model cut off where it is given no more memory
+        return "needs more memory to read than it may have"
 
 
 def _child(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import re
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
@@ -15,6 +17,8 @@ from dexsim import files, guard
 from dexsim.errors import UserError
 
 Edit = Callable[[mujoco.MjSpec], None] | None
+MAX_BESIDE = 256 << 20
+"""Bytes of meshes, with which the limits of reading grow at most."""
 MAX_DOFS = 1000
 """Degrees of freedom of a model."""
 
@@ -24,13 +28,34 @@ def read(path: Path, where: str, edit: Edit = None) -> mujoco.MjSpec:
     Raises UserError."""
     if not guard.ours(path):
         files.check(path, f"{where}:")
-        for text in guard.call(_tried, path, where, edit, what=where):
+        for text in guard.call(_tried, path, where, edit, what=where, size=weight(path)):
             print(f"warning: {where}: {text}", file=sys.stderr)
     with warned():
         spec = parsed(path)
     if edit is not None:
         edit(spec)
     return spec
+
+
+def weight(path: Path, root: Path | None = None) -> int:
+    """Return bytes of the files that a model names, and of those that these name, relative to `root` too: what reading
+    it may take grows with them."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    own = list(dict.fromkeys([path.parent, root or path.parent]))
+    folders = own + [f / d for f in own for d in re.findall(r'(?:mesh|asset|texture)dir="([^"]+)"', text)]
+    total = 0
+    for name in set(re.findall(r'\bfile(?:name)?="([^"]+)"', text)):
+        plain = name.removeprefix("file://")
+        if plain.startswith("package://"):
+            rest = plain.removeprefix("package://")
+            tries = [p / r for p in path.parents for r in (rest, rest.partition("/")[2])]
+        else:
+            tries = [f / plain for f in folders]
+        there = next((f for f in tries if os.path.isfile(f)), None)  # not Path's, which raises for a long name
+        if there is not None and there != path:
+            more = there.suffix in (".xml", ".mjcf") and root is None  # one level of files that are included
+            total += there.stat().st_size + (weight(there, path.parent) if more else 0)
+    return min(total, MAX_BESIDE)
 
 
 def _tried(path: Path, where: str, edit: Edit) -> list[str]:

@@ -292,6 +292,13 @@ def test_what_fastens_the_base_or_is_switched_off_ties_no_joints(tmp_path):
     assert len(hand.joints) == 6
 
 
+def test_an_object_on_joints_beside_the_hand_is_left_out(tmp_path):
+    ball = "".join(f'<joint name="ball_{k}" type="slide" axis="{k} 1 0"/>' for k in range(3))
+    text = jaws().replace("</worldbody>", f'<body name="ball">{ball}<geom size="0.03"/></body></worldbody>')
+    hand, said, _ = imported(tmp_path, text)
+    assert "left out: 'ball' (another tree)" in said and len(hand.joints) == 6
+
+
 def test_a_floating_joint_of_a_urdf_is_left_out_too(tmp_path):
     def floats(text: str) -> str:
         return text.replace(

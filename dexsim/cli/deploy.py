@@ -313,7 +313,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
         "notes": f"deployed policy {b.manifest['policy']['sha256'][:12]}",
     }  # fmt: skip
     config = yaml.safe_dump({"deploy": dataclasses.asdict(settings), "bundle": b.manifest["versions"]}, sort_keys=False)
-    return Recorder(path, b.manifest["joints"], meta, config, time.monotonic())
+    return Recorder(path, b.manifest["joints"], meta, config, time.monotonic(), sensed=b.hand.sensed)
 
 
 def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:

@@ -132,6 +132,7 @@ def run(play: dict[str, Any]) -> int:
     if recording.findings:
         print(audit.table(recording.findings))
     m = mechanism.for_recording(recording, model, play["servo"], hand)
+    recording = mechanism.driven(recording, m)
     config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else {}
     timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", mechanism.STEP))
     placed = led_object.add_object(m, recording, play["object"])

@@ -25,7 +25,8 @@ class HandState:
     position [J] rad; current [J] mA, + opening, - closing; temperature [J] degC; error [J] codes (0 ok), None for
     either: not measured. tactile [P, T, 3] counts: fx, fy int8, fz uint8; taxels as in the pad's file; None: nothing is
     felt. velocity [J] rad/s, None where the firmware does not say. silent [P]: pads that give nothing for now, whose
-    counts are zeros; None: all answer.
+    counts are zeros; None: all answer. follower [S] rad: joints without a drive that the hand.yaml calls sensed; None:
+    not measured.
     """
 
     time: float
@@ -37,6 +38,7 @@ class HandState:
     tactile: np.ndarray = None  # type: ignore[assignment]
     velocity: np.ndarray | None = None
     silent: np.ndarray | None = None
+    follower: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         joints = np.shape(self.position)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import torch
 
+from dexsim.deploy.driver import HandState
+from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.couplings import Couplings
 from dexsim.hand.skin import tip_skins
@@ -25,6 +28,8 @@ class HandKinematics:
         self.data = mujoco.MjData(self.model)
         m = self.model
         self._couplings = Couplings(m, hand.joints)
+        self._sensed = hand.sensed
+        self._follower = [int(m.joint(name).qposadr[0]) for name in hand.sensed]
         bodies = [*hand.tip_bodies, *(p.body for p in hand.pads[len(hand.fingers) :])]
         self._body = np.array([m.body(b).id for b in bodies])
         self._offset = np.array([f.position for f in hand.fingers])
@@ -33,15 +38,28 @@ class HandKinematics:
         self.taxels = np.zeros((0, 0, 3)) if layout is None else layout.lifted(tip_skins(hand)).point.copy()
         self.pad_centre = np.zeros((0, 3)) if layout is None else layout.centre()
 
-    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and
-        skin)."""
+    def __call__(
+        self, q: np.ndarray, follower: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and skin).
+        follower [S] rad: of measured joints without a drive; None: where the others hold them."""
         d = self.data
         self._couplings.put(d, q)
+        if follower is not None:
+            d.qpos[self._follower] = follower
         mujoco.mj_kinematics(self.model, d)
         position, turn = d.xpos[self._body].copy(), d.xmat[self._body].reshape(-1, 3, 3).copy()
         f = len(self._offset)
         return position[:f] + np.einsum("fij,fj->fi", turn[:f], self._offset), position, turn
+
+    def followers(self, state: HandState) -> torch.Tensor:
+        """Angles [1, S] rad of the measured joints without a drive. Raises UserError where the driver does not read
+        them."""
+        if not self._sensed:
+            return torch.zeros(1, 0)
+        if state.follower is None:
+            raise UserError(f"the driver reads no angle of {', '.join(self._sensed)}, which this policy observes")
+        return torch.as_tensor(np.asarray(state.follower, np.float32))[None]
 
     def touch(
         self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True

@@ -427,7 +427,8 @@ class Loop:
         self.state, self.fresh_for, self._good_at = state, self.fresh_for + 1, now
         if self.recorder is not None:
             r = self.recorder
-            r.put("state", now, state.position, state.velocity, 1e-3 * np.asarray(state.current, float), state.time)
+            r.put("state", now, state.position, state.velocity, 1e-3 * np.asarray(state.current, float), state.time,
+                  state.follower)  # fmt: skip
             if np.size(state.tactile):
                 r.put("tactile", now, state.tactile)
             if self.fresh_for % 100 == 1:

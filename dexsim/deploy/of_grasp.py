@@ -28,7 +28,7 @@ def check(m: Any, source: object, again: str) -> None:
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
     """Rows of the observation as this dexsim builds it."""
-    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.pads))
+    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.pads), sensed=len(hand.sensed))
 
 
 def settings(m: dict[str, Any]) -> float:
@@ -56,7 +56,8 @@ def parts(env: Any) -> dict[str, Any]:
     named = {"force_command": "the commanded share of normalization.force_max_N"}
     rows = [
         (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
-        for name, width, unit, source in observations.rows(env.num_actions, env.fingers, felt, commands)
+        for name, width, unit, source in observations.rows(
+            env.num_actions, env.fingers, felt, commands, len(env.hand.sensed))  # fmt: skip
     ]
     return {
         "rows": rows, "initial_pose": floats(env.pose0),
@@ -72,9 +73,14 @@ def parts(env: Any) -> dict[str, Any]:
 def signals_of(env: Any) -> observations.Signals:
     """What the last observation of a simulated task was built from, noise and all."""
     s, felt = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    followers = env.q[:, :0]
+    if env.hand.sensed:  # with its noise, which is nowhere else
+        widths = {name: width for name, width, _ in env.describe()["observations"]["actor"]}
+        parts = env.obs["actor"].split([*widths.values()], 1)
+        followers = dict(zip(widths, parts, strict=True))["follower_angle"].clone()
     return observations.Signals(
         s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, :felt],
-        env.touch.centre[:, :felt], s.tip, env.force_command())  # fmt: skip
+        env.touch.centre[:, :felt], s.tip, env.force_command(), followers)  # fmt: skip
 
 
 class Measure:
@@ -115,7 +121,7 @@ class Measure:
     def signals(self, state: HandState, place: np.ndarray, command: float) -> observations.Signals:
         """See `observe`; of touch, all that the hand feels."""
         c = self.calibration
-        tips, position, rotation_ = self.hand(state.position)
+        tips, position, rotation_ = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation_)
         if self._xy is None:
             self._xy = np.array(place[:2], float)
@@ -126,7 +132,7 @@ class Measure:
             tensor(state.position), tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
             tensor(self._xy), z, vz,
             tensor(force), tensor(centre), tensor(tips),
-            tensor([command] * self.commands))  # fmt: skip
+            tensor([command] * self.commands), self.hand.followers(state))  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
         """[1, D] float32, by the builder that training used."""

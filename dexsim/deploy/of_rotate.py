@@ -35,7 +35,7 @@ def check(m: Any, source: object, again: str) -> None:
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
     """Rows of the observation as this dexsim builds it."""
-    sizes = len(hand.joints), len(hand.fingers), len(hand.pads)
+    sizes = len(hand.joints), len(hand.fingers), len(hand.pads), len(hand.sensed)
     return observations_rotate.rows(m["task_settings"], *sizes)
 
 
@@ -57,7 +57,8 @@ def parts(env: Any) -> dict[str, Any]:
     scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
     rows = [
         (name, width, unit, source, scaled.get(name, "none"))
-        for name, width, unit, source in observations_rotate.rows(task, env.num_actions, env.fingers, env.pads)
+        for name, width, unit, source in observations_rotate.rows(
+            task, env.num_actions, env.fingers, env.pads, len(env.hand.sensed))  # fmt: skip
     ]
     imu = task["perception"] == "imu"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
@@ -93,7 +94,8 @@ def signals_of(env: Any) -> observations_rotate.Signals:
     return observations_rotate.Signals(
         row.get("joint_angle", env.q), row.get("joint_velocity", env.qd), env.seen.clone(), env.goal_seen(), env.sent(),
         env.contact_force(), env.contact_centre().flatten(1), row.get("fingertip_position", env.tips.flatten(1)),
-        torch.roll(frames, -1, 1) if blind else frames[:, :0], env.episode_length_buf == 0)  # fmt: skip
+        torch.roll(frames, -1, 1) if blind else frames[:, :0], env.episode_length_buf == 0,
+        row.get("follower_angle", env.q[:, :0]))  # fmt: skip
 
 
 class TurnMeasure:
@@ -113,9 +115,9 @@ class TurnMeasure:
         self.frame = sum(row[1] for row in observations_rotate.rows(self.task, *self._sizes(), frames=1))
         self.reset()
 
-    def _sizes(self) -> tuple[int, int, int]:
+    def _sizes(self) -> tuple[int, int, int, int]:
         hand = self.calibration.hand
-        return len(hand.joints), len(hand.fingers), len(self.calibration.gain)
+        return len(hand.joints), len(hand.fingers), len(self.calibration.gain), len(hand.sensed)
 
     def reset(self) -> None:
         """A new episode: the next orientation gives the first goal."""
@@ -147,7 +149,7 @@ class TurnMeasure:
             q = rotation.normalize(tensor(seen))
             self._aim(q)
         normal = self.calibration.normal_force(state.tactile)
-        tips, position, turned = self.hand(state.position)
+        tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(normal, position, turned, weighted=self.task["observe"]["force_weighted"])
         fresh = not imu and self._past is None
         past = (
@@ -162,7 +164,8 @@ class TurnMeasure:
             self.task["observe"].get("last_action", "step"))  # fmt: skip
         return observations_rotate.Signals(
             tensor(state.position), tensor(self._velocity(state)), q, q if self.goal is None else self.goal, sent,
-            tensor(force), tensor(centre), tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
+            tensor(force), tensor(centre), tensor(tips), past, torch.tensor([fresh]),
+            self.hand.followers(state))  # fmt: skip
 
     def _aim(self, q: torch.Tensor) -> None:
         """The first goal, or the next where this one is reached."""

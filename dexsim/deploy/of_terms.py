@@ -215,7 +215,7 @@ class TermsMeasure:
         """One control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where the
         policy needs it. command: of a task with one command of one number, that."""
         c = self.calibration
-        tips, position, turned = self.hand(state.position)
+        tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
         told = self.commands
         if len(told) == 1 and next(iter(told.values())).size == 1:

@@ -47,8 +47,9 @@ class Recorder:
         start_ns: int | None = None,
         most: int = 4000,
         chunk_s: float = 0.5,
+        sensed: Sequence[str] = (),
     ):
-        self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s)
+        self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s, sensed=sensed)
         self.path, self.zero, self.dropped, self.written = self.writer.path, zero, 0, 0
         self.error: str | None = None
         self._channels: dict[str, int] = {}
@@ -105,8 +106,8 @@ class Recorder:
                     w.add_about(HAND, values[0])
                     continue
                 if kind == "state":
-                    position, velocity, effort, stamp = values
-                    w.add_state(t, position, velocity, effort, stamp - self.zero)
+                    position, velocity, effort, stamp, *follower = values
+                    w.add_state(t, position, velocity, effort, stamp - self.zero, *follower)
                 elif kind in add:
                     add[kind](t, *values)
                 else:

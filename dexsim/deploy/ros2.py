@@ -235,11 +235,13 @@ class Ros2Hand:
         joints = self.hand.joints
         if self._order is None or len(names) <= max(self._order):
             plain = [bare(n) for n in names]
+            joints = (*joints, *self.hand.sensed)
             missing = [j for j in joints if j not in names and bare(j) not in plain]
             if missing:
                 self._wrong = f"{self.topics[0]} lacks {', '.join(missing)[:120]}: it has {', '.join(names)[:120]}"
                 return
             self._order = [plain.index(bare(j)) for j in joints]
+        joints = self.hand.joints
 
         def part(x: Any) -> np.ndarray | None:
             return None if x is None or len(x) < len(names) else np.asarray(x, float)[self._order]
@@ -247,10 +249,14 @@ class Ros2Hand:
         q, current = part(position), part(effort)
         if q is None:
             return
-        amps = np.zeros(len(joints)) if current is None else self.effort * current
+        n, speed = len(joints), part(velocity)
+        amps = np.zeros(n) if current is None else self.effort * current[:n]
         with self._lock:
             self._count += 1
-            self._state = HandState(self.clock.now(), self._count, q, amps, velocity=part(velocity))
+            self._state = HandState(
+                self.clock.now(), self._count, q[:n], amps, velocity=None if speed is None else speed[:n],
+                follower=q[n:] if len(q) > n else None,
+            )  # fmt: skip
             if self._relaxed and self.clock.now() - self._let_go > 0.5 * WATCH:
                 self._peak = max(self._peak, float(np.abs(amps).max()))
 

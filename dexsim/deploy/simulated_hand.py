@@ -222,7 +222,13 @@ class SimulatedHand:
         speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
         return HandState(now, self.sequence, position.astype(np.float32), current, np.full(len(position), 30.0),
                          np.zeros(len(position), np.int64), tactile,
-                         np.clip(speed, -32.768, 32.767))  # fmt: skip
+                         np.clip(speed, -32.768, 32.767), follower=self._followers())  # fmt: skip
+
+    def _followers(self) -> np.ndarray | None:
+        """Angles of joints without a drive, as their encoders count them."""
+        if not self.env.hand.sensed:
+            return None
+        return np.round(self.env.followers()[0].double().numpy() / POSITION_LSB) * POSITION_LSB
 
 
 class SimulatedImu:

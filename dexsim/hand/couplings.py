@@ -58,11 +58,22 @@ class Couplings:
         for t in range(m.ntendon):
             if (found := _fixed(m, t)) is None:
                 continue
-            low, high = _lengths(m, t)
+            found, low, high = _tied(m, t, found)
             if np.isfinite([low, high]).any():
                 self._rows.append((found, low, high))
                 held |= {int(a) for a in np.flatnonzero(found)}
         self._free = sorted({int(m.jnt_qposadr[j]) for j in free} & held)
+        self._groups: list[list[int]] = []
+        for k, (row, *_) in enumerate(self._rows):
+            mine = {a for a in np.flatnonzero(row) if a in self._free}
+            if not mine:
+                continue
+            apart = (g for g in self._groups if all(not mine & set(np.flatnonzero(self._rows[o][0])) for o in g))
+            group = next(apart, None)
+            self._groups.append([k]) if group is None else group.append(k)
+        one = [np.count_nonzero(row[self._free]) <= 1 for row, *_ in self._rows]
+        alone = all(one)  # of intervals of one joint that meet, the last that is entered lies in all
+        self._sweeps = 0 if not self._groups else 1 if alone else SWEEPS
         self._on: dict[tuple[torch.device, torch.dtype], tuple[Any, ...]] = {}
         self.loose = tuple(m.joint(j).name for j in sorted(free) if int(m.jnt_qposadr[j]) not in held)
 
@@ -83,22 +94,21 @@ class Couplings:
         if self._free:
             free, rest, low, high, rows = self._tensors(q)
             q[..., free] = rest.clamp(low, high)
-            for _ in range(SWEEPS if rows else 0):
+            for _ in range(self._sweeps):
                 most = 0.0
-                for a, b, least, largest in rows:
-                    length = (q * a).sum(-1)
-                    miss = length.clamp(least, largest) - length
-                    q[..., free] = (q[..., free] + miss[..., None] * b).clamp(low, high)
+                for a, b, least, largest in rows:  # rows together share no free joint
+                    length = q @ a
+                    miss = torch.minimum(torch.maximum(length, least), largest) - length
+                    q[..., free] = (q[..., free] + miss @ b).clamp(low, high)
                     most = max(most, float(miss.abs().max())) if q.device.type == "cpu" else 1.0
                 if most < CLOSE:  # nobody waits for a GPU to say so
                     break
         return q
 
     def _tensors(self, q: torch.Tensor) -> tuple[Any, ...]:
-        """Return addresses, rest and limits [F] of the joints that tendons hold, and a row a tendon: its coefficients
-        [nq],
-        how the joints [F] share what its length misses, and its least and largest length. Made once: a recorded step
-        must find them on its device."""
+        """Return addresses, rest and limits [F] of the joints that tendons hold, and groups of rows, one a tendon, that
+        share none of these: coefficients [nq, R], how the joints [R, F] share what the lengths miss, and least and
+        largest lengths [R]. Made once: a recorded step must find them on its device."""
         key = (q.device, q.dtype)
         if key not in self._on:
             m, at = self.model, self._free
@@ -109,9 +119,12 @@ class Couplings:
             def to(x: np.ndarray) -> torch.Tensor:
                 return torch.as_tensor(x, dtype=q.dtype, device=q.device)
 
-            rows = [
-                (to(a), to(a[at] / (a[at] @ a[at])), low, high) for a, low, high in self._rows if np.abs(a[at]).any()
-            ]
+            rows = []
+            for group in self._groups:
+                a = np.stack([self._rows[k][0] for k in group])
+                b = a[:, at] / (a[:, at] ** 2).sum(1, keepdims=True)
+                ends = np.array([self._rows[k][1:] for k in group])
+                rows.append((to(a.T), to(b), to(ends[:, 0]), to(ends[:, 1])))
             free = torch.as_tensor(at, device=q.device)
             self._on[key] = free, to(rest), to(limits[:, 0]), to(limits[:, 1]), rows
         return self._on[key]
@@ -159,12 +172,16 @@ def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:
     return out
 
 
-def _lengths(m: mujoco.MjModel, t: int) -> tuple[float, float]:
-    """Return least and largest length that a tendon may have."""
+def _tied(m: mujoco.MjModel, t: int, arms: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Return what is bounded of a tendon whose coefficients are `arms` [nq]: its length, or what it has more than a
+    share of another's; coefficients [nq], least and largest value."""
     for e in range(m.neq):
-        if m.eq_type[e] == mujoco.mjtEq.mjEQ_TENDON and m.eq_obj1id[e] == t and m.eq_obj2id[e] < 0:
-            length = float(m.tendon_length0[t] + m.eq_data[e, 0])
-            return length, length
+        if m.eq_type[e] == mujoco.mjtEq.mjEQ_TENDON and m.eq_obj1id[e] == t:
+            length, other = float(m.tendon_length0[t] + m.eq_data[e, 0]), int(m.eq_obj2id[e])
+            if other >= 0 and (others := _fixed(m, other)) is not None:
+                share = float(m.eq_data[e, 1])
+                arms, length = arms - share * others, length - share * float(m.tendon_length0[other])
+            return arms, length, length
     if m.tendon_limited[t]:
-        return float(m.tendon_range[t, 0]), float(m.tendon_range[t, 1])
-    return -np.inf, np.inf
+        return arms, float(m.tendon_range[t, 0]), float(m.tendon_range[t, 1])
+    return arms, -np.inf, np.inf

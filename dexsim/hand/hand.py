@@ -85,6 +85,11 @@ class Hand:
         return Couplings(self.compiled, self.joints, f"hand {self.folder}")
 
     @property
+    def sensed(self) -> tuple[str, ...]:
+        """Joints without a drive that are measured: those of `sensed` in hand.yaml."""
+        return tuple(self.file.sensed)
+
+    @property
     def name(self) -> str:
         return self.file.name
 

@@ -99,6 +99,11 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
     spec, tips = model.prepared(file, path, where)
     limits = model.limits(spec, [j.name for j in file.joints], where)
     _poses(file, limits, where)
+    passive = [j.name for j in spec.joints if j.name not in {entry.name for entry in file.joints}]
+    for name in file.sensed:
+        if name not in passive:
+            there = _near(name, passive) if passive else "every joint has one"
+            raise UserError(f"{where}: sensed: '{name}' is no joint without a drive; {there}")
     if mirror or scale != 1.0:
         spec = derive.derived(spec, mirror, scale)
         limits = model.limits(spec, [j.name for j in file.joints], where)

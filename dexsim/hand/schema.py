@@ -109,7 +109,8 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     """The file. Paths are relative to its folder. force: N that a fingertip can press with; None: from the servo's
     torque limits and the levers, press: from a simulated press (pads with a lattice); span: m, width of what the
     hand can grasp; skin: touch beyond the fingertips; held_cubes: poses that rotation begins with (dexsim
-    stable-grasps), None: searched for; guessed: places of this file that a program guessed; source: free."""
+    stable-grasps), None: searched for; sensed: joints without a drive that have an encoder of their own; guessed:
+    places of this file that a program guessed; source: free."""
 
     format: Literal["dexsim-hand"]
     version: Literal[1]
@@ -127,6 +128,7 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     skin: Annotated[list[SkinEntry], msgspec.Meta(max_length=256)] = []
     places: PlacesEntry | None = None
     held_cubes: Text | None = None
+    sensed: list[Text] = []
     guessed: list[str] = []
     source: dict[str, Any] = {}
 
@@ -148,7 +150,7 @@ def to_yaml(file: HandFile) -> str:
     for finger in data["fingers"]:
         if finger["closes"] is None:
             del finger["closes"]
-    for name in ("skin", "places", "held_cubes"):
+    for name in ("skin", "places", "held_cubes", "sensed"):
         if not data[name]:
             del data[name]
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=116, default_flow_style=False)

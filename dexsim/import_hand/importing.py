@@ -179,6 +179,8 @@ def import_hand(
         name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, pulls, fixes, pick
     )
     corrections.lay_over(hand, fixes)
+    if sensed := fixes.pick("sensed", [j for j in robot.sensed if search.m.joint(j).id >= 0]):
+        hand["sensed"] = sensed
     hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
     hand["source"] = {"file": model.name, "written by": "dexsim import-hand"}
     kept: list[str] = []

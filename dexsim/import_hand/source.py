@@ -26,8 +26,9 @@ FASTENED = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 class Source:
     """model: of the hand alone. drives: what the file's actuators say; speeds: by joint, where the file says them
     (rad/s). bare: moving bodies whose inertia the file does not give. notes: what was left out, a line each. coupled:
-    what ties joints, a line each; passive: joints that it moves. limits: [rad, m] by joint, as a URDF says them: MuJoCo
-    leaves out what is none. mended: by body, the moments that no body has, for which the model has others."""
+    what ties joints, a line each; passive: joints that it moves; sensed: of these, the ones with a sensor of position.
+    limits: [rad, m] by joint, as a URDF says them: MuJoCo leaves out what is none. mended: by body, the
+    moments that no body has, for which the model has others."""
 
     path: Path
     model: mujoco.MjModel
@@ -39,6 +40,7 @@ class Source:
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     mended: dict[str, Moments] = field(default_factory=dict)
     passive: set[str] = field(default_factory=set)
+    sensed: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -56,10 +58,10 @@ def read(
     Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
     coupled joints, links without inertia, limits that are none.
     """
-    files.check(path, "model")
+    size = files.check(path, "model") + model_file.weight(path)
     with tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch:
         given = path, packages, coupled, density, inertia, Path(scratch)
-        return guard.call(_read, *given, what=f"model {path}")
+        return guard.call(_read, *given, what=f"model {path}", size=size)
 
 
 def _read(
@@ -93,6 +95,7 @@ def _source(
     ties, passive = _coupled(spec, path, coupled, said.moved)
     if coupled == "independent":
         said.pulls.clear()
+    read = {s.objname for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_JOINTPOS}
     notes += said.notes + drives.contacts(spec) + drives.joints(spec)
     _strip(spec, path, notes)
     if bare and density is None:
@@ -112,7 +115,8 @@ def _source(
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             name, most = model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max())
             said.effort[name] = min(said.effort.get(name, most), most)
-    return Source(path, model, said, speeds, bare, notes, ties, limits, mended, passive)
+    sensed = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name in passive & read]
+    return Source(path, model, said, speeds, bare, notes, ties, limits, mended, passive, sensed)
 
 
 def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
@@ -152,6 +156,8 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
 
     trees = {b.name or f"body {k}": b for k, b in enumerate(spec.worldbody.bodies)}
     hands = [n for n, b in trees.items() if _hinges(b) >= 2]
+    if len(hands) > 1:  # a door and a ball on six joints have no fingers
+        hands = [n for n in hands if _ends(trees[n]) >= 2] or hands
     if not hands:
         raise UserError(
             f"model {path}: has no tree of bodies with two hinges or more; "
@@ -205,6 +211,8 @@ def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> 
             found.append(f"tendon '{tendon.name}' ({', '.join(sorted(arms))})")
             still = [j for j in arms if j not in moved]
             pulled = any(a.trntype == mujoco.mjtTrn.mjTRN_TENDON and a.target == tendon.name for a in spec.actuators)
+            pulled |= any(e.type == mujoco.mjtEq.mjEQ_TENDON and e.name1 == tendon.name and e.name2 for e in
+                          spec.equalities)  # fmt: skip
             if len(still) == len(arms) and not pulled:
                 closed.append(f"no actuator moves any of the joints of tendon '{tendon.name}' ({', '.join(arms)})")
             passive |= set(still)
@@ -216,19 +224,42 @@ def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> 
             passive.add(equality.name1)
             if equality.name1 in moved:
                 closed.append(f"joint '{equality.name1}' has an actuator, and follows '{equality.name2}'")
-        elif equality.type != mujoco.mjtEq.mjEQ_TENDON:
+        elif equality.type == mujoco.mjtEq.mjEQ_TENDON:
+            if not equality.name2:
+                continue  # a length of its own: the tendon's joints are among those above
+            found.append(f"tendon equality ({both})")
+            arms = set(drives.fixed_arms(spec.tendon(equality.name1)))
+            if np.any(np.array(equality.data)[2:5]):
+                closed.append(f"tendon '{equality.name1}' follows '{equality.name2}' by a polynomial")
+            passive |= arms - moved
+            if not arms - moved:
+                closed.append(f"every joint of tendon '{equality.name1}' has an actuator, and follows"
+                              f" '{equality.name2}'")  # fmt: skip
+        else:
             kind = {mujoco.mjtEq.mjEQ_CONNECT: "a closed loop (connect", mujoco.mjtEq.mjEQ_WELD: "a weld ("}
             closed.append(f"{kind.get(equality.type, 'an equality (')} {both})")
     if coupled == "independent":
         for thing in things:
             spec.delete(thing)
         return found + closed, set()
+    tied = {e.name1: e.name2 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT}
+    for start in tied:
+        at, seen = start, [start]
+        while (at := tied.get(at, "")) and at not in seen:
+            seen.append(at)
+        if at == start:
+            raise UserError(
+                f"model {path}: joints {', '.join(seen)} follow each other in a ring: take one equality out"
+            )
     if closed:
+        balls = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]
+        instead = "or coupled=independent drives each joint by a motor of its own (another hand than the real one)"
+        if balls:
+            instead = f"and hinges in that of its {len(balls)} ball joints ({', '.join(balls[:3])} ...)"
         raise UserError(
             f"model {path}: what ties its joints is not simulated: {'; '.join(closed[:6])}"
             f"{f'; {len(closed) - 6} more' if len(closed) > 6 else ''}: put joint equalities or tendons of fixed"
-            " coefficients in its place, or coupled=independent drives each joint by a motor of its own (another hand"
-            " than the real one)"
+            f" coefficients in its place, {instead}"
         )
     return found, passive
 
@@ -273,6 +304,12 @@ def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
             if not joint.name:
                 joint.name = f"{body.name}_joint{n or ''}"
                 notes.append(f"joint without a name on '{body.name}': called '{joint.name}'")
+
+
+def _ends(body: Any) -> int:
+    """Bodies on joints, behind which nothing moves."""
+    behind = sum(_ends(b) for b in body.bodies)
+    return behind or int(any(j.type in ONE_DOF for j in body.joints))
 
 
 def _hinges(body: Any) -> int:

@@ -23,6 +23,7 @@ SHRINK, TRIES = 0.8, 14
 SMALLEST = 0.05  # of the free range: a motion that must be smaller than this to be safe is left out
 RESERVE = 0.9  # of the limits, for a motion alone: within the sequence it starts from a little elsewhere
 REST = 0.3  # s at home between two motions
+PASSED = 1e-3  # rad (m) beyond a limit: where a weak drive lets a joint rest on one, it passes by a tenth of that
 CHECK_STEP, FRAME = 0.004, 0.008  # s: physics step and spacing of contact checks of the simulation
 
 
@@ -399,7 +400,7 @@ def _faults(m: Mechanism, peaks: safety.Peaks, limits: Limits, reserve: float = 
         j = int(np.argmax(value / allowed))
         if value[j] > reserve * allowed[j] + 1e-6:
             out.append(f"{name} of {m.joints[j]} reaches {value[j]:.2f} of its limit, {allowed[j]:.3g} is allowed")
-    if peaks.excess > 1e-4:
+    if peaks.excess > PASSED:
         out.append(f"a joint passes its limit by {peaks.excess:.3g}")
     out += [f"{a} touches {b} at {t:.2f} s" for (a, b), t in list(peaks.contacts.items())[:2]]
     return "; ".join(out)

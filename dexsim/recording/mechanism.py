@@ -204,7 +204,8 @@ def of_recording(m: Mechanism, recording: Recording) -> Mechanism:
     spec = m.spec.copy()
     spec.option.gravity = [float(g) for g in recording.gravity]
     out = Mechanism(spec, m.joints, m.table, m.robot, m.hand, m.part_of)
-    missing = [j for j in recording.joints if j not in out.joints]
+    followers = () if m.hand is None else m.hand.couplings.passive
+    missing = [j for j in recording.joints if j not in out.joints and j not in followers]
     if missing:
         raise UserError(
             f"recording {recording.path} has joints that the model has not: {', '.join(missing)};"
@@ -223,6 +224,11 @@ def of_recording(m: Mechanism, recording: Recording) -> Mechanism:
             if column in stated[joint]:
                 out.table.set(joint, column, factor * (out.table.value(joint, column).value or 0.0))
     return out
+
+
+def driven(recording: Recording, m: Mechanism) -> Recording:
+    """Return a recording without the joints of the hand that have no drive: those are measured, and follow."""
+    return recording if m.hand is None else recording.without(m.hand.couplings.passive)
 
 
 def held_joints(m: Mechanism, joints: Sequence[str]) -> list[str]:
@@ -404,7 +410,10 @@ def recorded(
         "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False),
     }
     series = lambda x, topic: Series(t, x[::every], topic, t.copy())  # noqa: E731
-    return Recording(
+    sensed = () if m.hand is None else m.hand.sensed
+    frames = np.arange(len(run.qpos)) * run.frame_s
+    angles = [np.interp(t - run.t[0], frames, run.qpos[:, run.model.joint(j).qposadr[0]]) for j in sensed]
+    out = Recording(
         Path("simulated.mcap"),
         DEFAULTS | meta,
         m.joints,
@@ -413,6 +422,7 @@ def recorded(
         start_ns=start_ns,
         hand=m.hand,
     )
+    return out.with_followers(sensed, np.stack(angles, 1) if sensed else np.zeros((len(t), 0)))
 
 
 def replay(
@@ -433,6 +443,7 @@ def replay(
     joints that no servo drives, or that its file was not fitted to (`held_joints`), follow their recording where it is
     `recorded`; `limp`: nothing moves those without a servo.
     """
+    recording = driven(recording, m)
     commands, state = recording.targets(), recording.states.position
     if not len(commands):
         raise UserError(f"recording {recording.path} has no commands: nothing to replay; {COMMANDS_FIX}")

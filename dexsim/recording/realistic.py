@@ -67,9 +67,10 @@ def realistic(
         effort = _at(recording.states.effort, t)
         value = effort.value * recording.effort_sign
         if recording.effort_is == "torque_Nm":
-            scale = np.broadcast_to(
-                np.asarray(np.nan if current_per_torque is None else current_per_torque, float), value.shape[1:]
-            )
+            scale = np.asarray(np.nan if current_per_torque is None else current_per_torque, float)
+            if scale.ndim:  # joints without a drive come last, and have no current
+                scale = np.append(scale, np.ones(value.shape[1] - len(scale)))
+            scale = np.broadcast_to(scale, value.shape[1:])
             if np.isnan(scale).any():
                 notes.append(f"current_per_torque unknown: {CURRENT_PER_TORQUE} A per N.m assumed")
             value = value * np.where(np.isnan(scale), CURRENT_PER_TORQUE, scale)

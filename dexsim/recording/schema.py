@@ -6,6 +6,7 @@ joints). Times are host times, seconds since the recording's start.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -280,6 +281,24 @@ class Recording:
         if len(groups) < 2 and all(c is None or c.all() for c in told):
             return [self]
         return [self._of(columns) for columns in groups.values()]
+
+    def without(self, joints: Collection[str]) -> Recording:
+        """The recording of all joints but these; itself where it tells of none of them."""
+        left = [k for k, j in enumerate(self.joints) if j not in joints]
+        return self if len(left) == len(self.joints) else self._of(left)
+
+    def with_followers(self, joints: Sequence[str], angles: np.ndarray) -> Recording:
+        """The recording with joints that nothing commands: their angles [T, S] rad at the times of the positions."""
+        if not joints:
+            return self
+        more = lambda s, x: None if s is None else replace(s, value=np.concatenate([s.value, x], 1))  # noqa: E731
+        none = np.full_like(angles, np.nan)
+        states, names = self.states, (*self.joints, *joints)
+        return replace(
+            self, joints=names, meta=self.meta | {"joint_names": ",".join(names)},
+            commands=more(self.commands, np.full((len(self.commands), len(joints)), np.nan)),
+            states=States(more(states.position, angles), more(states.velocity, none), more(states.effort, none)),
+        )  # fmt: skip
 
     def _of(self, columns: list[int]) -> Recording:
         """These joints, and the messages that tell of them."""

@@ -31,9 +31,9 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 @cache
 def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.Kernel, Any]:
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
-    object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph.
-    features: of the servo, those of `columns.FEATURES`. The kernel, and the struct that it takes, shapes and units as
-    in `servo.Servo`."""
+    object's pose and the angles of measured joints without a drive. The slot written goes round, and is kept on the
+    device so that the launch can be part of a graph. features: of the servo, those of `columns.FEATURES`. The kernel,
+    and the struct that it takes, shapes and units as in `servo.Servo`."""
     encoder, Memory = encoder_error(features), wp.types.vector(len(MEMORY), real)
     remembers = bool(features & EXTENDED)
 
@@ -42,6 +42,7 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.
         q_index: wp.array(dtype=int)  # [J] addresses
         v_index: wp.array(dtype=int)
         object_q: int
+        sensed_q: wp.array(dtype=int)  # [S] of joints without a drive that are measured
         time: wp.array(dtype=real)
         qpos: wp.array2d(dtype=real)
         qvel: wp.array2d(dtype=real)
@@ -85,6 +86,8 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.
             value = slope * x.qvel[w, x.v_index[j]]
         elif c > 2 * joints and c <= 3 * joints:
             value = x.torque[w, c - 1 - 2 * joints]
+        elif c > 3 * joints + 7:
+            value = x.qpos[w, x.sensed_q[c - 8 - 3 * joints]]
         elif c > 3 * joints:
             value = x.qpos[w, x.object_q + c - 1 - 3 * joints]
         rows[slot[0], s, c] = value
@@ -93,11 +96,13 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.
 
 
 def tap(
-    kind: Any, engine: Any, servo: Servo, q_index: np.ndarray, v_index: np.ndarray, object_q: int
-) -> Any:
-    """The struct of a `copy_kernel` with an engine's and its servo's arrays; where joints and object are in the
-    state."""
+    kind: Any, engine: Any, servo: Servo, q_index: np.ndarray, v_index: np.ndarray, object_q: int,
+    sensed_q: np.ndarray,
+) -> Any:  # fmt: skip
+    """The struct of a `copy_kernel` with an engine's and its servo's arrays; where joints, object and joints without a
+    drive are in the state."""
     made = kind()
+    made.sensed_q = wp.array(sensed_q, dtype=int)
     made.q_index, made.v_index, made.object_q = wp.array(q_index, dtype=int), wp.array(v_index, dtype=int), object_q
     made.time, made.qpos, made.qvel = engine.wp.time, engine.wp.qpos, engine.wp.qvel
     made.torque, made.params, made.state = servo._torque, servo._params, servo._state
@@ -146,9 +151,10 @@ class PlayRecorder:
         with wp.ScopedDevice(engine.device):
             at = int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")])
             self._kernel, kind = copy_kernel(engine.real, servo.features)
-            of = tap(kind, engine, servo, engine.qpos_index(self.joints), engine.dof_index(self.joints), at)
+            of = tap(kind, engine, servo, engine.qpos_index(self.joints), engine.dof_index(self.joints), at,
+                     engine.qpos_index(env.hand.sensed))  # fmt: skip
             self._slot = wp.zeros(1, dtype=int)
-            self._rows = wp.zeros((K, count, 1 + 3 * J + 7), dtype=engine.real)
+            self._rows = wp.zeros((K, count, 1 + 3 * J + 7 + len(env.hand.sensed)), dtype=engine.real)
             self._args = [wp.array(chosen, dtype=int), of, self._slot, self._rows]
         self._rows_t = wp.to_torch(self._rows)
         self._servo_before, self._step = servo.before_each, env.step
@@ -269,7 +275,7 @@ class PlayRecorder:
         start = float(rows[0, 0])
         command_t = np.array(e.times) - start
         parts = [Series(t, rows[:, 1 + k * J : 1 + (k + 1) * J], STATES, t.copy()) for k in range(3)]
-        pose = Series(t, rows[:, 1 + 3 * J :], OBJECT_POSE, t.copy(), "palm")
+        pose = Series(t, rows[:, 1 + 3 * J : 8 + 3 * J], OBJECT_POSE, t.copy(), "palm")
         world, servo = self._world(track.world, e.about)
         assert e.gravity is not None  # set with the first row
         gravity = " ".join(f"{g:g}" for g in e.gravity)
@@ -312,7 +318,7 @@ class PlayRecorder:
             imu=imu,
             config=config,
             start_ns=1_000_000_000,
-        )
+        ).with_followers(self.env.hand.sensed, rows[:, 8 + 3 * J :])
 
     def _believed(self) -> dict[str, Any] | None:
         """The drives as the policy believes them, where it plays in another world (reality=), which does not tell its

@@ -28,6 +28,7 @@ class Writer:
         start_ns: host time of t = 0 [ns since the epoch]; None: now.
         config: the resolved config as YAML, attached.
         chunk_s: a chunk is finished at least this often, in recorded time [s].
+        sensed: names [S] of joints that are measured and not commanded: of `follower` in add_state.
 
     Every add_* takes t [s since start] and its values; `stamp` [s] is what header.stamp says (None: t itself).
     Not thread-safe: a real-time loop hands samples to the one thread that owns the writer.
@@ -42,10 +43,12 @@ class Writer:
         config: str | None = None,
         chunk_s: float = 1.0,
         chunk_bytes: int = 1 << 18,
+        sensed: Sequence[str] = (),
     ):
-        self.path, self.joints = Path(path).expanduser(), tuple(joints)
+        self.path, self.joints, self.sensed = Path(path).expanduser(), tuple(joints), tuple(sensed)
         self.start_ns = time.time_ns() if start_ns is None else int(start_ns)
-        self.meta = {"schema": "1", "joint_names": ",".join(joints)} | {k: str(v) for k, v in (meta or {}).items()}
+        self.meta = {"schema": "1", "joint_names": ",".join([*joints, *sensed])}
+        self.meta |= {k: str(v) for k, v in (meta or {}).items()}
         unknown = [k for k in self.meta if k not in schema.KEYS and k not in schema.UNIT_KEYS]
         if unknown:
             raise UserError(f"{self.path}: metadata key '{unknown[0]}' does not exist; valid: {', '.join(schema.KEYS)}")
@@ -88,8 +91,13 @@ class Writer:
         velocity: np.ndarray | None = None,
         effort: np.ndarray | None = None,
         stamp: float | None = None,
+        follower: np.ndarray | None = None,
     ) -> None:
-        """Measured position, velocity, effort [J] each."""
+        """Measured position, velocity, effort [J] each; follower [S] rad: joints without a drive."""
+        if follower is not None and self.sensed:
+            none = np.full(len(self.sensed), np.nan)
+            position = np.append(position, follower)
+            velocity, effort = (None if x is None else np.append(x, none) for x in (velocity, effort))
         self._joints(schema.STATES, t, position, velocity, effort, stamp)
 
     def add_temperature(self, t: float, value: np.ndarray) -> None:
@@ -153,8 +161,9 @@ class Writer:
         effort: np.ndarray | None,
         stamp: float | None,
     ) -> None:
+        names = self.joints if len(position) == len(self.joints) else (*self.joints, *self.sensed)
         self._message(
-            topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), self.joints, position, velocity, effort)
+            topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), names, position, velocity, effort)
         )
 
     def _array(self, topic: str, t: float, value: np.ndarray, labels: Sequence[str]) -> None:

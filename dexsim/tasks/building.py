@@ -269,6 +269,7 @@ class Built(VecEnv):
 
         self._couplings = Couplings(mjm, self.joints)
         self.joint_q, self.joint_v = long(e.qpos_index(self.joints)), long(e.dof_index(self.joints))
+        self._sensed_q = long(e.qpos_index(hand.sensed))
         self._object_at = 0, 0
         if self.scene.object is not None:
             joint = "object_free" if self.scene.free else "object_joint"

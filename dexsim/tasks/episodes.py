@@ -117,6 +117,10 @@ class Episodes(Built):
         if self.reality is not None:
             self.reality.read(self)
 
+    def followers(self) -> torch.Tensor:
+        """Angles [N, S] rad of the hand's joints without a drive that are measured (`sensed` of its hand.yaml)."""
+        return torch.nan_to_num(self.engine.t.qpos[:, self._sensed_q].float())
+
     def _read_object(self) -> None:
         """Pose and velocity of an object on a joint; `object_joint` [N] rad or m and `object_speed` [N]."""
         e = self.engine.t

@@ -62,7 +62,8 @@ class GraspEnv(Launches):
         """`observe.touch` and `critic` as switches of observations."""
         t = self.task
         felt = {"actor": (t.get("observe") or {}).get("touch", True)}  # checkpoints from before have no such setting
-        return {"contact_force": felt, "contact_centre": felt,
+        sensed = dict.fromkeys(("actor", "critic"), bool(self.hand.sensed))
+        return {"contact_force": felt, "contact_centre": felt, "follower_angle": sensed,
                 "privileged": {"critic": t["critic"] == "privileged"}}  # fmt: skip
 
     def prepare_task(self) -> None:
@@ -177,6 +178,11 @@ class GraspEnv(Launches):
     def joint_angle(self) -> torch.Tensor:
         """measured"""
         return self.q if self.clean else self.sensed.joint_position
+
+    @observe("rad", noise="sensors.joint_noise")
+    def follower_angle(self) -> torch.Tensor:
+        """measured, of joints without a drive"""
+        return self.followers()
 
     @observe("tau/tau_max")
     def joint_torque(self) -> torch.Tensor:

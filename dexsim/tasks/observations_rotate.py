@@ -18,10 +18,12 @@ from dexsim.errors import UserError
 ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 
 
-def actor(joints: int, fingers: int, pads: int) -> tuple[tuple[str, int, str, str], ...]:
-    """Table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers and touch pads."""
+def actor(joints: int, fingers: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
+    """Table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers, touch pads and
+    measured joints without a drive."""
     return (
         ("joint_angle", joints, "rad", "measured"),
+        ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
         ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
         ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
         ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
@@ -30,10 +32,11 @@ def actor(joints: int, fingers: int, pads: int) -> tuple[tuple[str, int, str, st
     )
 
 
-def proprioception(joints: int, pads: int) -> tuple[tuple[str, int, str, str], ...]:
+def proprioception(joints: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
     """The same without an object's pose; `history` of these, newest first."""
     return (
         ("joint_angle", joints, "rad", "measured"),
+        ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
         ("joint_velocity", joints, "rad/s", "measured"),
         ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
         ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
@@ -42,12 +45,14 @@ def proprioception(joints: int, pads: int) -> tuple[tuple[str, int, str, str], .
 
 
 FRAME = {
-    "joint_angle": "joint", "joint_velocity": "joint", "relative_orientation": "object", "last_action": "joint",
+    "joint_angle": "joint", "follower_angle": "joint", "joint_velocity": "joint", "relative_orientation": "object",
+    "last_action": "joint",
     "contact_centre": "palm", "contact_force": "taxel, along the normal", "fingertip_position": "palm",
 }  # fmt: skip
 """Frame of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 ORDER = {
-    "joint_angle": "joints", "joint_velocity": "joints", "last_action": "joints",
+    "joint_angle": "joints", "follower_angle": "joints without a drive", "joint_velocity": "joints",
+    "last_action": "joints",
     "contact_centre": "fingers, x y z each",
     "contact_force": "fingers", "fingertip_position": "fingers, x y z each",
     "relative_orientation": "6d: the matrix's first two columns, one after the other; quaternion: w x y z",
@@ -59,7 +64,7 @@ class Signals(NamedTuple):
     only); orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, J], see
     `sent`; touch_force [N, P] N, touch_centre [N, P, 3], fingertip [N, F, 3] m, palm frame (P = 0 without touch); past
     [N, H, D]: the last H frames, newest first (perception=proprioception, else empty); fresh [N] bool: an episode
-    begins."""
+    begins; follower [N, S] rad: measured joints without a drive (None: none)."""
 
     joint_position: torch.Tensor
     joint_velocity: torch.Tensor
@@ -71,18 +76,21 @@ class Signals(NamedTuple):
     fingertip: torch.Tensor
     past: torch.Tensor
     fresh: torch.Tensor
+    follower: torch.Tensor | None = None
 
 
 def rows(
-    task: Mapping[str, Any], joints: int, fingers: int, pads: int, frames: int | None = None
+    task: Mapping[str, Any], joints: int, fingers: int, pads: int, sensed: int = 0, frames: int | None = None
 ) -> list[tuple[str, int, str, str]]:
     """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`, for a hand of so
-    many joints, fingers and touch pads. frames: of how many control steps a row of the history is taken (default:
-    `history`)."""
+    many joints, fingers, touch pads and measured joints without a drive. frames: of how many control steps a row of the
+    history is taken (default: `history`)."""
     o = task["observe"]
     blind = task["perception"] == "proprioception"
     out = []
-    for name, width, unit, text in proprioception(joints, pads) if blind else actor(joints, fingers, pads):
+    for name, width, unit, text in (
+        proprioception(joints, pads, sensed) if blind else actor(joints, fingers, pads, sensed)
+    ):
         if name == "relative_orientation":
             width = ORIENTATION[o["orientation"]]
             text = text if width != 4 else "quaternion, sign as it comes"
@@ -108,7 +116,8 @@ def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
     blind = task["perception"] == "proprioception"
     if not blind:
         parts["relative_orientation"] = relative(s.orientation, s.goal, task["observe"]["orientation"])
-    sizes = joints, parts["fingertip_position"].shape[1] // 3, s.touch_force.shape[1]
+    parts["follower_angle"] = s.joint_position[:, :0] if s.follower is None else s.follower
+    sizes = joints, parts["fingertip_position"].shape[1] // 3, s.touch_force.shape[1], parts["follower_angle"].shape[1]
     frame = torch.cat([parts[row[0]] for row in rows(task, *sizes, frames=1)], 1)
     if not blind:
         return frame

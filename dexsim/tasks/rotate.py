@@ -63,6 +63,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         rows = {name: {"actor": o.get(name, True) is not False} for name in (
             "joint_angle", "last_action", "contact_centre", "contact_force", "fingertip_position")}  # fmt: skip
         rows["fingertip_position"]["actor"] &= not blind
+        rows["follower_angle"] = dict.fromkeys(("actor", "critic"), bool(self.hand.sensed))
         rows["joint_velocity"] = {"actor": blind and o.get("joint_velocity", True)}
         rows["relative_orientation"] = {"actor": not blind and o["orientation"] != "none"}
         return rows | {"privileged": {"critic": t["critic"] == "privileged"}}
@@ -193,6 +194,11 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
     def joint_angle(self) -> torch.Tensor:
         """measured"""
         return self.q if self.clean else self.q + self.joint_bias
+
+    @observe("rad", noise="sensors.joint_noise")
+    def follower_angle(self) -> torch.Tensor:
+        """measured, of joints without a drive"""
+        return self.followers()
 
     @observe("rad/s", noise="sensors.velocity_noise", only="actor")
     def joint_velocity(self) -> torch.Tensor:

@@ -76,7 +76,8 @@ def _known_joints(recording: Recording, m: Mechanism, notes: list[str]) -> tuple
     commands."""
     name = recording.path.name
     joints = tuple(j for j in m.joints if j in recording.joints)
-    foreign = [j for j in recording.joints if j not in m.joints]
+    followers = () if m.hand is None else m.hand.couplings.passive  # measured, but nothing commands them
+    foreign = [j for j in recording.joints if j not in m.joints and j not in followers]
     if foreign:
         notes.append(f"{name}: joints that the model has not are left out: {', '.join(foreign)}")
     if not joints:
