@@ -18,6 +18,7 @@ train               train a policy
 load_policy         a trained policy as a function of observations
 play                play episodes, return the metrics
 PPO                 what learns, for train(agent=PPO(gamma=0.99))
+Distillation        the same: a student of a teacher that sees more
 ServoTable          the drives of a mechanism as servo.yaml states them: load, value, set, save
 Recording           what read_recording returns
 Diagnosis           what diagnose returns
@@ -39,7 +40,7 @@ from dexsim.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from dexsim.actuator.table import ServoTable
-    from dexsim.agents import PPO
+    from dexsim.agents import PPO, Distillation
     from dexsim.api import (
         demo_recordings,
         diagnose,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Diagnosis",
+    "Distillation",
     "PPO",
     "Recording",
     "ServoTable",
@@ -77,6 +79,7 @@ __all__ = [
 
 _ELSEWHERE = {
     "Diagnosis": "dexsim.gap.inquiry",
+    "Distillation": "dexsim.agents",
     "PPO": "dexsim.agents",
     "Recording": "dexsim.recording.schema",
     "ServoTable": "dexsim.actuator.table",

@@ -18,7 +18,7 @@ from dexsim.paths import CONFIGS
 if TYPE_CHECKING:
     import torch
 
-    from dexsim.agents import PPO
+    from dexsim.agents import PPO, Distillation
     from dexsim.gap.inquiry import Diagnosis
     from dexsim.recording.schema import Recording
     from dexsim.tasks.env import HandEnv
@@ -267,7 +267,7 @@ def train(
     settings: Sequence[str] = (),
     out: File | None = None,
     *,
-    agent: PPO | None = None,
+    agent: PPO | Distillation | None = None,
     hand: File | None = None,
     servo: File | None = None,
     objects: Sequence[File] | None = None,

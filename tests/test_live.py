@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import socket
 import sys
@@ -302,6 +303,69 @@ def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
     assert process.poll() is None, (tmp_path / "log").read_text()[-2000:]  # it steps and draws
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 0, (tmp_path / "log").read_text()[-2000:]
+
+
+def test_a_page_follows_a_run(env, tmp_path):
+    """A slider position for each checkpoint that is saved, the last for the newest policy, which is played anew."""
+    from dexsim.cli.live import Run
+    from dexsim.view.live import LiveView
+
+    def save(name, number):
+        (tmp_path / name).write_text(str(number))
+
+    save("policy.pt", 0), save("model_10.pt", 10), save("model_9.pt", 9)
+    rows = "iteration,steps,reward,reward/goal,task/drift", "1,8,,0.5,0.1", "2,16,3,0.7,0.2"
+    (tmp_path / "progress.csv").write_text("\n".join(rows) + "\n")
+    run, rewards, taken = Run(tmp_path / "policy.pt", {}), env.rewards, []
+    assert run.names() == ["model_9.pt", "model_10.pt", "policy.pt"] and not run.changed()
+
+    def load(name):
+        taken.append((name, (tmp_path / name).read_text()))
+        return lambda obs: torch.zeros(2, 12)
+
+    view = LiveView(env, load("policy.pt"), "policy.pt", ["policy.pt", "zero"], load, "127.0.0.1", free_port(), run)
+    try:
+        view.run(seconds=0.3)
+        assert view._checkpoint.max == 2 and view._checkpoint.value == 2
+        assert view._policy_choice.options == ("policy.pt", "model_10.pt", "model_9.pt", "zero")
+        assert all(word in view._training.content for word in ("goal", "drift", ">2<"))
+        save("model_20.pt", 20), save("policy.pt", 1)
+        os.utime(tmp_path / "policy.pt", (1e9, 1e9))
+        view.run(seconds=0.3)
+        assert taken[-1] == ("policy.pt", "1") and view._checkpoint.value == 3
+        view.wishes.policy = view._names[1]  # as the slider asks
+        view.run(seconds=0.3)
+        assert view.name == "model_10.pt" and taken[-1] == ("model_10.pt", "10")
+    finally:
+        view.stop()
+        env.rewards = rewards
+
+
+@pytest.mark.slow
+def test_a_training_is_watched_and_takes_its_page_along(tmp_path):
+    import signal
+    import subprocess
+
+    port, said = free_port(), tmp_path / "run" / "view.log"
+    train = [sys.executable, str(shell.ROOT / "train.py"), "task=rotate", "preset=none", "device=cpu", "worlds=2",
+             "agent.num_steps_per_env=8", "agent.actor.hidden_dims=[8]", "agent.critic.hidden_dims=[8]", "seed=3",
+             "iterations=100000", "view=true", f"view_port={port}", f"out={tmp_path / 'run'}"]  # fmt: skip
+    process = subprocess.Popen(train, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def served():
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    end = time.monotonic() + 240
+    while not (said.is_file() and "ssh -L" in said.read_text()):
+        assert process.poll() is None and time.monotonic() < end, said.read_text() if said.is_file() else ""
+        time.sleep(0.5)
+    assert served()
+    process.send_signal(signal.SIGKILL)  # it has no time to end the other
+    process.wait(30)
+    while served():
+        assert time.monotonic() < end, "the page outlives its training"
+        time.sleep(0.5)
 
 
 # --- strangers
