@@ -33,7 +33,8 @@ def evaluate(env: HandEnv, policy: Policy, episodes: int, seed: int, progress: P
     resamples = max(int(settings.get("resamples", 2000)), 1)
     length, env.max_episode_length = env.max_episode_length, max(1, round(cap / env.dt))
     graphs, env.graphs = env.graphs, False  # a recorded step begins with objects of the training, and as training does
-    env.learning = False
+    env.learning, width = False, env.sampler.width.clone()
+    env.sampler.width.fill_(1.0)  # all of what a curriculum widens
     try:
         found, frames = _episodes(env, policy, episodes, True, progress)
         kept = None
@@ -45,6 +46,7 @@ def evaluate(env: HandEnv, policy: Policy, episodes: int, seed: int, progress: P
                 env.judge_kept_out(False)
     finally:
         env.max_episode_length, env.learning, env.graphs = length, True, graphs
+        env.sampler.width.copy_(width)
     metrics = _summary(env, found, resamples, seed)
     rows = [("", *row) for row in _rows(env, metrics)]
     if kept is not None:
