@@ -336,6 +336,17 @@ def test_a_table_of_another_width_is_refused():
         made(Short, worlds=1)
 
 
+def test_ranges_widen_as_a_task_is_learned():
+    env = made(Flat, "task.curriculum.steps=4", "task.curriculum.start=0.2", worlds=2)
+    widths = [float((stepped(env, 1), env.sampler.width)[1]) for _ in range(5)]
+    assert np.allclose(widths, [0.4, 0.6, 0.8, 1.0, 1.0])
+    again = made(Flat, "task.curriculum.steps=4", "task.curriculum.start=0.2", worlds=2)
+    stepped(again, 1)
+    env.load_state_dict(again.state_dict())  # a resume goes on where it was
+    stepped(env, 1)
+    assert float(env.sampler.width) == pytest.approx(0.6)
+
+
 def test_touch_is_clean_for_the_critic():
     env = made(Several, "tactile.noise=0.5", "tactile.threshold=0.01", worlds=2)
     obs = stepped(env, 3)[0]
