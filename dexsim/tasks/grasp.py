@@ -18,12 +18,7 @@ from dexsim.tactile.clearance import Clearance
 from dexsim.tasks import base_path, grasp_rewards, observations
 from dexsim.tasks.grasp_launch import CENTRE_LENGTH, Launches
 from dexsim.tasks.press import fingertip_press
-from dexsim.tasks.terms import VECTOR, done, joints, memory, observe
-
-
-def camera_length(env: Any) -> int:
-    """How many pictures are kept: as many as may be late, and the newest."""
-    return max(1, int(round(env.task["sensors"]["vision_delay"][1] / env.dt)) + 1) + 1
+from dexsim.tasks.terms import VECTOR, done, observe
 
 
 def _is_range(pair: Any) -> bool:
@@ -38,14 +33,6 @@ class GraspEnv(Launches):
 
     choices = {"critic": ("paper", "privileged"), "observe.touch": (True, False)}
     ranges = {"object.scale": (0.3, 3.0), "servo.delay": (-0.5, 0.5), "push.weights": (0.0, 20.0)}
-
-    command, command_left = memory(reset=False), memory(reset=False)  # share of F_max; s
-    thumb_command = memory(reset=False)  # below 0: none of its own
-    push_force, push_left, push_wait = memory(3, reset=False), memory(reset=False), memory(reset=False)
-    first_xy, z_seen, vz_seen = memory(2, reset=False), memory(reset=False), memory(reset=False)
-    z_history, z_delay = memory(camera_length, reset=False), memory(dtype=torch.long, reset=False)
-    torque_bias = memory(joints, reset=False)
-    outside_force = memory(3, reset=False)  # N on the object's body frame, on top of the random pushes (evaluation)
 
     # -- setting up
     @classmethod

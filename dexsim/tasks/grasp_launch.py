@@ -3,27 +3,53 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import warp as wp
 
+from dexsim.tactile.clearance import Clearance
 from dexsim.tasks import grasp_kernels as kernels
 from dexsim.tasks import grasp_rewards
 from dexsim.tasks.structs import filled
 from dexsim.tasks.task import Task
+from dexsim.tasks.terms import joints, memory
 
 CENTRE_LENGTH = 0.03
 """Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward
 `centre`, of a hand of UNIT_SPAN."""
 
 
+def camera_length(env: Any) -> int:
+    """How many pictures are kept: as many as may be late, and the newest."""
+    return max(1, int(round(env.task["sensors"]["vision_delay"][1] / env.dt)) + 1) + 1
+
+
 class Launches(Task):
-    """The kernels of a `GraspEnv`, which inherits this and declares the memory that they work on."""
+    """The kernels of a `GraspEnv`, which inherits this, and the memory that they work on."""
 
-    if TYPE_CHECKING:
+    command, command_left = memory(reset=False), memory(reset=False)  # share of F_max; s
+    thumb_command = memory(reset=False)  # below 0: none of its own
+    push_force, push_left, push_wait = memory(3, reset=False), memory(reset=False), memory(reset=False)
+    first_xy, z_seen, vz_seen = memory(2, reset=False), memory(reset=False), memory(reset=False)
+    z_history, z_delay = memory(camera_length, reset=False), memory(dtype=torch.long, reset=False)
+    torque_bias = memory(joints, reset=False)
+    outside_force = memory(3, reset=False)  # N on the object's body frame, on top of the random pushes (evaluation)
 
-        def __getattr__(self, name: str) -> Any: ...  # a GraspEnv declares it
+    f_max: float  # N at command 1; these are the task's own, see `GraspEnv.prepare_task`
+    beside: float
+    pushes: bool
+    fixed_command: torch.Tensor | None
+    clearance: Clearance
+    centre0: torch.Tensor
+    reach: torch.Tensor
+    pose0: torch.Tensor
+    lay: torch.Tensor
+    tau_max: torch.Tensor
+    root_closes: torch.Tensor
+    inner: torch.Tensor
+    inner_closes: torch.Tensor
+    outer: torch.Tensor
 
     def prepare_kernels(self) -> None:
         """Allocate what the kernels share with the task."""

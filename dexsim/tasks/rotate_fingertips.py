@@ -41,7 +41,7 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     TAKES_OBJECTS = False  # its held poses are of a cube
     holds = "fingertips", (0.04, 0.065)
-    choices = RotateEnv.choices | {"perception": ("camera",)}
+    choices = {**RotateEnv.choices, "perception": ("camera",)}
     ranges = {
         "camera.delay": (0.0, 0.5), "camera.tilt": (-0.5, 0.5), "camera.offset": (-0.05, 0.05),
         "camera.visible": (0.0, 1e6), "camera.hidden": (0.0, 1e6),
@@ -214,7 +214,7 @@ class FingertipEnv(TipTrials, RotateEnv):
         """ours: touched by palm or links"""
         return (self.other_force > TOUCH).float()
 
-    turning = None  # about one axis: says nothing here
+    turning = None  # type: ignore[assignment]  # about one axis: says nothing here
 
     @metric("share", now=True)
     def touched_by_others(self) -> torch.Tensor:
