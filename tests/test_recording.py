@@ -162,7 +162,7 @@ def test_a_bag_that_rosbags_wrote(tmp_path):
         ("a/msg/B", "a/C c\n", "a/msg/C"),
         ("a/msg/B", "B b\n", "recursion"),
         ("a/msg/B\nimport os", "float64 x\n", "no message's"),
-        ("a/msg/B", "float64 x\n" * 9999, "conflicting"),
+        ("a/msg/B", "float64 x\n" * 9999, "characters"),
         ("B", "float64 x", "no message's"),
         ("a/msg/B", "float64 1x\n", "."),
         ("a/msg/B", "\x00", "."),

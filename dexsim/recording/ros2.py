@@ -14,6 +14,7 @@ from typing import Any
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
+MAX_DEFINITION = 1 << 16  # characters: rosbags compiles it, which takes seconds a megabyte
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*_?\Z")
 
 
@@ -30,6 +31,8 @@ def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
     parts = [p for p in re.split(r"::|/", name) if p]
     if not 2 <= len(parts) <= 3 or not _NAME.match("/".join(parts)):
         raise BadDefinition("its name is no message's")
+    if len(text) > MAX_DEFINITION:
+        raise BadDefinition(f"it has more than {MAX_DEFINITION} characters")
     root = f"{parts[0]}/msg/{parts[-1]}"
     try:
         if encoding == "ros2idl":
