@@ -4,6 +4,7 @@ number."""
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 
 import mujoco
@@ -24,7 +25,7 @@ from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import conditions
 from dexsim.gap.search.search import JointSearch, Member
 from dexsim.paths import CONFIGS
-from dexsim.recording.mechanism import drive, of_recording
+from dexsim.recording.mechanism import drive, mechanism, of_recording
 from dexsim.recording.schema import COMMANDS, Series, States
 
 
@@ -57,6 +58,17 @@ def test_a_run_begun_in_its_middle_goes_on_as_it_did():
     still = world(table, t[t > 1.5] - 1.5, c[t > 1.5], 1.4, whole.position[1500, 0], whole.velocity[1500, 0])
     # those commands matter
     assert np.abs(free_runs(m.spec, ["joint"], [still], timestep=1e-3)[0][:1400, 0] - q).max() > 1e-4
+
+
+def test_a_joint_that_sticks_does_not_creep(tmp_path):
+    """Of a model from a file that says nothing of how hard friction holds: 5 s under 0.8 of it."""
+    file = tmp_path / "rig.xml"
+    file.write_text(re.sub("solimpfriction.*solreffriction=.*1\"", "", demo.MODEL))
+    m = mechanism(file, {"joints": {"*": SERVO | {"kp": 2.0, "coulomb_friction": 0.1, "stribeck_peak": 0.0}}})
+    t = np.array([0.0])
+    run = drive(m, Series(t, np.full((1, 1), 0.04), COMMANDS, t), ["joint"], 5.0, np.zeros(1))
+    assert np.abs(run.position).max() < 1e-4
+    assert np.ptp(drive(m, Series(t, np.full((1, 1), 0.2), COMMANDS, t), ["joint"], 1.0, np.zeros(1)).position) > 0.05
 
 
 def test_a_freed_joint_swings():

@@ -38,6 +38,24 @@ def test_an_end_that_the_model_lacks_is_found_and_used():
     assert low == pytest.approx(-1.03, abs=3e-3) and high == 2.7 and model.jnt_limited[0]
 
 
+@pytest.mark.parametrize("angle", ["radian", "degree"])
+def test_a_range_that_the_recordings_show_to_be_another_is_written(angle):
+    """An end that is met narrows a joint's range, a motion beyond it takes it away, and else nothing is changed."""
+    unit = 180 / np.pi if angle == "degree" else 1.0
+    more = f' range="{-2.7 * unit} {2.7 * unit}" limited="true"'
+    spec = mujoco.MjSpec.from_string(XML.format(y=0, z=1, more=more, mass=0.1).replace("radian", angle))
+    used = spec.compile()
+    assert inputs.with_ranges(spec, used)[1] == []
+    used.jnt_range[0] = (-1.03, 2.7)
+    changed, said = inputs.with_ranges(spec, used)
+    made = mujoco.MjSpec.from_string(changed.to_xml()).compile()
+    assert made.jnt_range[0] == pytest.approx([-1.03, 2.7], abs=1e-6) and "range of a is -1.03 to 2.7" in said[0]
+    used.jnt_limited[0] = 0
+    changed, said = inputs.with_ranges(spec, used)
+    assert not mujoco.MjSpec.from_string(changed.to_xml()).compile().jnt_limited[0] and "taken away" in said[0]
+    assert spec.compile().jnt_range[0] == pytest.approx([-2.7, 2.7])  # what was given is as it was
+
+
 def test_a_joint_that_follows_has_no_end():
     model = model_of()
     assert inputs.used_end_stops(model, [run_of(None), run_of(None, reach=0.5)]) == [] and not model.jnt_limited[0]

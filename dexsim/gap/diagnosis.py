@@ -149,6 +149,7 @@ class Drives(Steps):
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
         self.pushes: Sequence[logged_torque.Push] = ()  # from outside
+        self.ranges: list[str] = []  # of joints that the recordings show to be others, in words
         # plant: a case a joint, what is held out of the fit, the noise
         self.cases: list[Case] = []
         self.left_out: dict[str, str] = {}  # effects that are not considered, with reasons
@@ -204,6 +205,8 @@ class Drives(Steps):
         w, model = self.w, self.mj_model
         fitted = [r for i, r in enumerate(w.runs) if i not in w.held]
         w.notes += _limits(model, w.runs) + inputs.used_end_stops(model, fitted)
+        spec, self.ranges = inputs.with_ranges(w.m.spec, model)
+        w.m = replace(w.m, spec=spec)
         pressed = inputs.unforeseen_end_stops(model, [w.runs[i] for i in w.held])
         if pressed:
             why = "presses against an end of its motion that no recording for the fit has shown"
@@ -592,6 +595,9 @@ class Drives(Steps):
             self.written,
             self.refused,
         )
+        if self.ranges:
+            d.model_spec = w.m.spec if d.model_spec is None else d.model_spec
+            w.notes += self.ranges
         w.notes += [x.note(d.data["nuisance"]) for x in self.told]
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:

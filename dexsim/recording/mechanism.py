@@ -129,6 +129,7 @@ def mechanism(
         assert model is not None  # else the folder is the xHand's
         path = Path(model).expanduser()
         spec = model_file.read(path, f"model={model}", _undriven)
+        _hold_friction(spec, hardest=True)
         _moved(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:
@@ -579,7 +580,13 @@ def _table(servo: str | Path | dict) -> ServoTable:
     return ServoTable.from_dict(servo) if isinstance(servo, dict) else ServoTable.load(Path(servo).expanduser())
 
 
-def _hold_friction(spec: mujoco.MjSpec) -> None:
-    """Dry friction that holds, as in the hand's tasks: MuJoCo's default lets a stuck joint creep."""
+def _hold_friction(spec: mujoco.MjSpec, hardest: bool = False) -> None:
+    """Let dry friction hold as in the hand's tasks; hardest: as hard as MuJoCo can, where a model says nothing of it.
+    By MuJoCo's defaults a stuck joint creeps, by 20 mrad in some seconds."""
+    said = mujoco.MjSpec().worldbody.add_body().add_joint()
+    usual = [*said.solimp_friction, *said.solref_friction]
     for joint in spec.joints:
-        joint.solimp_friction, joint.solref_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0], [0.01, 1.0]
+        if not hardest:
+            joint.solimp_friction, joint.solref_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0], [0.01, 1.0]
+        elif [*joint.solimp_friction, *joint.solref_friction] == usual:
+            joint.solimp_friction, joint.solref_friction = [0.9999, 0.9999, 1e-3, 0.5, 2.0], [0.002, 1.0]

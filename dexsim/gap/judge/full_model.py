@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
+SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BELIEVED = "believed"  # candidate: nothing is changed
 WHOLE = ", as fitted"  # of a fit's candidate: with the figures that else only absorb the search's plant's inaccuracy
@@ -308,7 +309,9 @@ def free_runs(
     and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
-        groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
+        # as long as the longest of a batch all of it runs
+        length = math.ceil(math.log2(max(w.duration / SHORTEST, 1.0)))
+        groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate, length), []).append(i)
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     for members in groups.values():
         for i, q in zip(

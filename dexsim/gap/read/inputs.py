@@ -490,9 +490,27 @@ def used_end_stops(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
             )
             said.append(
                 f"{where}: {name} meets an end of its motion at {end:.4g} while its target goes on; {beyond}. The end "
-                "is used: put it into the model"
+                "is used"
             )
     return said
+
+
+def with_ranges(spec: mujoco.MjSpec, used: mujoco.MjModel) -> tuple[mujoco.MjSpec, list[str]]:
+    """(a copy of a mechanism with the joints' ranges of `used`, a model of it, what changed in words): a joint that has
+    moved beyond its range, or meets an end before it, does so in training too."""
+    own, spec, said = spec.compile(), spec.copy(), []
+    for i in range(own.njnt):
+        name, limited, ends = own.joint(i).name, bool(used.jnt_limited[i]), used.jnt_range[i]
+        if limited == bool(own.jnt_limited[i]) and (not limited or np.array_equal(ends, own.jnt_range[i])):
+            continue
+        joint = spec.joint(name)
+        turns = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        joint.limited = limited
+        if limited:
+            joint.range = np.degrees(ends) if turns else ends
+        ends_said = f"is {ends[0]:.4g} to {ends[1]:.4g}" if limited else "is taken away"
+        said.append(f"model.xml: the range of {name} {ends_said}")
+    return spec, said
 
 
 def unforeseen_end_stops(model: mujoco.MjModel, runs: list[Run]) -> dict[str, list[tuple[float, float]]]:

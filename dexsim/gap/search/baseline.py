@@ -34,6 +34,7 @@ WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little 
 GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside what is believed
 AT_ONCE = 49  # guesses that are simulated together: between them there is a look at the clock
 ITERATIONS = 10  # of the fit from each guess
+WHOLE, FAR = 1200.0, 0.05  # s of recordings that are run whole; rad (m) from which an error there counts linearly
 GAIN, DAMPING, LIMIT = (0.2, 5.0), 20.0, (0.3, 3.0)  # x what is believed, where no range is stated
 WIDER = 2.0  # x: a stated range may be off by as much
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
@@ -156,7 +157,17 @@ def fitted(
         Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)),
         passed,
     )
-    return params, _fitted(fitter, params, np.random.default_rng(seed))
+    fits = _fits(fitter, params, np.random.default_rng(seed))
+    # which of them, and what is believed, follows whole recordings, and a few steps more there
+    whole = case.plant.windows(None, list(train), span=span)
+    t = case.plant.t[whole.sample_row]
+    seconds = [np.ptp(t[whole.sample_window == w]) for w in range(len(whole.window))]
+    some = np.cumsum(seconds) - seconds[0] <= WHOLE
+    runs = Fitter(case.plant, subset(whole, some), Residuals(case.sigma, huber=max(FAR / case.sigma, 3.0)), passed)
+    start = np.clip([p.start for p in params], [p.low for p in params], [p.high for p in params])
+    tried = np.array([start, *fits])
+    best = tried[int(np.argmin(runs.loss(runs.residuals(params, tried))))]
+    return params, best if passed() else runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3).x
 
 
 def judged(
@@ -194,8 +205,8 @@ def judged(
     )
 
 
-def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np.ndarray:
-    """[P] least squares from the best of guesses all over the bounds, and from what is believed."""
+def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list[np.ndarray]:
+    """[P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
     low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
     start = np.clip([p.start for p in params], low, high)
     # a Latin square
@@ -217,11 +228,10 @@ def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np
             break
         loss[i : i + AT_ONCE] = fitter.loss(fitter.residuals(params, guesses[i : i + AT_ONCE]))
     order = np.argsort(loss)[:BEST]
-    fits = [
-        fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3)
+    return [
+        fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3).x
         for k in dict.fromkeys([0, *order.tolist()])
     ]
-    return min(fits, key=lambda f: f.loss).x
 
 
 def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:
