@@ -977,7 +977,8 @@ def test_a_little_friction_stays_in_the_model():
 
 
 def test_the_end_of_a_recording_is_held_out():
-    runs = [SimpleNamespace(name=n, duration=10.0) for n in "ab"]
+    t = np.linspace(0, 10, 100)
+    runs = [SimpleNamespace(name=n, duration=10.0, t=t, q=np.sin(t)[:, None]) for n in "ab"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(held_out, "visits", lambda *_: ([], np.zeros((0, 2))))
         parts = held_out.split(runs, [], [0, 1], [])

@@ -213,7 +213,8 @@ class Held:
         times = {"t": np.tile(np.arange(n) / 100, len(saturated)), "run_of": np.repeat(np.arange(len(saturated)), n)}
         self.plant = type("P", (), times | {"rows": staticmethod(lambda i: slice(i * n, (i + 1) * n))})()
         self.runs = [
-            type("R", (), {"t": np.arange(n) / 100, "duration": T, "name": f"r{i}"})() for i in range(len(saturated))
+            type("R", (), {"t": np.arange(n) / 100, "q": slow[:, None], "duration": T, "name": f"r{i}"})()
+            for i in range(len(saturated))
         ]
 
 
@@ -275,6 +276,20 @@ def test_ends_of_all_recordings_where_there_are_few():
     case = Held([(0, 0), (0, 0)])
     parts = held_out.split(case.runs, [], [0, 1], [case])
     assert parts.train == parts.test == [0, 1] and parts.span_train[0] == (0.0, 7.5)
+
+
+def test_a_part_that_stands_still_proves_nothing():
+    """One stroke at the start of a log: its last quarter cannot be held out, and what is found is a hint."""
+    t = np.arange(0, 4, 0.01)
+    for last, proven in ((0.5, False), (3.6, True)):
+        q = np.clip((t - last + 0.3) / 0.3, 0, 1)[:, None] + (0.0 if last < 1 else 0.3 * np.sin(t)[:, None])
+        run = Run("a", ("joint",), t, q, t, q, None, np.zeros(3))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(held_out, "visits", lambda *_: ([], np.zeros((0, 1))))
+            parts = held_out.split([run], [], [0], [])
+        assert parts.proven is proven and parts.span_test[0][1] == run.duration
+        assert parts.span_test[0][0] == (pytest.approx(0.75 * run.duration) if proven else 0.0)
+        assert ("nothing" in parts.how) is not proven
 
 
 def test_a_limit_ends_searches_and_says_which():

@@ -199,7 +199,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> di
     loads: list[np.ndarray] = []
     unit, lsb, measured = "count", None, True
     for path in current.files_of(s["touch"], "touch"):
-        r = read(path, meta=meta, audit=False)
+        r = read(path, meta=meta, audit=False, hand=hand)
         if r.tactile is None:
             raise UserError(f"{path}: has no /tactile")
         if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):
@@ -315,13 +315,14 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
     out, meta = dict(defaults), {}
     for argument in argv:
         key, equals, text = argument.partition("=")
-        if equals and key.startswith("meta."):
-            meta[key[5:]] = text
+        if equals and key.startswith(("meta.", "units.")):
+            meta[key.removeprefix("meta.")] = text
             continue
         if not equals or key not in defaults:
             near = difflib.get_close_matches(key, defaults, 1)
             hint = f"; did you mean {near[0]}=" if near else ""
-            raise UserError(f"'{argument}': no such setting{hint}; settings: {', '.join(defaults)}, meta.KEY")
+            valid = ", ".join((*defaults, "meta.KEY", "units.QUANTITY"))
+            raise UserError(f"'{argument}': no such setting{hint}; settings: {valid}")
         if text == "null":
             out[key] = None
         elif isinstance(defaults[key], bool):

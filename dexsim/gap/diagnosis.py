@@ -598,6 +598,9 @@ class Drives(Steps):
         if self.ranges:
             d.model_spec = w.m.spec if d.model_spec is None else d.model_spec
             w.notes += self.ranges
+        for e in d.evidence if not p.proven else ():
+            e.reasons.append("nothing that moves is left to try it on: record the motion twice")
+            e.confidence = min(e.confidence, JUDGE.hinted)
         w.notes += [x.note(d.data["nuisance"]) for x in self.told]
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:

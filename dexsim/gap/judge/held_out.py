@@ -30,7 +30,7 @@ from dexsim.gap.rules import JUDGE, SEARCH
 class Split:
     """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
     not_judged: regimes that only what is held out visits; apart: by joint the measured rows [n] bool in and near
-    them."""
+    them; proven: whether what is found is tried on what was not fitted."""
 
     train: list[int]
     test: list[int]
@@ -39,6 +39,7 @@ class Split:
     how: str
     not_judged: list[str] = field(default_factory=list)
     apart: dict[str, np.ndarray] = field(default_factory=dict)
+    proven: bool = True
 
 
 def regimes(cases: Sequence[Case]) -> dict[str, np.ndarray]:
@@ -93,8 +94,13 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
     if chosen is None:
         every = list(range(len(runs)))
         cut = {i: (1 - JUDGE.kept_end) * runs[i].duration for i in every}
+        how = f"the last {100 * JUDGE.kept_end:.0f} % of each recording's time"
+        if not any(_goes_on(r, cut[i]) for i, r in enumerate(runs)):
+            whole = {i: (0.0, r.duration) for i, r in enumerate(runs)}
+            how = f"nothing, for all stands still in {how}; what is found is a hint until a motion is recorded twice"
+            return Split(every, every, whole, whole, how, proven=False)
         return Split(every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every},
-                     f"the last {100 * JUDGE.kept_end:.0f} % of each recording's time")  # fmt: skip
+                     how)  # fmt: skip
     test = [i for i in range(len(runs)) if group[i] == chosen]
     train = [i for i in range(len(runs)) if i not in test]
     how = "one condition, " + ", ".join(runs[i].name for i in test)
@@ -108,6 +114,16 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
         out.test = sorted([*test, *ends])
         out.how += f", and the end of {', '.join(runs[i].name for i in ends)}"
     return out
+
+
+STANDS = 0.02
+"""Of a joint's motion: less is none."""
+
+
+def _goes_on(run: Run, at: float) -> bool:
+    """Whether a joint still moves from `at` s on."""
+    late = run.t - run.t[0] >= at
+    return bool(late.any() and (np.ptp(run.q[late], 0) > STANDS * np.ptp(run.q, 0)).any())
 
 
 def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> int | None:
