@@ -187,6 +187,32 @@ def test_presses_from_outside_are_found_without_commands():
     assert first.ratio == pytest.approx(3.0, rel=0.02) and second.ratio == pytest.approx(7.5, rel=0.03) and first.linear
 
 
+def test_presses_in_percent_and_milliamperes_are_the_same_presses(tmp_path):
+    """`units.position=percent units.effort=mA` of `dexsim calibrate`, along the hand's own ranges."""
+    from dexsim.calibration.command import _settings
+
+    plain = pushed()
+    low, high = HAND.limits[:, 0], HAND.limits[:, 1]
+    share = 100 * (plain.commands.value - low) / (high - low)
+    current = Series(plain.states.effort.t, 1000 * plain.states.effort.value, STATES)
+    t = plain.commands.t
+    other = replace(plain, commands=Series(t, share, COMMANDS), states=States(Series(t, share, STATES), None, current))
+    write(tmp_path / "si.mcap", plain)
+    write(tmp_path / "own.mcap", other)
+    _, meta = _settings(["units.position=percent", "units.effort=mA", "meta.robot=mine"], {"real": None})
+    assert meta == {"units.position": "percent", "units.effort": "mA", "robot": "mine"}
+    a = current_half(tmp_path / "si.mcap", {})
+    b = current_half(tmp_path / "own.mcap", meta)
+    assert a.fits and a.fits.keys() == b.fits.keys()
+    for joint, fit in a.fits.items():
+        assert b.fits[joint].ratio == pytest.approx(fit.ratio, rel=1e-3)
+
+
+def current_half(path, meta):
+    """Return the fits of one recording of currents."""
+    return current.half([path], "current_A", HAND, meta)
+
+
 # -- rubber
 # ---------------------------------------------------------------------------------------------------------------------
 
