@@ -48,13 +48,20 @@ def check(path: Path, what: str, most: int = MAX_FILE) -> int:
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 
-def text(path: Path, what: str, most: int = MAX_TEXT) -> str:
-    """A UTF-8 text file. Raises UserError as `check` does, and where it is not text."""
+def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) -> str:
+    """A text file of UTF-8, of UTF-16 with its mark, or where it is neither of the encoding `other`. Raises UserError as
+    `check` does, and where it is not text."""
     check(path, what, most)
     try:
         with open(path, "rb") as file:
             raw = file.read(most + 1)
-        return raw[:most].decode("utf-8")
+        kind = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+        try:
+            return raw[:most].decode(kind)
+        except UnicodeDecodeError:
+            if other is None:
+                raise
+            return raw[:most].decode(other)
     except OSError as error:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -1,16 +1,17 @@
-"""A CSV or NPZ file with named columns as a recording: time, and command, position, effort ... of each joint.
+"""A CSV, JSON or NPZ file with named columns as a recording: time, and command, position, effort ... of each joint.
 
 Columns are named `QUANTITY.JOINT`, `JOINT.QUANTITY`, `QUANTITY_JOINT`, `JOINT_QUANTITY` (also with / : or a blank
 between), or `QUANTITY` alone where there is one joint; a unit may follow: `position.elbow [deg]`, `elbow_position_deg`,
-`time_ms`. An NPZ file may hold arrays [T, J] with `joint_names`. `remap.QUANTITY.JOINT=COLUMN` (`remap.time=COLUMN`)
-names columns that are called otherwise. A trajectory controller's columns (`desired.positions[0]`,
-`actual.positions[0]`) are known, and a table with a column of joint names and one joint a line. Times may be dates
-(ISO 8601), numbers may have a decimal comma.
+`time_ms`. An NPZ file may hold arrays [T, J] with `joint_names`, a JSON file a list of mappings (or one a line), or
+lists by name. `remap.QUANTITY.JOINT=COLUMN` (`remap.time=COLUMN`) names columns that are called otherwise. A trajectory
+controller's columns (`desired.positions[0]`, `actual.positions[0]`) are known, and a table with a column of joint names
+and one joint a line. Times may be dates (ISO 8601), numbers may have a decimal comma.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -26,7 +27,9 @@ from dexsim.recording import schema, units
 from dexsim.recording.schema import Finding
 from dexsim.recording.units import UNITS
 
-SUFFIXES = (".csv", ".tsv", ".npz")
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".npz", ".json", ".jsonl")
+EPOCHS = {"ms": 1e11, "us": 1e14, "ns": 1e17}
+"""From where on a time since 1970 is in a unit: 1973, and for 3000 years on."""
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "time": ("time", "timestamp", "timestamps", "stamp", "t", "host_time", "zeit", "temps", "tiempo"),
     "command": (
@@ -59,7 +62,7 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
     "temperature": ("temperature", "temp", "present_temperature"),
     "duty": ("duty", "pwm", "duty_cycle", "present_pwm"),
     "enabled": ("enabled", "enable", "torque_enable", "torque_enabled"),
-    "supply_voltage": ("supply_voltage", "supply", "voltage", "bus_voltage", "input_voltage"),
+    "supply_voltage": ("supply_voltage", "supply", "voltage", "bus_voltage", "input_voltage", "input_volts"),
 }
 """Quantity -> the names that columns may give it."""
 _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=lambda x: -len(x[0]))
@@ -123,7 +126,8 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str], ti
 
     meta: what is stated of it; time_unit: of a time without a unit of its own. Raises UserError naming what is
     missing."""
-    raw, findings = _npz(path) if path.suffix.lower() == ".npz" else _csv(path)
+    kinds = {".npz": _npz, ".json": _json, ".jsonl": _json}
+    raw, findings = kinds.get(path.suffix.lower(), _csv)(path)
     return of_columns(path, raw, findings, remap, meta, time_unit)
 
 
@@ -175,6 +179,12 @@ def of_columns(
                 else ""
             )
         scale = 1.0
+        if quantity == "time" and not unit and not time_unit:
+            unit = _epoch(raw[column])
+            if unit:
+                text = f"'{column}' counts {unit} since 1970, by its values (say otherwise with units.time=)"
+                findings.append(Finding("unit", "", np.nan, 1, text, "warning"))
+                roles[column] = (quantity, joint, unit, word)
         if unit or quantity == "time":
             scale = units.parse(unit or time_unit or "s", quantity, f"recording {path}: {column}").scale
             si.add((quantity, joint))
@@ -450,10 +460,49 @@ def _clock(
     return {q: t - first for q, t in out.items()}, round(first * 1e9) if first > 1e6 else 0
 
 
+def _epoch(t: np.ndarray) -> str:
+    """The unit in which a time without one counts from 1970: "" where it may be s, or does not."""
+    middle = float(np.nanmedian(np.abs(t))) if np.isfinite(t).any() else 0.0
+    return next((u for u, least in EPOCHS.items() if least <= middle < 1000 * least), "")
+
+
+def _json(path: Path) -> tuple[dict[str, Any], list[Finding]]:
+    """Columns of a JSON file: of its first list of mappings, of a mapping a line, or of lists by name."""
+    text = files.text(path, "recording", 1 << 30)
+    try:
+        found = json.loads(text) if path.suffix.lower() == ".json" else [json.loads(x) for x in text.split("\n") if x]
+    except ValueError as error:
+        raise UserError(f"recording {path}: is not JSON: {error}") from None
+    if isinstance(found, dict):
+        rows = next((v for v in found.values() if isinstance(v, list) and v and isinstance(v[0], dict)), None)
+        if rows is None:  # lists by name
+            size = max((len(v) for v in found.values() if isinstance(v, list)), default=0)
+            lists = {k: v for k, v in found.items() if isinstance(v, list) and len(v) == size}
+            rows = [dict(zip(lists, x, strict=True)) for x in zip(*lists.values(), strict=True)]
+        found = rows
+    if not isinstance(found, list) or not found or not all(isinstance(x, dict) for x in found):
+        raise UserError(f"recording {path}: holds no list of mappings with numbers by name, nor lists by name")
+    flat = [_flat(x) for x in found]
+    names = dict.fromkeys(k for row in flat for k in row)
+    return {k: ["" if (v := row.get(k)) is None else str(v) for row in flat] for k in names}, []
+
+
+def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """What is nested in a mapping, by names with points between them; places of a list by their number."""
+    out: dict[str, Any] = {}
+    for key, value in row.items():
+        if isinstance(value, list):
+            value = dict(enumerate(value))
+        out |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
+    return out
+
+
 def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
     """Columns of a text file, as texts: separated by commas, semicolons or tabs, a line of names before the numbers;
     lines from # on are left out."""
-    text = files.text(path, "recording", 1 << 30)
+    text = files.text(path, "recording", 1 << 30, "cp1252")  # as spreadsheets write it
+    if "\0" in text:
+        raise UserError(f"recording {path}: is no text file of columns")
     lines = text.lstrip("\ufeff").splitlines()
     body = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if body and _numeric(body[0]):  # the names may stand in a comment
@@ -465,16 +514,22 @@ def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
             " e.g. time,command.elbow,position.elbow"
         )
     separator = max(",;\t", key=body[0].count)
+    if not body[0].count(separator):  # columns with blanks between them
+        body, separator = [" ".join(line.split()) for line in body], " "
     if not body[0].count(separator):
-        raise UserError(f"recording {path}: its first line has no comma, semicolon or tab between names")
+        raise UserError(f"recording {path}: its first line has no comma, semicolon, tab or blank between names")
     rows = list(csv.reader(body, delimiter=separator, skipinitialspace=True))
     names = [n.strip() for n in rows[0]]
     twice = next((n for i, n in enumerate(names) if n and n in names[:i]), None)
     if twice:
         raise UserError(f"recording {path}: two columns are called '{twice}'; give each its own name")
+    again = [r for r in rows[1:] if [x.strip() for x in r] == names]
+    rows = rows[:1] + [r for r in rows[1:] if [x.strip() for x in r] != names]
     bad = sum(len(r) != len(names) for r in rows[1:])
     rows = [r for r in rows[1:] if len(r) == len(names)]
-    findings = (
+    text = f"{len(again)} lines name the columns once more: the logger was started again"
+    more = [Finding("malformed", "", np.nan, len(again), text, "warning")] if again else []
+    findings = more + (
         [
             Finding(
                 "malformed",
@@ -546,12 +601,23 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         arrays = files.arrays(path)
     except ValueError as error:
         fix = ": cut it into several files" if "unpacks" in str(error) else ""
+        fix = "; names as text: np.array(names, dtype=str)" if "no objects" in str(error) else fix
         raise UserError(f"recording {path}: is not an NPZ file that can be read: {error}{fix}") from None
     names = next(
         (arrays.pop(k) for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"),
         None,
     )
     out: dict[str, np.ndarray] = {}
+    fields = {f"{k}.{n}": x[n] for k, x in arrays.items() for n in x.dtype.names or ()}  # of arrays of records
+    if fields and len({k.split(".")[0] for k in fields}) == 1:
+        fields = {k.partition(".")[2]: x for k, x in fields.items()}
+    arrays |= fields
+    length = max((len(x) for x in arrays.values() if x.ndim and x.dtype.kind in "fiu"), default=0)
+    step = {"dt": 1.0, "period": 1.0, "fps": -1.0, "rate": -1.0, "hz": -1.0, "frequency": -1.0}
+    for key in [k for k in step if k in arrays and arrays[k].size == 1 and arrays[k].dtype.kind in "fiu"]:
+        value = float(arrays.pop(key).ravel()[0])
+        if value > 0 and "time" not in arrays and "t" not in arrays:
+            out["time"] = np.arange(length) * (value if step[key] > 0 else 1 / value)
     for key, x in arrays.items():
         if x.dtype.kind not in "fiub":
             continue

@@ -75,7 +75,7 @@ def open_container(path: Path) -> Container:
         hint = (
             f"; it is a bag of ROS 1: `rosbags-convert --src {path.name} --dst {path.stem}` makes one of ROS 2"
             if data[:8] == b"#ROSBAG "
-            else "; numbers in named columns are read from .csv, .tsv and .npz"
+            else "; numbers in named columns are read from .csv, .json, .npz and the like"
         )
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
     for m in out.messages:

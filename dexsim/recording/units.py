@@ -19,10 +19,11 @@ from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
 
 TURN = 2 * np.pi
-LENGTHS = {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3, "cm": 1e-2, "turn": TURN, "rev": TURN}
+LENGTHS = {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3, "cm": 1e-2, "turn": TURN, "rev": TURN,
+           "°": np.pi / 180}  # fmt: skip
 SPEEDS = {
     "rad/s": 1.0, "rads": 1.0, "rad_s": 1.0, "deg/s": np.pi / 180, "degs": np.pi / 180, "deg_s": np.pi / 180,
-    "rpm": TURN / 60, "m/s": 1.0, "mm/s": 1e-3,
+    "rpm": TURN / 60, "m/s": 1.0, "mm/s": 1e-3, "°/s": np.pi / 180,
 }  # fmt: skip
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -30,7 +31,7 @@ UNITS: dict[str, dict[str, float]] = {
     "position": LENGTHS,
     "velocity": SPEEDS,
     "effort": {"a": 1.0, "ma": 1e-3, "nm": 1.0, "n.m": 1.0, "n": 1.0, "mnm": 1e-3, "mn.m": 1e-3, "ncm": 1e-2},
-    "temperature": {"degc": 1.0, "c": 1.0},
+    "temperature": {"degc": 1.0, "c": 1.0, "°c": 1.0},
     "duty": {"1": 1.0, "%": 0.01, "percent": 0.01, "permille": 1e-3},
     "enabled": {},
     "supply_voltage": {"v": 1.0, "mv": 1e-3},
