@@ -49,8 +49,8 @@ def check(path: Path, what: str, most: int = MAX_FILE) -> int:
 
 
 def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) -> str:
-    """A text file of UTF-8, of UTF-16 with its mark, or where it is neither of the encoding `other`. Raises UserError as
-    `check` does, and where it is not text."""
+    """A text file of UTF-8, of UTF-16 with its mark, or of the encoding `other` where it is neither. Raises UserError
+    as `check` does, and where it is not text."""
     check(path, what, most)
     try:
         with open(path, "rb") as file:
