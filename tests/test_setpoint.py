@@ -7,14 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import test_gap
+import torch
+import yaml
 
 from dexsim.actuator.columns import COLUMNS
 from dexsim.actuator.reference import Step, setpoint
+from dexsim.cli import start
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions, inputs
 from dexsim.gap.search.search import JointSearch
+from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.recording.mechanism import mechanism
+from dexsim.tasks import make_env
 
 
 def path(targets, dt, speed=np.inf, acceleration=np.inf, start=0.0):
@@ -92,3 +97,29 @@ def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
     best = JointSearch(build(m.spec.compile(), [run])[0], [0], None, conditions([run])).run().best
     assert best.ids == ("setpoint_profile",)
     assert best.fit.value("setpoint_profile.speed") == pytest.approx(3.1, rel=0.05)
+
+
+def drive_in_training(folder, profile):
+    """Speeds [6, 4] rad/s of a joint of a hand in training whose target moves at 3.3 rad/s."""
+    table = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text())
+    table["joints"].setdefault("index_joint1", {}).update(profile)
+    (folder / "servo.yaml").write_text(yaml.safe_dump(table))
+    cfg = start.for_train(["task=grasp", "device=cpu", f"servo_file={folder / 'servo.yaml'}"], CONFIGS).cfg
+    env = make_env(cfg, 4, "cpu", 0, "mujoco")
+    j, q, action = env.hand.joints.index("index_joint1"), [], torch.zeros(4, 12)
+    action[:, j] = 1.0
+    for _ in range(7):
+        env.step(action)
+        q.append(env.q[:, j].clone())
+    return torch.stack(q).diff(dim=0) / (env.decimation * env.engine.mjm.opt.timestep)
+
+
+def test_a_fitted_profile_is_what_the_drive_in_training_has(tmp_path):
+    """A servo.yaml with `profile_speed` as a diagnosis writes it, with its interval, given to training: no joint goes
+    faster than its profile, each world by one within the interval; without it the joint follows."""
+    fast = drive_in_training(tmp_path, {})
+    slow = drive_in_training(tmp_path, {"profile_speed": {"value": 0.6, "low": 0.5, "high": 0.7}})
+    assert fast[-1].min() > 2.5 and slow.max() < 0.75
+    assert slow[-1].median() > 0.4 and slow[-1].std() > 0.02  # it moves, each world at a speed of its own
+    held = drive_in_training(tmp_path, {"profile_speed": {"value": 0.6, "low": 0.6, "high": 0.6}})
+    assert held[-1].max() < 0.62
