@@ -45,6 +45,11 @@ def check(path: Path, what: str, most: int = MAX_FILE) -> int:
         raise UserError(f"{what} {path} is {kind}, not a file")
     if about.st_size > most:
         raise UserError(f"{what} {path} has {about.st_size} bytes; at most {most} ({most / 2**20:g} MiB) are read")
+    return stored(about)
+
+
+def stored(about: os.stat_result) -> int:
+    """The bytes that a file takes on its disk, without the holes of a sparse one."""
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 

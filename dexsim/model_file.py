@@ -53,8 +53,10 @@ def weight(path: Path, root: Path | None = None) -> int:
             tries = [f / plain for f in folders]
         there = next((f for f in tries if os.path.isfile(f)), None)  # not Path's, which raises for a long name
         if there is not None and there != path:
+            about = there.stat()
             more = there.suffix in (".xml", ".mjcf") and root is None  # one level of files that are included
-            total += there.stat().st_size + (weight(there, path.parent) if more else 0)
+            total += files.stored(about)
+            total += weight(there, path.parent) if more and about.st_size < files.MAX_FILE else 0
     return min(total, MAX_BESIDE)
 
 

@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from dexsim import files, guard
+from dexsim import files, guard, model_file
 from dexsim.errors import UserError
 
 
@@ -102,6 +102,9 @@ def test_the_holes_of_a_sparse_file_give_no_limits(tmp_path):
     path.write_bytes(b"x")
     os.truncate(path, 1 << 40)
     assert files.check(path, "file", 1 << 41) < 1 << 20
+    (tmp_path / "m.xml").write_text('<mujoco><include file="sparse"/><asset><mesh file="big.xml"/></asset></mujoco>')
+    (tmp_path / "big.xml").symlink_to(path)
+    assert model_file.weight(tmp_path / "m.xml") < 1 << 20
     path.write_bytes(bytes(3000))
     assert files.check(path, "file") == 3000
 
