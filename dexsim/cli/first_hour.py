@@ -486,7 +486,10 @@ class Hour:
         clock = VirtualClock()
         trained = SimulatedXHand(b.config, c, clock, grip=b.manifest.get("grip"))
         trained.open()
-        there = latency(Session(trained, b.hand, clock), self.middle, self.joints, self.amps)
+        for amps in (self.amps, self.most, 4 * self.most):  # its friction is a guess: the lowest that moves it
+            there = latency(Session(trained, b.hand, clock), self.middle, self.joints, amps)
+            if len(there["ms"]) == len(self.joints):
+                break
         here = {k: x for n in ("cycles", "latency") if n in self.found for k, x in self.found[n].figures.items()}
         more = b.config.get("randomize", {}).get("servo", {}).get("delay", 0.0)
         reach = 1e3 * (max(more) if isinstance(more, list) else float(more))
@@ -553,7 +556,7 @@ STEPS = ("connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "
          "bundle")  # fmt: skip
 
 
-def latency(s: Session, middle: np.ndarray, joints: Sequence[int], current: np.ndarray) -> dict[str, Any]:
+def latency(s: Session, middle: np.ndarray, joints: Sequence[int], current: Any) -> dict[str, Any]:
     """Steps of single joints to and fro: {"ms": joint: [ms from command to motion], "rise_ms": joint: [ms from there to
     half of the step]}. A joint moves where it has left the spread of its encoder by three times."""
     out: dict[str, Any] = {"ms": {}, "rise_ms": {}}
