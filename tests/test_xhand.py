@@ -92,6 +92,18 @@ def test_a_cycle_is_one_round_trip(b):
     assert report.ended == "done" and 0.0094 < np.median(cycles) < 0.0099 and cycles.max() < 0.012
 
 
+def test_each_round_trip_brings_a_reading():
+    d = driver(VirtualClock(1.0))
+    d.open()
+    seen, before = set(), len(d.body._sdk.trips)
+    for k in range(500):
+        d.send(HandCommand(np.full(12, 0.1 + 1e-4 * k), np.full(12, 300)))
+        d.clock.sleep_until(d.clock.now() + 0.002)
+        if (state := d.read()) is not None:
+            seen.add(state.sequence)
+    assert 100 <= len(seen) <= 106 and abs(len(d.body._sdk.trips) - before - len(seen)) <= 2
+
+
 @pytest.mark.parametrize("start", [0.0, 0.9])
 def test_homing_begins_where_the_hand_is_not_from_the_zeros_of_the_cache(b, start):
     _, _, fake, _ = run(b, partial(LaggingHand, start=start))
@@ -197,6 +209,25 @@ def test_crc_errors_cost_a_pause_and_no_boot_mode(b, share):
     if share > 0.01:
         assert (np.diff(t) > 0.05).sum() > 5, "it had some, and waited after each"
     assert not report.counts["error_codes"], "a tip board's code in a broken frame is no fault of the joint"
+
+
+def test_a_code_of_a_tips_board_is_no_fault_of_the_joint(monkeypatch):
+    d = driver(VirtualClock(1.0))
+    d.open()
+    control = type(d.body._sdk.XHandControl())
+    frame = control._frame
+
+    def coded(self, *args):
+        made = frame(self, *args)
+        made.finger_state[2].tipboard_err = 307
+        return made
+
+    monkeypatch.setattr(control, "_frame", coded)
+    for _ in range(5):
+        d.send(HandCommand(np.full(12, 0.1), np.full(12, 300)))
+        d.clock.sleep_until(d.clock.now() + 0.02)
+        state = d.read()
+    assert not state.error.any()
 
 
 def test_a_retry_at_once_would_have_started_the_boot_mode():
