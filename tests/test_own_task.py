@@ -336,6 +336,18 @@ def test_a_table_of_another_width_is_refused():
         made(Short, worlds=1)
 
 
+def test_what_provides_a_row_on_a_hand_stands_in_the_manifest():
+    from dexsim.deploy import of_terms
+
+    class Seen(Flat):
+        @observe("rad", real="encoders of the drives")
+        def joint_position(self):
+            return self.q
+
+    rows = of_terms.parts(made(Seen, worlds=1))["rows"]
+    assert [row[:4] for row in rows] == [("joint_position", 12, "rad", "encoders of the drives")]
+
+
 def test_ranges_widen_as_a_task_is_learned():
     env = made(Flat, "task.curriculum.steps=4", "task.curriculum.start=0.2", worlds=2)
     widths = [float((stepped(env, 1), env.sampler.width)[1]) for _ in range(5)]

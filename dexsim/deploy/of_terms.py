@@ -147,7 +147,7 @@ def parts(env: Task) -> dict[str, Any]:
     rows = []
     for row in of.rows:
         wide = row.width * row.frames * env.history
-        rows.append((row.term.name, wide, row.unit or "1", row.term.text, "none"))
+        rows.append((row.term.name, wide, row.unit or "1", row.term.options["real"] or row.term.text, "none"))
     told = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
     rows += [(k, v.shape[1] * env.history, "1", "told", "none") for k, v in told.items()]
     width = env.sampler.width.clone()

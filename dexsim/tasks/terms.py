@@ -88,8 +88,8 @@ def observe(
         dropout: share of the readings that do not arrive; the one before stays.
         frames: how many of the last readings are seen, the newest first.
         only: who sees it; None: both.
-        real: what provides it on a real hand, one of `dexsim.tasks.signals.REAL`, where the method itself cannot be
-            computed from what a hand measures.
+        real: what provides it on a real hand, in words, for the manifest of a bundle; None: what the method's docstring
+            says.
         mirror: signs by which its numbers change where hand and world are mirrored (palm y to -y), repeated:
             `VECTOR` of places and speeds in the palm frame, `SIX` of a 6D orientation; None: they stay.
         name: of the row, where the method's would hide something of the environment.
