@@ -61,6 +61,16 @@ def dexsim_main(argv):
     return commands.train(argv[1:])
 
 
+@pytest.mark.parametrize("preset", ["cpu", "cuda"])
+def test_a_preset_changes_what_an_agent_has(preset):
+    from dexsim.cli import start
+    from dexsim.paths import CONFIGS
+
+    begun = start.for_train(["task=rotate", "agent=distill", "device=cpu", f"preset={preset}"], CONFIGS).cfg
+    assert begun["worlds"] in (256, 8192) and "gamma" not in begun["agent"]["algorithm"]
+    assert begun["agent"]["num_steps_per_env"] == (12 if preset == "cuda" else 24)
+
+
 def test_a_cube_is_the_same_from_each_side():
     """Rows of a cube whose own frame is turned are those that the declared symmetry makes of the rows before."""
     env = make_env(task_cfg("task.sensors.joint_noise=0", "task.sensors.tip_noise=0", worlds=3, task="rotate"), 3,

@@ -252,13 +252,23 @@ def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfi
         if not presets or name in ("cpu", "cuda"):
             return cfg  # the task has no wish for this kind of machine
         raise UserError(f"preset={name}: no such preset; this task has auto, none, {', '.join(presets)}")
+    wishes = OmegaConf.to_container(presets[name])
+    if isinstance(wishes, dict) and "agent" in wishes:  # what learns may be of another kind
+        wishes["agent"] = _there_too(wishes["agent"], cfg.get("agent"))
     try:
-        merged = OmegaConf.merge(cfg, presets[name])
+        merged = OmegaConf.merge(cfg, wishes)
     except OmegaConfBaseException as error:
         raise UserError(f"task.presets.{name}: {_first_line(error)}") from None
     assert isinstance(merged, DictConfig)  # as both were
     gone = [i for i in items if i.type == OverrideType.DEL and OmegaConf.select(merged, i.key_or_group) is None]
     return override(merged, [i for i in items if i not in gone])
+
+
+def _there_too(wishes: Any, own: Any) -> Any:
+    """The part of nested settings that others have as well."""
+    if not isinstance(wishes, dict) or not isinstance(own, DictConfig):
+        return wishes
+    return {k: _there_too(v, own.get(k)) for k, v in wishes.items() if k in own}
 
 
 def resolve(cfg: DictConfig) -> dict[str, Any]:
