@@ -13,6 +13,7 @@ from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.hand.skin import geom_points, link_skins, tip_skins
 from dexsim.import_hand import command, skin
+from dexsim.import_hand.importing import Settings, import_hand
 from dexsim.paths import CONFIGS
 from dexsim.tactile import ShapeSet, Tactile, TaxelLayout, hand_layout
 from dexsim.tactile.posed import PosedEngine
@@ -21,6 +22,7 @@ from dexsim.tactile.reference import spread
 from dexsim.tactile.shapes import bake_convex
 from dexsim.tasks import make_env
 from dexsim.tasks.building import contact_pairs, pad_pairs, self_pairs
+from tests import hands
 from tests.made_hand import made_hand
 from tests.tactile_fixtures import primitives, random_rotation
 
@@ -202,10 +204,10 @@ def test_a_hand_keeps_its_skin_and_another_replaces_it(tmp_path):
     again = skin.add(tmp_path, "a_2:12")
     assert [p.name for p in again.pads[3:]] == ["a_2"] and not list(tmp_path.glob("skin_palm*"))
     assert again.file.source["skin"] == "a_2:12"
-    left = hand_layout(load_hand(tmp_path, mirror=True, scale=2.0))
-    right = hand_layout(again)
-    np.testing.assert_allclose(left.point[3], 2 * right.point[3] * [1, -1, 1])
-    np.testing.assert_allclose(np.cross(left.tx[3, :12], left.ty[3, :12]), left.normal[3, :12], atol=2e-6)
+    other = hand_layout(load_hand(tmp_path, mirror=True, scale=2.0))
+    own = hand_layout(again)
+    np.testing.assert_allclose(other.point[3], 2 * own.point[3] * [1, -1, 1])
+    np.testing.assert_allclose(np.cross(other.tx[3, :12], other.ty[3, :12]), other.normal[3, :12], atol=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -257,6 +259,23 @@ def test_the_command_makes_another_hand_and_leaves_nothing_where_it_fails(tmp_pa
         command.main(["skin", "xhand", "skin=palm:20"])
 
 
+@pytest.mark.slow
+def test_an_import_lays_skin_and_a_later_one_keeps_it(tmp_path):
+    """As `skin=` says it the first time, as the command says it later; words of hand.yaml stay."""
+    robot, out = hands.write(tmp_path / "robot"), tmp_path / "claw"
+    settings = Settings(pads=(4, 3), drops=0, skin="palm:30/2,links:8")
+    import_hand(robot, out, settings, picture=False)
+    first = load_hand(out)
+    assert first.file.source["skin"] == settings.skin and len(first.pads) == 4 + 2 + 4
+    skin.add(out, "palm:12")
+    assert "# guess" in (out / "hand.yaml").read_text() and [p.name for p in load_hand(out).pads[4:]] == ["palm"]
+    again = import_hand(robot, out, Settings(pads=(4, 3), drops=0), picture=False)
+    assert [p.name for p in load_hand(out).pads[4:]] == ["palm"] and not again.kept and not again.corrected
+    with pytest.raises(UserError, match="skin=palm:12: needs pads on the fingertips"):
+        import_hand(robot, tmp_path / "bare", Settings(pads=None, drops=0, skin="palm:12"), picture=False)
+    assert not (tmp_path / "bare").exists()
+
+
 def test_a_grasp_is_felt_whole(hand):
     """In simulation: what palm and links carry is felt with what fingertips do, and the hand itself where it meets
     itself; each link's pads add up to the solver's force."""
@@ -264,10 +283,10 @@ def test_a_grasp_is_felt_whole(hand):
     given = ["task=grasp", "hand=xhand_skin", "worlds=8", "device=cpu", "task.objects.train=[box,sphere]"]
     env = make_env(start.for_train(given, CONFIGS).cfg, 8, "cpu", 0, "mujoco")
     assert env.pads == 15 and env.obs["actor"].shape[1] == sum(row[1] for row in env.rows())
-    fist = torch.tensor(hand.limits[:, 1], dtype=torch.float32)
+    cupped = torch.tensor(hand.pose("cupped"), dtype=torch.float32)
     most = torch.zeros(8), torch.zeros(8)
     for _ in range(40):
-        env.step((3 * (fist - env.q)).clamp(-1, 1))
+        env.step((3 * (cupped - env.q)).clamp(-1, 1))
         env.feel()
         touch, pair = env.touch, env.engine.t.pair_normal
         felt = touch.force_clean.sum(1)
@@ -280,4 +299,4 @@ def test_a_grasp_is_felt_whole(hand):
                 torch.testing.assert_close(force[:, mine].sum(1), pair[:, env.engine.pair(name)], rtol=1e-4, atol=1e-4)
         most = torch.maximum(most[0], felt - touch.force_clean[:, :5].sum(1)), torch.maximum(
             most[1], touch.force_other.sum(1))  # fmt: skip
-    assert (most[0] > 1.0).all()
+    assert (most[0] > 1.0).any() and (most[1] > 0.5).any()

@@ -130,14 +130,13 @@ class Hand:
 
     @property
     def pads(self) -> tuple[TouchPad, ...]:
-        """Its touch pads: pad f on finger f, then those of `skin`; none where its fingertips have none."""
+        """Return its touch pads: pad f on finger f, then those of `skin`; none where its fingertips have none."""
         tips = [TouchPad(f.name, f.body, f.pad.taxels, f.pad.kind, f.pad.rows) for f in self.fingers if f.pad]
         return (*tips, *(TouchPad(p.name, p.body, p.taxels, p.kind) for p in self.file.skin))
 
     @cached_property
     def links(self) -> dict[str, tuple[str, ...]]:
-        """Geoms that press objects, by body, without those of fingertips; a body that has none of its own is left
-        out."""
+        """Return geoms that press objects, by body, without those of fingertips; a body without any is not there."""
         out: dict[str, tuple[str, ...]] = {}
         m, tips = self.compiled, set(self.tip_geoms)
         for g in range(m.ngeom):

@@ -28,7 +28,8 @@ def tip_skin(hand: Hand, finger: Finger) -> np.ndarray:
 
 
 def link_skins(hand: Hand) -> list[tuple[str, np.ndarray]]:
-    """(body, corners [V, 3] m in its frame) of every link that presses objects: what touches the rest of the hand."""
+    """Return (body, corners [V, 3] m in its frame) of every link that presses objects: what touches the hand's
+    other links."""
     tips = {f.body: tip_skin(hand, f) for f in hand.fingers}
     own = {body: geom_points(hand, geoms) for body, geoms in hand.links.items()}
     return [

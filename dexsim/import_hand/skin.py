@@ -50,7 +50,7 @@ TURNS = 25
 
 @dataclass(frozen=True)
 class Wish:
-    """What is asked of a link, by name: taxels, or the spacing [m] that gives them; pads; side: palmar or all."""
+    """Hold what is asked of a link, by name: taxels, or the spacing [m] that gives them; pads; side: palmar or all."""
 
     link: str
     count: int | None
@@ -81,8 +81,8 @@ def wishes(text: str) -> list[Wish]:
 
 
 def names(hand: Hand) -> dict[str, str]:
-    """Short names of the links that press objects, fingertips' own shapes left out, and their bodies: palm; of a finger
-    its name and the link's number from the root; else the body's name."""
+    """Return short names of the links that press objects, fingertips' own shapes left out, and their bodies: palm; of a
+    finger its name and the link's number from the root; else the body's name."""
     model, out = hand.compiled, {}
     for body in hand.links:
         name = "palm" if body == hand.palm_body else body
@@ -95,7 +95,7 @@ def names(hand: Hand) -> dict[str, str]:
 
 
 def _way(model: mujoco.MjModel, tip: str, palm: str) -> list[str]:
-    """Names of the bodies from the palm, without it, to the tip."""
+    """Return names of the bodies from the palm, without it, to the tip."""
     out, b = [], model.body(tip).id
     while b > 0 and model.body(b).name != palm:
         out.append(model.body(b).name)
@@ -104,8 +104,8 @@ def _way(model: mujoco.MjModel, tip: str, palm: str) -> list[str]:
 
 
 def lay(hand: Hand, asked: str) -> dict[str, tuple[str, Pad]]:
-    """Pads by name, each with its body. Raises UserError for links that are not there, or carry nothing on that side,
-    and for more than MOST taxels."""
+    """Make pads by name, each with its body. Raises UserError for links that are not there, or carry nothing on that
+    side, and for more than MOST taxels."""
     known = names(hand)
     every, palm = hand.compiled, hand.palm_body
     out: dict[str, tuple[str, Pad]] = {}
@@ -138,7 +138,7 @@ def lay(hand: Hand, asked: str) -> dict[str, tuple[str, Pad]]:
 
 
 def _lay_link(hand: Hand, m: mujoco.MjModel, body: str, wish: Wish, where: str) -> list[Pad]:
-    """Pads of one link."""
+    """Make the pads of one link."""
     out_of_palm, ahead = directions(hand, body)
     points, normals, weight = _surface(hand, m, body, wish)
     seen = normals @ out_of_palm > FLAT if wish.side == "palmar" else np.ones(len(points), bool)
@@ -192,9 +192,9 @@ def spread(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _surface(hand: Hand, m: mujoco.MjModel, body: str, wish: Wish) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points [P, 3] m spread at random over what a link shows of its shapes, in its frame, unit normals [P, 3] out of
-    it, and the area [m2] that a point stands for. Not shown is what lies in another shape of the hand in the open pose,
-    or has one before it within ROOM."""
+    """Return points [P, 3] m spread at random over what a link shows of its shapes, in its frame, unit normals [P, 3]
+    out of it, and the area [m2] that a point stands for. Not shown is what lies in another shape of the hand in the
+    open pose, or has one before it within ROOM."""
     data = mujoco.MjData(m)
     hand.couplings.put(data, hand.pose("open"))
     mujoco.mj_kinematics(m, data)
@@ -230,8 +230,8 @@ def _surface(hand: Hand, m: mujoco.MjModel, body: str, wish: Wish) -> tuple[np.n
 
 
 def _hits(points: np.ndarray, ways: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Whether rays from points [P, 3] along ways [P, 3] meet a convex solid, of planes [K, 4] (outward normal, offset),
-    within ROOM (Cyrus and Beck 1978)."""
+    """Tell which rays from points [P, 3] along ways [P, 3] meet a convex solid, of planes [K, 4] (outward normal,
+    offset), within ROOM (Cyrus and Beck 1978)."""
     out = np.zeros(len(points), bool)
     near = np.flatnonzero((points @ planes[:, :3].T + planes[:, 3]).max(1) < ROOM)
     outside, slope = points[near] @ planes[:, :3].T + planes[:, 3], ways[near] @ planes[:, :3].T
@@ -252,8 +252,8 @@ def _area(surface: geometry.Surface) -> float:
 
 
 def directions(hand: Hand, body: str) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors in a link's frame: out of its palmar side, and towards the fingertips. Of a finger's link: its
-    fingertip's, the finger straight; else the palm's."""
+    """Return unit vectors in a link's frame: out of its palmar side, and towards the fingertips. Of a finger's link:
+    its fingertip's, the finger straight; else the palm's."""
     m = hand.compiled
     pose = hand.pose("open")
     bends = sorted({j for f in hand.fingers for j in f.flexion})
@@ -345,7 +345,7 @@ def main(argv: list[str]) -> int:
 
 
 def copy(hand: Hand, out: Path) -> None:
-    """A new folder with the files of a hand. Raises UserError where the folder holds anything."""
+    """Make a new folder with the files of a hand. Raises UserError where the folder holds anything."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"out={out}: exists and is not empty; choose another, or leave out= away for the hand itself")
     shutil.copytree(hand.folder, out, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "__pycache__"))

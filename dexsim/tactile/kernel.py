@@ -204,7 +204,7 @@ def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3
 
 @wp.func
 def nearest_link(here: Surroundings, tips: Shapes, w: int, body: int, point: wp.vec3):
-    """Signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links."""
+    """Return the signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links."""
     out = float(1.0e9)
     for g in range(here.link_body.shape[0]):
         other = here.link_body[g]
@@ -219,8 +219,8 @@ def beside_object(
     here: Surroundings, pads: Pads, shapes: Shapes, shape: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, f: int, o: int,
     first: int, step: int, level: float,
 ):  # fmt: skip
-    """Of every step-th taxel from `first` of the other pads that share pad f's pair with object o: the least distance
-    [m], and the sum of weights under `level`."""
+    """Return the least distance [m] and the sum of weights under `level` of every step-th taxel, from `first`, of the
+    other pads that share pad f's pair with object o."""
     nearest = float(1.0e9)
     weight = float(0.0)
     for g in range(pads.body.shape[0]):
@@ -238,7 +238,7 @@ def beside_object(
 def beside_links(
     here: Surroundings, pads: Pads, tips: Shapes, w: int, f: int, first: int, step: int, level: float
 ):
-    """The same for the rest of the hand: of the other pads on pad f's body."""
+    """Return the same for the rest of the hand: of the other pads on pad f's body."""
     nearest = float(1.0e9)
     weight = float(0.0)
     body = pads.body[f]

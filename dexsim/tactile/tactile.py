@@ -330,7 +330,7 @@ def _baked(corners: bytes) -> Grid:
 
 
 def _link_shapes(links: Sequence[tuple[str, np.ndarray]]) -> list[TouchShape]:
-    """Distance grids of links; equal ones share one, whoever asks."""
+    """Return distance grids of links; equal ones share one, whoever asks."""
     return [TouchShape(body, "grid", _baked(np.ascontiguousarray(x, dtype=float).tobytes())) for body, x in links]
 
 

@@ -73,8 +73,8 @@ def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[Con
 
 
 def pad_pairs(hand: Hand) -> list[tuple[str, tuple[str, str]]]:
-    """Name of the contact pair with the object whose force each pad feels (each fingertip, without touch), and its
-    first member: the fingertip; where a link has skin, the link, whose pads share its force."""
+    """Return the name of the contact pair with the object whose force each pad feels (each fingertip, without touch),
+    and its first member: the fingertip; where a link has skin, the link, whose pads share its force."""
     skin = {p.body for p in hand.file.skin}
     tips = {f.body: ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers}
     names = dict(zip(hand.tip_bodies, hand.finger_names, strict=True))
@@ -83,7 +83,7 @@ def pad_pairs(hand: Hand) -> list[tuple[str, tuple[str, str]]]:
 
 
 def self_pairs(hand: Hand) -> list[str]:
-    """Name of the contact pair of each pad's body and the rest of the hand."""
+    """Return the name of the contact pair of each pad's body and the rest of the hand."""
     tips = dict(zip(hand.tip_bodies, hand.finger_names, strict=True))
     return [f"self_{tips[p.body]}" if p.body in tips else f"hand_{p.body}" for p in hand.pads]
 

@@ -1,5 +1,4 @@
-"""Write xhand_right.xml, meshes/*.obj, the derived taxel columns, and the hand xhand_skin, the same with taxels on palm
-and links: `python -m dexsim.assets.xhand.build`.
+"""Write xhand_right.xml, meshes/*.obj and the derived taxel columns: `python -m dexsim.assets.xhand.build`.
 
 Input: joints.csv, bodies.csv and the x, y, z columns of taxels_*.csv (measured). The results are committed.
 """
@@ -236,27 +235,6 @@ def build() -> str:
     return text
 
 
-SKIN = "palm:80/4,links:20"
-"""Taxels of xhand_skin beside the fingertips'. The real hand has none."""
-
-
-def build_skin() -> None:
-    """Write ../xhand_skin: the same hand, with touch on palm and links."""
-    from dexsim.hand import schema
-    from dexsim.import_hand import skin
-
-    folder = xhand.FOLDER.with_name("xhand_skin")
-    folder.mkdir(exist_ok=True)
-    file = schema.read(xhand.FOLDER / schema.FILE)
-    away = lambda name: f"../xhand/{name}"  # noqa: E731
-    file.name, file.model = folder.name, away(file.model)
-    for finger in file.fingers:
-        assert finger.pad is not None and finger.pad.skin is not None  # the xHand's have
-        finger.pad.taxels, finger.pad.skin = away(finger.pad.taxels), away(finger.pad.skin)
-    schema.write(file, folder / schema.FILE)
-    skin.add(folder, SKIN, print)
-
-
 def _sites(body: str) -> list[str]:
     if body == xhand.ROOT_BODY:
         half_turn = _num([0, 0.5**0.5, 0, 0.5**0.5])
@@ -369,4 +347,3 @@ _TEMPLATE = """\
 
 if __name__ == "__main__":
     build()
-    build_skin()
