@@ -448,7 +448,7 @@ def test_the_help_of_play_lists_what_goes_with_a_replay():
 
 @pytest.mark.parametrize("line, said", [
     ("+agent.actor.hidden_dims.task=[16,16]", "agent.actor.hidden_dims is a list"),
-    ("hand=" + "a" * 300, "must be one of xhand, or a folder with a hand.yaml"),
+    ("hand=" + "a" * 300, "must be one of xhand, xhand_skin, or a folder with a hand.yaml"),
 ])  # fmt: skip
 def test_a_name_in_a_list_and_a_name_too_long_for_a_file_are_one_line(line, said, capsys):
     from dexsim.cli.main import main

@@ -185,7 +185,7 @@ def test_names_of_hands(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = made_hand(tmp_path / "hands" / "leapt")
     assert load_hand("leapt").folder == made.resolve() == load_hand("hands/leapt").folder
-    with pytest.raises(UserError, match="hand=leap: must be one of xhand, leapt, .*did you mean leapt"):
+    with pytest.raises(UserError, match="hand=leap: must be one of xhand, xhand_skin, leapt, .*did you mean leapt"):
         load_hand("leap")
     with pytest.raises(UserError, match="hand_scale=9"):
         load_hand("xhand", scale=9.0)
