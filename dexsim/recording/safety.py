@@ -38,9 +38,13 @@ class ContactCheck:
         self.data = mujoco.MjData(self.model)
         self.clearance = clearance
         self.address = np.array([self.model.jnt_qposadr[self.model.joint(j).id] for j in m.joints])
+        self._names = [self.model.body(b).name or f"body {b}" for b in range(self.model.nbody)]
         self._couplings = Couplings(self.model, m.joints) if m.hand is not None else None
-        self.exempt: set[tuple[str, str]] = set()
-        self.exempt = set(self.near(home))
+        self._apart = np.zeros((self.model.nbody, self.model.nbody), bool)  # pairs that are not looked at
+        self.exempt: set[tuple[str, str]] = set(self.near(home))
+        for pair in self.exempt:
+            a, b = (self._names.index(name) for name in pair)
+            self._apart[a, b] = self._apart[b, a] = True
 
     def near(self, q: np.ndarray) -> list[tuple[str, str]]:
         """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest, or, in a hand,
@@ -58,15 +62,12 @@ class ContactCheck:
         d.qpos[:] = qpos
         mujoco.mj_kinematics(m, d)
         mujoco.mj_collision(m, d)
-        out = []
-        for k in range(d.ncon):
-            contact = d.contact[k]
-            if contact.dist < self.clearance:
-                a, b = (m.body(m.geom_bodyid[g]).name or f"body {m.geom_bodyid[g]}" for g in contact.geom)
-                pair = (min(a, b), max(a, b))
-                if pair not in self.exempt:
-                    out.append(pair)
-        return out
+        bodies = m.geom_bodyid[d.contact.geom]
+        close = (d.contact.dist < self.clearance) & ~self._apart[bodies[:, 0], bodies[:, 1]]
+        if not close.any():
+            return []
+        pairs = {(min(a, b), max(a, b)) for a, b in ((self._names[i], self._names[k]) for i, k in bodies[close])}
+        return sorted(pairs)
 
     def along(self, run: Run) -> dict[tuple[str, str], float]:
         """Pairs that came near, with the time of the first."""
