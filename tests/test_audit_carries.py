@@ -11,7 +11,7 @@ import pytest
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import command
-from dexsim.gap.audit import main
+from dexsim.gap.audit import main, renewed
 from dexsim.gap.plant import information
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import Run, agreement, inputs
@@ -216,3 +216,23 @@ def test_the_xhands_recording_needs_no_model(tmp_path, capsys):
     main([str(path)])
     said = capsys.readouterr().out
     assert f"next: dexsim diagnose recordings={path} out=out/diagnosis" in said
+
+
+def test_the_true_rate_of_each_signal_is_said(tmp_path, capsys):
+    """A firmware that renews its position every 20 ms with jitter, a policy of 20 Hz and a current of 50 Hz in a log of
+    200 Hz; what creeps over a coarse encoder's steps is not slow."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(0.005 + 0.001 * rng.random(800))
+    at = lambda period, x: x(np.floor(t / period) * period)  # noqa: E731
+    motion_ = lambda u: 0.5 * np.sin(2 * u)  # noqa: E731
+    shown = at(0.02, lambda u: np.round(motion_(u - 0.05) / 1.5e-3) * 1.5e-3)
+    sent, effort = at(0.05, motion_), at(0.02, lambda u: motion_(u) - motion_(u - 0.05))
+    head = "time,command.a,position.a,effort.a"
+    np.savetxt(tmp_path / "r.csv", np.stack([t, sent, shown, effort], 1), delimiter=",", header=head, comments="")
+    main([str(tmp_path / "r.csv")])
+    said = capsys.readouterr().out
+    lines_ = [x for x in said.splitlines() if "a new value" in x]
+    found = {x.split(" of ")[0]: float(x.split("every ")[1].split()[0]) for x in lines_}
+    assert found["position"] == pytest.approx(20, abs=2) and found["effort"] == pytest.approx(20, abs=2)
+    assert found["command"] == pytest.approx(50, abs=3)
+    assert renewed(t, np.round(0.02 * t / 1.5e-3) * 1.5e-3) == 0.0 and renewed(t, motion_(t)) == 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -73,6 +74,10 @@ def files(tmp_path):
         np.savez(path, command=np.stack(list(Q.values()), 1), position=np.stack(list(LATE.values()), 1),
                  joint_names=list(Q))  # fmt: skip
 
+    def json_lines(path):
+        rows = zip(T.tolist(), Q["elbow"].tolist(), LATE["elbow"].tolist(), strict=True)
+        path.write_text("".join(json.dumps({"time": t, "goal": c, "elbow": {"pos": q}}) + "\n" for t, c, q in rows))
+
     def aloha(path):
         import h5py
 
@@ -114,6 +119,7 @@ def files(tmp_path):
         "registers.csv": lambda p: plain(p, lambda q: np.round(1000 * (1.47 - q) / 1.47)),
         "percent.csv": lambda p: plain(p, lambda q: 100 * (q + 1) / 3),
         "rig.xml": rig,
+        "log.jsonl": json_lines,
         "arrays.npz": arrays,
         "so100": lambda p: test_readers.lerobot(p, "v3.0"),
         "hands.zarr": lambda p: test_readers.hands(p, 3),

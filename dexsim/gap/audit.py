@@ -232,6 +232,46 @@ def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
     return text
 
 
+LEAP, FEW = 3.0, 8
+"""Smallest steps of a signal by which a new value leaps, and new values that tell how often they come."""
+
+
+def renewed(t: np.ndarray, x: np.ndarray) -> float:
+    """s from one new value of a signal x [n] at t [n] to the next while it changes; 0 where each sample is a new one,
+    or too few are. A joint that creeps over a coarse encoder's steps has new values seldom, but no leaps."""
+    ok = np.isfinite(x)
+    t, x = t[ok], x[ok]
+    change = np.flatnonzero(np.diff(x) != 0) + 1
+    if len(change) < FEW:
+        return 0.0
+    size = np.abs(x[change] - x[change - 1])
+    leaps = size > LEAP * size.min()
+    both = leaps[1:] & leaps[:-1]  # from one leap to the next: between them it moves, and stands in the log
+    since = np.diff(change)[both]
+    if both.sum() < FEW - 1 or both.sum() < 0.5 * len(both) or np.median(since) < 2 or np.mean(since < 2) > 0.25:
+        return 0.0
+    return float(np.median(np.diff(t[change])[both]))
+
+
+def rates(recordings: Sequence[Recording]) -> list[str]:
+    """The signals that are renewed more seldom than they are logged, a line each."""
+    out = []
+    for name in ("position", "velocity", "effort", "duty", "command"):
+        slow: dict[str, tuple[float, float]] = {}
+        for r in recordings:
+            for part in r.parts():
+                s = part.commands if name == "command" else part.duty if name == "duty" else getattr(part.states, name)
+                for k, joint in enumerate(part.joints if s is not None and len(s) > 20 else ()):
+                    period, logged = renewed(s.t, s.value[:, k]), float(np.median(np.diff(s.t)))
+                    if period > 1.5 * logged > 0:
+                        slow.setdefault(joint, (period, logged))
+        if slow:
+            period, logged = (float(np.median([x[k] for x in slow.values()])) for k in (0, 1))
+            out.append(f"{name} of {', '.join(slow)}: a new value every {1e3 * period:.3g} ms, logged every "
+                       f"{1e3 * logged:.3g}")  # fmt: skip
+    return out
+
+
 def _only(r: Recording, joint: str) -> Recording:
     return next(p for p in r.parts() if joint in p.joints)._of([_place(r, joint)])
 
@@ -326,7 +366,8 @@ def main(argv: Sequence[str]) -> int:
         worst = max(worst, int(any(f.severity == "error" for f in found)))
     if runs:
         print(carries([r for _, r in recordings], runs) + "\n")
-        for text in (delays(runs), beliefs(runs, known) if known is not None and own.get("servo") else ""):
+        believed = beliefs(runs, known) if known is not None and own.get("servo") else ""
+        for text in ("\n".join(rates([r for _, r in recordings])), delays(runs), believed):
             if text:
                 print(text + "\n")
         options = [a for a in rest if a not in given]
