@@ -115,6 +115,14 @@ def test_worlds_that_cannot_be_this_runs(tmp_path):
     assert "save_worlds=true keeps them" in again.resumed and again._fresh
 
 
+def test_worlds_of_an_earlier_dexsim_begin_anew(tmp_path):
+    """Whose tasks had memory of other names: the run goes on, its episodes do not."""
+    data = runner("grasp", "mujoco").payload()
+    data["worlds"]["env.z_before"] = data["worlds"].pop("env.z_seen")
+    again = resumed(checkpoint.save(tmp_path / "last.pt", data), "grasp", "mujoco")
+    assert again.resumed == "episodes begin anew (the checkpoint's are of another dexsim)"
+
+
 @pytest.mark.parametrize(("name", "spoil", "words"), [
     ("mujocoengine.geom_dataid", lambda x: x.fill_(10**6), r"geom_dataid holds 1000000, must lie in \[-1, \d+\]"),
     ("tactile.shape_id", lambda x: x.fill_(-7), r"shape_id holds -7"),

@@ -323,6 +323,8 @@ class Runner(OnPolicyRunner):
             why = "the checkpoint does not hold them: save_worlds=true keeps them"
         elif other:
             why = f"{other} differs from the checkpoint's"
+        elif worlds.of_another_version(self.env, {k: v for k, v in data["worlds"].items() if k[:6] != "meter."}):
+            why = "the checkpoint's are of another dexsim"
         else:
             self._load_worlds(data["worlds"])
             self._resumed_worlds, self._fresh, why = True, False, ""

@@ -140,12 +140,12 @@ class GraspEnv(Launches):
         self.clearance.launch()
 
     def update(self) -> None:
-        self.dropped = self.launch_dropped()
+        self.launch_dropped()
 
     @done(name="dropped")
     def is_dropped(self) -> torch.Tensor:
         """centre below the palm (termination.below) or far from it (termination.distance)"""
-        return self.dropped
+        return self._dropped
 
     # -- what is paid: every term is computed by one kernel
     def reward_words(self) -> dict[str, str]:

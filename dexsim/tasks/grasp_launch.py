@@ -168,7 +168,6 @@ class Launches(Task):
         # checkpoints from before lack some
         return {name: term for name, term in zip(names, out, strict=False) if name in w}
 
-    def launch_dropped(self) -> torch.Tensor:
-        """Whether each object's centre is below the palm or far from it [N]."""
+    def launch_dropped(self) -> None:
+        """Find whether each object's centre is below the palm or far from it, `_dropped` [N]."""
         self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)
-        return self._dropped

@@ -136,6 +136,10 @@ class ImuInside(Task):
     seen = memory(4, reset=False)
     joint_bias = memory(joints, reset=False)
 
+    def setup(self) -> None:
+        self.up = torch.tensor([0.0, 0.0, 1.0], device=self.device)  # an IMU knows where down is, but not its heading
+        super().setup()
+
     def begin_sensors(self, mask: torch.Tensor) -> None:
         """Draw what is constant within an episode."""
         s, m1 = self.sampler, mask[:, None]
@@ -164,8 +168,7 @@ class ImuInside(Task):
         return rotation.multiply(self._drift(self.goal_heading), self.goal)
 
     def _drift(self, heading: torch.Tensor) -> torch.Tensor:
-        up = torch.tensor([0.0, 0.0, 1.0], device=self.device)  # an IMU knows where down is, but not its heading
-        return rotation.about(up.expand(self.num_envs, 3), heading)
+        return rotation.about(self.up.expand(self.num_envs, 3), heading)
 
 
 class TipMotion(Task):

@@ -38,6 +38,9 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     goal, home = memory(4, reset=False), memory(3, reset=False)
     successes, since = memory(dtype=torch.long), memory(dtype=torch.long)  # since: control steps, since the last one
+    # of the last step, also where an episode has begun since; a recorded step writes into this memory
+    reached, dropped, tipped = (memory(dtype=torch.bool, reset=False) for _ in range(3))
+    d_rot, d_pos = memory(reset=False), memory(reset=False)  # rad, m, to the goal and from `home`
 
     # -- setting up
     @classmethod
@@ -74,7 +77,6 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         ends = t["termination"]
         self.farthest = torch.tensor(self.unit * (ends.get("training") or ends["distance"]), device=dev)
         self.axis, self.turn = (x.to(dev) for x in shared.axis_and_turn(t["goal"], self.hand.mirror))
-        self.up = torch.tensor([0.0, 0.0, 1.0], device=dev)  # an IMU knows where down is, but not its heading
         self.taxel_point = None if t["observe"]["force_weighted"] else self.taxels()
 
     def symmetries(self) -> list[dict[str, Callable[[torch.Tensor], torch.Tensor]]]:

@@ -64,6 +64,13 @@ def put_back(env: HandEnv, state: Mapping[str, torch.Tensor]) -> None:
     env.rng.set_state(rng)
 
 
+def of_another_version(env: HandEnv, state: Mapping[str, torch.Tensor]) -> bool:
+    """Whether a state is of a task that had other memory, as an earlier dexsim wrote it: it has names that this one
+    has not, and lacks some."""
+    own = {*live(env), "rng"}
+    return bool(set(state) - own) and bool(own - set(state))
+
+
 def size(env: HandEnv) -> int:
     """Bytes of all worlds."""
     return sum(tensor.numel() * tensor.element_size() for tensor, _, _ in live(env).values())
