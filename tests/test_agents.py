@@ -1,4 +1,4 @@
-"""What learns beside plain PPO: a student of a teacher that sees more, symmetric samples, histories."""
+"""Agents beside plain PPO: a student of a teacher that sees more, symmetric samples, histories."""
 
 from __future__ import annotations
 

@@ -80,19 +80,19 @@ class Run:
         return path.stat().st_mtime if path.is_file() else 0.0
 
     def names(self) -> list[str]:
-        """Checkpoints by iteration, then the newest policy."""
+        """List the checkpoints by iteration, then the newest policy."""
         kept = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
         kept.sort(key=lambda p: int(p.stem.removeprefix("model_")))
         self._files.update({p.name: p for p in kept})
         return [*(p.name for p in kept if p.name != self.newest), self.newest]
 
     def changed(self) -> bool:
-        """Whether the newest policy was saved again."""
+        """Tell whether the newest policy was saved again."""
         before, self._stamp = self._stamp, self._time()
         return self._stamp != before
 
     def panel(self) -> str:
-        """What progress.csv says."""
+        """Show what progress.csv says."""
         from dexsim.view.live_panels import training
         from dexsim.view.plots import read_progress
 

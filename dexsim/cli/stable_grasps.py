@@ -32,7 +32,7 @@ settings (key=default):
 
 
 def tasks() -> dict[str, tuple[str, list[float]]]:
-    """What carries the cube -> task whose episodes start so, usual edges of the cubes [m]."""
+    """Map what carries the cube to the task whose episodes start so, usual edges of the cubes [m]."""
     made = {name: registry.load(where) for name, where in registry.built_in().items()}
     held = {name: task.holds for name, task in made.items() if hasattr(task, "holds")}
     return {carries: (name, list(edges)) for name, (carries, edges) in held.items()}

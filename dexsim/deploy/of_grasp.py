@@ -71,7 +71,7 @@ def parts(env: Any) -> dict[str, Any]:
 
 
 def signals_of(env: Any) -> observations.Signals:
-    """What the last observation of a simulated task was built from, noise and all."""
+    """Return what the last observation of a simulated task was built from, noise and all."""
     s, felt = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
     followers = env.q[:, :0]
     if env.hand.sensed:  # with its noise, which is nowhere else

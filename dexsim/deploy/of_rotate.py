@@ -86,7 +86,7 @@ def parts(env: Any) -> dict[str, Any]:
 
 
 def signals_of(env: Any) -> observations_rotate.Signals:
-    """What the last observation of a simulated task was built from, noise and all."""
+    """Return what the last observation of a simulated task was built from, noise and all."""
     widths = {name: width // env.history for name, width, _ in env.describe()["observations"]["actor"]}
     frames = env.obs["actor"].view(env.num_envs, env.history, -1).clone()
     row = dict(zip(widths, frames[:, 0].split([*widths.values()], 1), strict=True))

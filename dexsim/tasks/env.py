@@ -107,7 +107,7 @@ class HandEnv(Kept):
 
     @classmethod
     def another_world(cls, u: Callable[..., float], friction: float, size: float) -> dict[str, Any]:
-        """What is drawn of this task for another world to be judged in: "randomize", ranges by name, and "sensors".
+        """Draw what of this task differs in another world to be judged in: "randomize", ranges by name, and "sensors".
 
         u(low, high, digits): a number. friction, size [m] of the object. See `dexsim.tasks.reality`."""
         return {}

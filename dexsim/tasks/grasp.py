@@ -189,7 +189,7 @@ class GraspEnv(Launches):
         return torch.cat([torch.zeros_like(self.first_xy), self.height_speed()[:, None]], 1)
 
     def height_speed(self) -> torch.Tensor:
-        """Of the object as the camera has it [N], m/s; 0 as an episode begins."""
+        """Return the speed of the object as the camera has it [N], m/s; 0 as an episode begins."""
         return self.vz_seen.masked_fill(self.episode_length_buf == 0, 0.0)
 
     @observe("F/F_max")
@@ -235,7 +235,7 @@ class GraspEnv(Launches):
         return {f"task/{name}": mean for name, mean in zip(grasp_rewards.METRICS, means, strict=True)}
 
     def notes(self) -> list[str]:
-        """What a command of 1 means."""
+        """Say what a command of 1 means."""
         tau = self.tau_max[self.others[0]].item()
         return [f"F_max = {self.f_max:.2f} N a fingertip: static press at {tau:.2f} N.m (command 1)"]
 

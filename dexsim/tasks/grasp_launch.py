@@ -1,4 +1,4 @@
-"""What the grasp shares with its kernels (`grasp_kernels.py`, `grasp_rewards.py`), and their launches."""
+"""Memory that the grasp shares with its kernels (`grasp_kernels.py`, `grasp_rewards.py`), and their launches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CENTRE_LENGTH = 0.03
 
 
 def camera_length(env: Any) -> int:
-    """How many pictures are kept: as many as may be late, and the newest."""
+    """Count the pictures that are kept: as many as may be late, and the newest."""
     return max(1, int(round(env.task["sensors"]["vision_delay"][1] / env.dt)) + 1) + 1
 
 

@@ -1,4 +1,4 @@
-"""What of an environment a checkpoint keeps."""
+"""Keeps of an environment what a checkpoint holds."""
 
 from __future__ import annotations
 

@@ -160,14 +160,14 @@ def next_goal(q: torch.Tensor, axis: torch.Tensor, turn: torch.Tensor, keep_tilt
 
 
 def relabelled(turn: torch.Tensor) -> dict[str, Callable[[torch.Tensor], torch.Tensor]]:
-    """How rows change where an object's own frame is turned by a matrix [3, 3] in it; see `HandEnv.symmetries`."""
+    """Return how rows change where an object's own frame is turned by a matrix [3, 3]; see `HandEnv.symmetries`."""
 
     def orientation(six: torch.Tensor) -> torch.Tensor:
-        """Of R [N, 6]: R turn."""
+        """Turn R [N, 6] into R turn."""
         return rotation.six_of_matrix(rotation.matrix_of_six(six) @ turn)
 
     def relative_(row: torch.Tensor) -> torch.Tensor:
-        """Of R_object^T R_goal: turn^T that turn."""
+        """Turn R_object^T R_goal into turn^T that turn."""
         if row.shape[1] != 6:
             raise UserError("agent=ppo_symmetric: needs task.observe.orientation=6d")
         return rotation.six_of_matrix(turn.T @ rotation.matrix_of_six(row) @ turn)

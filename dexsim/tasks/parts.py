@@ -27,7 +27,7 @@ class Held(Task):
 
     in_order = False
     holds: ClassVar[tuple[str, tuple[float, float]]]
-    """What carries the object as an episode begins (`dexsim stable-grasps hold=`), usual edges of cubes, m."""
+    """Carrier of the object as an episode begins (`dexsim stable-grasps hold=`), usual edges of cubes, m."""
 
     def __init__(
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
@@ -40,7 +40,7 @@ class Held(Task):
 
     @classmethod
     def needs_taxels(cls, task: dict) -> bool:
-        """Whether the task needs every taxel's force, beside sums and centres of pads."""
+        """Tell whether the task needs every taxel's force, beside sums and centres of pads."""
         return False
 
     @classmethod
@@ -119,7 +119,7 @@ class Held(Task):
 
 
 def _imu_length(env: Any) -> int:
-    """How many readings of the IMU are kept: as many as may be late, and the newest."""
+    """Count the readings of the IMU that are kept: as many as may be late, and the newest."""
     return max(1, math.ceil(env.sampler.range("imu.delay")[1] / env.dt) + 1) + 1
 
 
@@ -150,7 +150,7 @@ class ImuInside(Task):
         self.imu_delay = torch.where(mask, (s.draw("imu.delay") / self.dt).round().long(), self.imu_delay)
 
     def sense_object(self, fresh: torch.Tensor) -> None:
-        """Orientation as an IMU in the object reports it: late, noisy, slightly tilted, its heading drifting."""
+        """Read the orientation as an IMU in the object has it: late, noisy, slightly tilted, its heading drifting."""
         size, s = self.task["sensors"], self.sampler
         walk = size["imu_heading_walk"] * math.sqrt(self.dt) * s.normal()
         self.heading += torch.where(fresh, torch.zeros_like(walk), self.heading_rate * self.dt + walk)
@@ -163,8 +163,8 @@ class ImuInside(Task):
         self.seen = rotation.normalize(self.imu_past.gather(1, late)[:, 0])
 
     def goal_seen(self) -> torch.Tensor:
-        """The goal [N, 4] as the actor has it: set from the IMU, so it carries the heading drift of that moment; what
-        drifted since is error."""
+        """Return the goal [N, 4] as the actor has it: set from the IMU, it carries the heading drift of that moment;
+        what drifted since is error."""
         return rotation.multiply(self._drift(self.goal_heading), self.goal)
 
     def _drift(self, heading: torch.Tensor) -> torch.Tensor:
@@ -179,7 +179,7 @@ class TipMotion(Task):
     tip_velocity = memory(fingers, 6, reset=False)
 
     def sense_tips(self, fresh: torch.Tensor) -> None:
-        """Velocities over the last control step: linear, and angular from the rotation between the two."""
+        """Find velocities over the last control step: linear, and angular from the rotation between the two."""
         rot = self.engine.t.xmat[:, self.tip_body].float()
         rot = torch.where(self.nan[:, None, None, None], torch.zeros_like(rot), rot)
         new = fresh[:, None, None]
@@ -196,7 +196,7 @@ class TipMotion(Task):
         self.tip_rot, self.tip_last = rot, self.tips
 
     def taxels(self) -> torch.Tensor:
-        """Places of all taxels [P, T, 3] m in the frames of their pads' links."""
+        """Return places of all taxels [P, T, 3] m in the frames of their pads' links."""
         layout = hand_layout(self.hand) or tip_layout(self.hand)
         lifted = layout.lifted(tip_skins(self.hand)) if self.touch.cfg.lift and self.pads else layout
         return torch.as_tensor(lifted.point, dtype=torch.float32, device=self.device)

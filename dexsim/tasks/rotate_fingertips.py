@@ -28,7 +28,7 @@ from dexsim.tasks.terms import done, memory, metric, observe, reward
 
 
 def camera_length(env: Any) -> int:
-    """How many pictures are kept: as many as may be late, and the newest."""
+    """Count the pictures that are kept: as many as may be late, and the newest."""
     return math.ceil(env.sampler.range("camera.delay")[1] / env.dt) + 2
 
 

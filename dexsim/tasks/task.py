@@ -110,7 +110,7 @@ class Task(HandEnv):
 
     @classmethod
     def declared(cls) -> dict[str, Any]:
-        """The settings of its terms as their decorators have them."""
+        """Return the settings of its terms as their decorators have them."""
         return _terms_settings(terms_of(cls))
 
     @classmethod
@@ -172,8 +172,8 @@ class Task(HandEnv):
         """Allocate what the task needs beside declared memory; called once, before the first episode."""
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options of observations, by name, that follow from other settings of the task; what `task.observations` says
-        goes before them. May set `history`, whose setting is `task.history`."""
+        """Return options of observations, by name, that follow from other settings of the task; what
+        `task.observations` says goes before them. May set `history`, whose setting is `task.history`."""
         self.history = self.task["history"]
         return {}
 
@@ -453,7 +453,7 @@ class Task(HandEnv):
         due.copy_(torch.where(now, wait, due))
 
     def end_curriculum(self) -> None:
-        """From now on all ranges whole (evaluation)."""
+        """Draw from whole ranges from now on (evaluation)."""
         self.learned.fill_(float((self.task.get("curriculum") or {"steps": 0})["steps"]))
         self.sampler.width.fill_(1.0)
 
@@ -523,7 +523,7 @@ class Task(HandEnv):
     # -- observations
     # ------------------------------------------------------------------------------------------------------------
     def mirror_signs(self) -> torch.Tensor | None:
-        """From the rows that say so (`observe(mirror=)`); None where none does."""
+        """Gather them from the rows that say so (`observe(mirror=)`); None where none does."""
         rows = [x for x in self._sensed if self._named(self.task["observations"][x.term.name]["actor"])]
         if not any(x.term.options["mirror"] for x in rows):
             return None
@@ -638,7 +638,7 @@ class Task(HandEnv):
         }
 
     def notes(self) -> list[str]:
-        """What else a reader of the first screen must know of the task."""
+        """Say what else a reader of the first screen must know of the task."""
         return []
 
 

@@ -253,12 +253,12 @@ Size = int | Callable[[Any], int]
 
 
 def joints(env: Any) -> int:
-    """How many joints the hand of an environment has: a size of `memory`."""
+    """Count the joints of the hand of an environment: a size of `memory`."""
     return int(env.num_actions)
 
 
 def fingers(env: Any) -> int:
-    """How many fingers, likewise."""
+    """Count its fingers, likewise."""
     return int(env.fingers)
 
 

@@ -65,8 +65,8 @@ def put_back(env: HandEnv, state: Mapping[str, torch.Tensor]) -> None:
 
 
 def of_another_version(env: HandEnv, state: Mapping[str, torch.Tensor]) -> bool:
-    """Whether a state is of a task that had other memory, as an earlier dexsim wrote it: it has names that this one
-    has not, and lacks some."""
+    """Tell whether a state is of a task that had other memory, as an earlier dexsim wrote it: it has names that this
+    one has not, and lacks some."""
     own = {*live(env), "rng"}
     return bool(set(state) - own) and bool(own - set(state))
 

@@ -60,13 +60,13 @@ class Followed(Protocol):
     """Name of the policy that it saves over and over."""
 
     def names(self) -> list[str]:
-        """Names of its checkpoints, the oldest first, the newest policy last."""
+        """Name its checkpoints, the oldest first, the newest policy last."""
 
     def changed(self) -> bool:
-        """Whether the newest policy is another than when this was last asked."""
+        """Tell whether the newest policy is another than when this was last asked."""
 
     def panel(self) -> str:
-        """HTML: how it learns."""
+        """Give HTML: how it learns."""
 
 
 class LiveView:
