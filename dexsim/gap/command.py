@@ -316,18 +316,18 @@ class Progress:
         self.live = sys.stdout.isatty()
         self.said, self.searched = 0.0, -1
 
-    def __call__(self, done: float, total: int, name: str) -> None:
-        """done of total are searched, by the time that it takes."""
+    def __call__(self, done: float, total: int, name: str, left: float | None = None) -> None:
+        """done of total are searched, the one under way in part; left: s, where that is known."""
         now = time.perf_counter()
         if not done:  # what was before says nothing of how long it takes
             self.start = now
         if int(done) == self.searched < total and not self.live and now - self.said < self.EVERY:
             return
         self.said, self.searched, spent = now, int(done), now - self.start
-        left = f", about {spent * (total - done) / done:.0f} s left" if 0.1 <= done < total else ""
         part = f", {100 * done / total:.0f} % done" if 0.0 < done < total else ""
+        tail = f", about {left:.0f} s left" if left is not None else f", {spent:.0f} s so far" if part else ""
         text = (
-            f"  searching {name} ({int(done) + 1}/{total}){part}{left}"
+            f"  searching {name} ({int(done) + 1}/{total}){part}{tail}"
             if done < total
             else f"  searched {total} in {spent:.0f} s"
         )

@@ -192,54 +192,59 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
 
 
 class Pace:
-    """How much of the time that searches take side by side is over. count: of them; lanes: that run at a time."""
+    """How long searches of `count` joints will take, `lanes` at a time. How much is hidden in a joint is known when it
+    is searched: the time is told from those that have ended, once they say it within `KNOWN`."""
 
-    TELLS = 0.05  # share of its own time from which on a search tells how long it takes
+    KNOWN = 0.3  # of the time left: a standard deviation by which it may be off
+    SPREAD, PRIOR = 0.7, 3  # of their mean, by which searches differ as a rule, and how many it counts for
 
     def __init__(self, count: int, lanes: int):
-        self._count, self._lanes, self._first = count, lanes, time.monotonic()
-        self._parts, self._begun, self._took = [0.0] * count, dict[int, float](), dict[int, float]()
+        self._count, self._lanes = count, lanes
+        self._begun, self._took = dict[int, float](), dict[int, float]()
 
     def tell(self, k: int, part: float) -> None:
-        """Search k has this share (0..1) of its time behind it."""
-        now, self._parts[k] = time.monotonic(), part
+        """Search k has begun, is under way, or has ended (part 1)."""
+        now = time.monotonic()
         begun = self._begun.setdefault(k, now)
         if part >= 1.0:
             self._took[k] = now - begun
 
-    def share(self) -> float:
-        """Share (0..1) of the whole time that is over: each search takes as long as its own share says, one that tells
-        nothing yet as long as the others in the mean."""
-        now = time.monotonic()
-        running = [k for k in self._begun if k not in self._took]
-        whole = self._took | {
-            k: (now - self._begun[k]) / self._parts[k] for k in running if self._parts[k] >= self.TELLS
-        }
-        if not whole:
-            return sum(self._parts) / self._count
-        mean = sum(whole.values()) / len(whole)
-        lanes = [max(whole.get(k, mean) - (now - self._begun[k]), 0.0) for k in running]
+    def left(self) -> float | None:
+        """s that are left; None where they are not known."""
+        took, rest, now = np.array([*self._took.values()]), self._count - len(self._took), time.monotonic()
+        if len(took) < 3 or rest < 2 * self._lanes or took.mean() <= 0:
+            return None  # when the last of those side by side ends nobody knows
+        under_way = [now - t for k, t in self._begun.items() if k not in self._took]
+        late = [1.5 * t for t in under_way if t > took.mean()]  # those that ended first are not like the others
+        known = np.array([*took, *late])
+        mean, n = float(known.mean()), len(known)
+        spread = ((self.PRIOR * self.SPREAD**2 + n * float(known.var()) / mean**2) / (self.PRIOR + n)) ** 0.5
+        if spread * (1 / rest + 1 / len(took)) ** 0.5 > self.KNOWN:
+            return None
+        # of one that takes longer than others half of that is to come
+        lanes = [max(mean - t, 0.5 * mean) for t in under_way]
         lanes += [0.0] * (self._lanes - len(lanes))
         heapq.heapify(lanes)
         for _ in range(self._count - len(self._begun)):  # each goes where a lane is free first
             heapq.heapreplace(lanes, lanes[0] + mean)
-        return (now - self._first) / max(now - self._first + max(lanes), 1e-9)
+        return max(lanes)
 
 
 def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
-             progress: Callable[[float, int, str], None] | None = None, left: Sequence[float] = ()) -> list[T]:
-    """work(k, tell) for each name, in their order; tell(part) says how much of its time is over; progress(done, of,
-    which is worked on): `done` of them by the time that is over. left: what is to be explained of each, where that is
-    known: the more, the sooner it has its turns."""
-    lock, at_once = threading.Lock(), workers(device, len(names))
+             progress: Callable[..., None] | None = None, left: Sequence[float] = ()) -> list[T]:
+    """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is
+    worked on, s that are left or None). left: what is to be explained of each, where that is known: the more, the
+    sooner it has its turns."""
+    parts, lock, at_once = [0.0] * len(names), threading.Lock(), workers(device, len(names))
     pace = Pace(len(names), at_once)
 
     def one(k: int) -> T:
         def tell(part: float) -> None:
             with lock:
+                parts[k] = part
                 pace.tell(k, part)
                 if progress and part < 1.0:
-                    progress(len(names) * pace.share(), len(names), names[k])
+                    progress(sum(parts), len(names), names[k], pace.left())
 
         with turn(-left[k] if len(left) else 0.0):
             tell(0.0)

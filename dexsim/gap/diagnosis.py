@@ -47,7 +47,7 @@ from dexsim.gap.touch.diagnosis import Touch
 def diagnose(
     s: Settings,
     say: Callable[[str], None] = print,
-    progress: Callable[[float, int, str], None] | None = None,
+    progress: Callable[..., None] | None = None,
 ) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
     w = Inquiry(s, say, progress, s.time_limit or TimeLimit(s.limit))

@@ -199,7 +199,7 @@ class Inquiry:
 
     settings: Settings
     say: Callable[[str], None]
-    progress: Callable[[float, int, str], None] | None
+    progress: Callable[..., None] | None
     limit: TimeLimit
     clock: Clock = field(default_factory=Clock)
     notes: list[str] = field(default_factory=list)
