@@ -83,11 +83,14 @@ def moves(hand: Hand) -> list[Move]:
             sign = hand.fingers[finger].closes[hand.fingers[finger].flexion.index(j)]
             role = f"bends, closes to {'+' if sign > 0 else '-'}"
             goal = hand.others if finger in hand.opposing else hand.opposing
-            middle = tips(start)[list(goal)].mean(0)
             q = start.copy()
             step = 0.25 * (hand.limits[j, 1] - hand.limits[j, 0])
             q[j] = np.clip(start[j] + sign * step, *hand.limits[j])
-            closer = float(np.linalg.norm(tips(start)[finger] - middle) - np.linalg.norm(tips(q)[finger] - middle))
+            before, after = tips(start), tips(q)[finger]
+            # a claw's finger closes on the middle of the others, which may lead off the one that opposes it
+            others = [list(goal), [k for k in range(len(hand.fingers)) if k != finger]]
+            middles = [before[group].mean(0) for group in others]
+            closer = max(float(np.linalg.norm(before[finger] - x) - np.linalg.norm(after - x)) for x in middles)
         out.append(Move(name, finger, role, travel, closer, first))
     return out
 
