@@ -609,10 +609,13 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"steps={unknown[0]}: must be of {', '.join(STEPS)}")
     from dexsim import files, outputs
     from dexsim.hand import load_hand
+    from dexsim.sim.quiet import quiet_warp
 
     hand = load_hand("xhand", given["hand_mirror"] == "true")
     # nobody to wait for, and no hand: its time passes as fast as this machine simulates it, however loaded that is
     clock = VirtualClock() if given["yes"] == "true" and not _real(given) else Clock()
+    if not _real(given):
+        quiet_warp("cpu")
     driver = make_driver(given, hand, clock)
     out = files.place(given["out"])
     if (out / "check.json").exists():
@@ -637,6 +640,7 @@ def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) ->
         return VendorXHand(given["port"], clock, serial=given["serial"] or None, side=hand.handedness)
     Faults.parse(faults)
     config = settings.resolve(settings.from_files(CONFIGS, {})) | hand.identity
+    config["task"]["initial"]["object_xy"] = [0.5, 0.5]  # m: nothing is in the fingers' way
     calibration = Calibration.default(hand=hand)
     if given["driver"] == "xhand":
         return faked(config, calibration, faults, int(given["seed"]), hang=1.0, clock=clock)
