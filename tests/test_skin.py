@@ -266,7 +266,7 @@ def test_an_import_lays_skin_and_a_later_one_keeps_it(tmp_path):
     settings = Settings(pads=(4, 3), drops=0, skin="palm:30/2,links:8")
     import_hand(robot, out, settings, picture=False)
     first = load_hand(out)
-    assert first.file.source["skin"] == settings.skin and len(first.pads) == 4 + 2 + 4
+    assert first.file.source["skin"] == settings.skin and len(first.pads) == 4 + 2 + 5
     skin.add(out, "palm:12")
     assert "# guess" in (out / "hand.yaml").read_text() and [p.name for p in load_hand(out).pads[4:]] == ["palm"]
     again = import_hand(robot, out, Settings(pads=(4, 3), drops=0), picture=False)
@@ -280,13 +280,16 @@ def test_a_grasp_is_felt_whole(hand):
     """In simulation: what palm and links carry is felt with what fingertips do, and the hand itself where it meets
     itself; each link's pads add up to the solver's force."""
     torch.set_num_threads(1)
-    given = ["task=grasp", "hand=xhand_skin", "worlds=8", "device=cpu", "task.objects.train=[box,sphere]"]
-    env = make_env(start.for_train(given, CONFIGS).cfg, 8, "cpu", 0, "mujoco")
-    assert env.pads == 15 and env.obs["actor"].shape[1] == sum(row[1] for row in env.rows())
+    given = ["task=grasp", "hand=xhand_skin", "worlds=16", "device=cpu", "task.objects.train=[box,sphere]"]
+    env = make_env(start.for_train(given, CONFIGS).cfg, 16, "cpu", 0, "mujoco")
+    rows = {name: width for name, width, _ in env.describe()["observations"]["actor"]}
+    assert env.pads == 15 and rows["contact_force"] == 15 and rows["contact_centre"] == 45
     cupped = torch.tensor(hand.pose("cupped"), dtype=torch.float32)
-    most = torch.zeros(8), torch.zeros(8)
-    for _ in range(40):
-        env.step((3 * (cupped - env.q)).clamp(-1, 1))
+    across = cupped.clone()
+    across[:3] = torch.tensor(hand.limits[:3, 1])  # the thumb, into the fingers
+    most = torch.zeros(16), torch.zeros(16)
+    for k in range(80):
+        env.step((3 * ((across if k < 40 else cupped) - env.q)).clamp(-1, 1))
         env.feel()
         touch, pair = env.touch, env.engine.t.pair_normal
         felt = touch.force_clean.sum(1)
@@ -299,4 +302,4 @@ def test_a_grasp_is_felt_whole(hand):
                 torch.testing.assert_close(force[:, mine].sum(1), pair[:, env.engine.pair(name)], rtol=1e-4, atol=1e-4)
         most = torch.maximum(most[0], felt - touch.force_clean[:, :5].sum(1)), torch.maximum(
             most[1], touch.force_other.sum(1))  # fmt: skip
-    assert (most[0] > 1.0).any() and (most[1] > 0.5).any()
+    assert (most[0] > 1.0).any() and (most[1] > 0.1).any()
