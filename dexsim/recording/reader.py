@@ -72,6 +72,7 @@ def read(
         size = readers.ready(dataset, base)
     else:
         size = sum(files.check(p, "recording", 64 << 30) for p in _files(path))
+    _ = hand or load_hand()  # here, so that not every reader's process does it again
     given = path, dict(remap or {}), dict(meta or {}), joints, audit, hand, limits
     return guard.call(_read, *given, what=f"recording {path}", size=size)
 
