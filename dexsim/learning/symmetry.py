@@ -26,8 +26,8 @@ def augmented(
             f"agent=ppo_symmetric: task {env.task['name']} declares no symmetry, as it is set here; use agent=ppo"
         )
     if obs is not None:
-        groups = {name: torch.cat([value, *(_turned(env, name, value, by) for by in every)])
-                  for name, value in obs.items()}  # fmt: skip
+        rows: Any = obs.items()
+        groups = {name: torch.cat([x, *(_turned(env, name, x, by) for by in every)]) for name, x in rows}
         obs = TensorDict(groups, batch_size=[len(next(iter(groups.values())))], device=obs.device)
     if actions is not None:
         actions = torch.cat([actions, *(by["action"](actions) if "action" in by else actions for by in every)])
