@@ -197,7 +197,8 @@ def import_hand(
             _drop_region(stage, hand, settings.drops, tell)
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         loaded = _loads(stage)
-        asked = settings.skin or (((note or {}).get("hand") or {}).get("source") or {}).get("skin")
+        before = yaml_text.load(out / folder.HAND, "hand") if note and (out / folder.HAND).is_file() else {}
+        asked = settings.skin or (before.get("source") or {}).get("skin")
         if asked:
             hand["skin"], hand["source"]["skin"] = links.write_pads(loaded, stage, asked, tell), asked
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
