@@ -50,6 +50,8 @@ def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
         read = store.get_msgdef(root)
     except BadDefinition:
         raise
+    except KeyError as error:  # rosbags looks it up when it registers
+        raise BadDefinition(f"{str(error.args[0])[:80]} is used and not defined") from None
     except Exception as error:  # rosbags' parsers, and Python's of the code that it writes
         raise BadDefinition(" ".join(str(error).split())[:200] or type(error).__name__) from None
 
