@@ -20,7 +20,7 @@ from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import PadFacts
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.judge import confidence, full_model, handed_on
-from dexsim.gap.read import Run, channels, inputs
+from dexsim.gap.read import Run, agreement, channels, inputs
 from dexsim.gap.search.search import Outcome
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
@@ -348,6 +348,8 @@ def to_runs(w: Inquiry) -> None:
             f"{'it' if len(absent) == 1 else 'them'}, taken to stand at rest"
         )
     model = w.m.spec.compile()
+    for joint in w.m.joints if len(w.runs) > 1 else ():
+        w.notes += [f"{name}: {text}" for name, _, text in agreement.contradictions(w.runs, joint)]
     wrong, out, blind = channels.inspect(w.runs, model, channels.spoiled(readable, openly))
     w.channel = channels.secondary(w.channel + wrong)
     before = {id(r): k for k, r in enumerate(w.runs)}

@@ -67,9 +67,9 @@ def _lag(run: Run, j: int, grid: np.ndarray, t: np.ndarray, q: np.ndarray) -> fl
     dq, dc = rate(np.interp(grid, t, q)), rate(run.command_at(wide)[:, j])
     if len(wide) < len(grid) + 2 * reach or np.ptp(run.cmd[:, j]) < 0.02 or dq.std() == 0 or dc.std() == 0:
         return None
-    windows = np.lib.stride_tricks.sliding_window_view(dc, len(dq))
-    size = np.sqrt(np.maximum((windows**2).sum(1), 1e-30)) * np.linalg.norm(dq)
-    found = (windows @ dq) / size  # by the sample at which the target's stretch begins: lag = reach - sample
+    power = np.r_[0.0, np.cumsum(dc**2)]
+    size = np.sqrt(np.maximum(power[len(dq) :] - power[: -len(dq)], 1e-30)) * np.linalg.norm(dq)
+    found = np.correlate(dc, dq, "valid") / size  # by where the target's stretch begins: lag = reach - place
     best = int(np.argmax(found))
     away = np.abs(np.arange(len(found)) - best) > 0.15 / STEP
     if found[best] < CLEAR or best in (0, len(found) - 1) or found[best] - found[away].max(initial=-1.0) < ALONE:
@@ -82,7 +82,8 @@ def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]
     contradict each other are both named."""
     each = [(r, seen(r, r.joints.index(joint))) for r in runs if joint in r.joints]
     out = []
-    for what in ("lag", "scale", "effort sign", "effort scale"):
+    alike = all(r.servo.to_dict() == runs[0].servo.to_dict() for r in runs)  # another gain has another lag
+    for what in ("lag", "scale", "effort sign", "effort scale") if alike else ("scale", "effort sign"):
         field = what.split(" ")[0]
         told = [(r.name, x) for r, s in each if (x := getattr(s, field)) is not None]
         if what == "effort sign":
