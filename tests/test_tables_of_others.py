@@ -129,3 +129,18 @@ def test_names_that_are_objects_say_how_to_save_them(tmp_path):
     np.savez(tmp_path / "a.npz", time=T, cmd=GOAL, pos=SHOWN, joint_names=np.array(["elbow"], object))
     with pytest.raises(UserError, match=r"names as text: np.array\(names, dtype=str\)"):
         read(tmp_path / "a.npz")
+
+
+def test_an_encoder_that_passes_its_end_is_read_round_its_zero(tmp_path):
+    """A servo of one turn that goes from 4095 to 0 within its motion: the audit says how to read it."""
+    ticks = [np.round(100 + x * 4096 / (2 * np.pi)) % 4096 for x in (GOAL - 0.5, SHOWN - 0.5)]
+    (tmp_path / "a.csv").write_bytes(text(table(columns=(T, *ticks))))
+    r = read(tmp_path / "a.csv")
+    assert any(f.kind == "wrap" and "units.position=ticks:4096@TICK" in f.text for f in r.findings)
+    r = read(tmp_path / "a.csv", meta={"units.position": "ticks:4096@100"})
+    assert not any(f.kind == "wrap" for f in r.findings)
+    assert np.allclose(r.states.position.value[:, 0], SHOWN - 0.5, atol=2e-3)
+    # of several turns, as a drive in extended mode counts them, nothing is folded
+    (tmp_path / "b.csv").write_bytes(text(table(columns=(T, *(np.round(9000 * x) for x in (GOAL, SHOWN))))))
+    r = read(tmp_path / "b.csv", meta={"units.position": "ticks:4096@100"})
+    assert np.ptp(r.states.position.value) == pytest.approx(np.ptp(np.round(9000 * SHOWN)) * 2 * np.pi / 4096)

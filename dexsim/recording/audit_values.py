@@ -170,7 +170,7 @@ def wraps(r: Recording) -> Iterator[Finding]:
             if found is not None:
                 m, at = found
                 what = (
-                    "the angle starts again after a turn"
+                    "the angle starts again after a turn (of ticks: units.position=ticks:4096@TICK, TICK the middle)"
                     if m in (2 * np.pi, 360.0)
                     else f"a signed number was read as unsigned (modulus {m:g})"
                 )

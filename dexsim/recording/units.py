@@ -2,9 +2,10 @@
 
 `position` also holds for commands and, by its scale, for velocities, where those have no unit of their own. Beside
 plain units there are two that a drive's own numbers need: `ticks:4096` (of an encoder, so many a turn;
-`ticks:4096@2048` where 2048 is zero) and positions along a range, of which both ends are known: `percent` (0 to 100),
-`signed_percent` (-100 to 100), `normalized` (-1 to 1), `registers` (0 to 1000) or `range:A..B`. Such a range is the
-joint's in the model, or follows: `registers=1.47..0` says that 0 is 1.47 rad and 1000 is 0 rad.
+`ticks:4096@2048` where 2048 is zero, and the encoder's turn half on either side of it) and positions along a range, of
+which both ends are known: `percent` (0 to 100), `signed_percent` (-100 to 100), `normalized` (-1 to 1), `registers` (0
+to 1000) or `range:A..B`. Such a range is the joint's in the model, or follows: `registers=1.47..0` says that 0 is 1.47
+rad and 1000 is 0 rad.
 """
 
 from __future__ import annotations
@@ -48,16 +49,24 @@ _NUMBER = r"[-+]?[0-9.]+(?:e[-+]?[0-9]+)?"
 
 @dataclass(frozen=True)
 class Unit:
-    """A straight line to SI: `scale` x value + `offset`. text: as it was stated; sure: not a guess."""
+    """A straight line to SI: `scale` x value + `offset`. text: as it was stated; sure: not a guess; turn: values of a
+    turn, for an encoder of one turn, which goes from the largest to 0 within a motion: it is taken half a turn to both
+    sides of its zero."""
 
     scale: float
     offset: float = 0.0
     text: str = ""
     sure: bool = True
+    turn: float = 0.0
 
     def __call__(self, x: np.ndarray, rate: bool = False) -> np.ndarray:
         """Values x in SI; rate: by second, where an offset is none."""
-        return np.asarray(self.scale * x + (0.0 if rate else self.offset))
+        out = np.asarray(self.scale * x + (0.0 if rate else self.offset))
+        known = x[np.isfinite(x)]
+        if not rate and self.turn and len(known) and 0 <= known.min() and known.max() <= self.turn:
+            whole = self.turn * self.scale
+            out = np.asarray((out + whole / 2) % whole - whole / 2)
+        return out
 
 
 def parse(text: str, quantity: str, where: str, limits: tuple[float, float] | None = None) -> Unit:
@@ -72,7 +81,7 @@ def parse(text: str, quantity: str, where: str, limits: tuple[float, float] | No
         if word == "ticks" and (found := re.fullmatch(rf"({_NUMBER})(?:@({_NUMBER}))?", argument)):
             count, zero = float(found[1]), float(found[2] or 0.0)
             if count > 0:
-                return Unit(TURN / count, -zero * TURN / count, text)
+                return Unit(TURN / count, -zero * TURN / count, text, turn=count if found[2] else 0.0)
         low_high = RANGES.get(word) if not argument else _pair(argument) if word == "range" else None
         if low_high is not None and low_high[0] != low_high[1]:
             to = _pair(ends) if ends else limits
