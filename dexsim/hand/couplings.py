@@ -7,13 +7,15 @@ asked for, so that no step begins with a constraint violated.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-import torch
 
 from dexsim.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
 
 STEP = 1e-5  # rad or m, of differences
 CLOSE = 1e-9  # of a length: met
@@ -82,8 +84,16 @@ class Couplings:
         """Return whether some joint follows others."""
         return bool(self._laws) or bool(self._free and self._rows)
 
+    def placed(self, qpos: np.ndarray) -> np.ndarray:
+        """Return `complete` of an array [..., nq]."""
+        import torch  # here, for it takes a second to import, and most hands have nothing that follows
+
+        return self.complete(torch.as_tensor(qpos.copy())).numpy()
+
     def complete(self, qpos: torch.Tensor) -> torch.Tensor:
         """Return qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
+        import torch
+
         m, q = self.model, qpos.clone()
         for at, other, law in self._laws:
             x = q[..., other] - m.qpos0[other] if other >= 0 else torch.zeros_like(q[..., at])
@@ -109,6 +119,8 @@ class Couplings:
         """Return addresses, rest and limits [F] of the joints that tendons hold, and groups of rows, one a tendon, that
         share none of these: coefficients [nq, R], how the joints [R, F] share what the lengths miss, and least and
         largest lengths [R]. Made once: a recorded step must find them on its device."""
+        import torch
+
         key = (q.device, q.dtype)
         if key not in self._on:
             m, at = self.model, self._free
@@ -133,7 +145,7 @@ class Couplings:
         """Set the driven joints' positions [J] in qpos, and those of what follows them."""
         data.qpos[self.address] = values
         if self.passive:
-            data.qpos[:] = self.complete(torch.as_tensor(data.qpos.copy())).numpy()
+            data.qpos[:] = self.placed(data.qpos)
 
     def along(self, columns: np.ndarray, qpos: np.ndarray) -> np.ndarray:
         """Return columns [..., nv] of a Jacobian by dof as those [..., J] of the driven joints, at a state [nq]: what
@@ -150,7 +162,7 @@ class Couplings:
         for k, a in enumerate(self.address):
             ends[2 * k, a] -= STEP
             ends[2 * k + 1, a] += STEP
-        both = self.complete(torch.as_tensor(ends)).numpy()
+        both = self.placed(ends)
         slope = (both[1::2] - both[::2]).T / (2 * STEP)
         for j in range(m.njnt):
             if _one_dof(m, j):

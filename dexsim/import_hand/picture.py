@@ -12,7 +12,6 @@ import numpy as np
 from dexsim import files
 from dexsim.hand import Hand
 from dexsim.hand.places import places
-from dexsim.tactile.layout import hand_layout, load_layout
 from dexsim.view.stills import Shot, render
 
 AXES = (("x forward", "#d62728"), ("y", "#2ca02c"), ("z normal", "#1f77b4"))
@@ -107,6 +106,8 @@ def draw_skin(hand: Hand, path: Path) -> None:
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
+    from dexsim.tactile.layout import hand_layout  # which brings torch and warp, seconds that a plain import is without
+
     model, layout = hand.spec().compile(), hand_layout(hand)
     assert layout is not None  # asked for only with touch
     q = qpos(hand, model, hand.pose("open"))
@@ -177,6 +178,8 @@ def _joints(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.
 def _taxels(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData, k: int) -> None:
     finger = hand.fingers[k]
     assert finger.pad is not None
+    from dexsim.tactile.layout import load_layout
+
     pad = load_layout(hand.folder / finger.pad.taxels, finger.body)
     body = model.body(finger.body).id
     turn = d.xmat[body].reshape(3, 3)

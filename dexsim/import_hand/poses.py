@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-import torch
 from scipy.optimize import least_squares
 
 from dexsim.hand.couplings import Couplings
@@ -49,7 +48,7 @@ class Search:
 
     def complete(self, q: np.ndarray) -> np.ndarray:
         """Return angles [nq] with those that follow where the others hold them."""
-        return self.couplings.complete(torch.as_tensor(q)).numpy() if self.passive else q
+        return self.couplings.placed(q) if self.passive else q
 
     def tips(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tips' positions and normals [F, 3] in the palm frame."""
