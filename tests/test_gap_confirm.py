@@ -102,6 +102,8 @@ def test_the_files_are_replayed_and_that_is_the_number_of_the_report(answer):
     assert d.written.chosen["joint"] in (*full_model.ORDER[:2], "plain")
     assert h["after"] < 1.3 * d.data["noise_floor"]["position_rad"]
     assert d.written.errors["joint"]["believed"] > 10 * r["error"]  # it tells right from wrong
+    # what the choice went by is that number
+    assert r["error"] == pytest.approx(d.written.errors["joint"][d.written.chosen["joint"]], rel=1e-6)
     assert r["error"] == pytest.approx(h["after"], rel=0.5)
     assert f"leave {1e3 * r['error']:.3g} mrad" in d.sentence
     page = (folder / "out" / "report.html").read_text()

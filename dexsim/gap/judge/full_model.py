@@ -555,10 +555,11 @@ def write_best(
     if engine == "none" or not cases or not len(windows[0].window):
         return Written(candidates, errors, {j: choose(x, noise[j]) for j, x in errors.items()})
     by = {j: {c.name: c for c in given} for j, given in candidates.items()}
-    first = windows[0]
-    starts = [
-        _start(recordings[runs[int(r)].name], float(t)) for r, t in zip(first.run, first.window_t, strict=True)
-    ]
+    first, within = windows[0], cases[0].plant.t
+    of = [recordings[runs[int(r)].name] for r in first.run]
+    starts = [_start(r, float(t)) for r, t in zip(of, first.window_t, strict=True)]
+    ends = [float(within[first.sample_row[first.sample_window == k][-1]]) for k in range(len(starts))]
+    times = [a + STEP * np.arange(round((b - a) / STEP) + 1) for a, b in zip(starts, ends, strict=True)]
 
     def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
         """rms by joint of each choice."""
@@ -570,13 +571,22 @@ def write_best(
         count = len(windows[0].window)
         for group in groups.values():
             worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0])]
-            spec = given[group[0]][1].copy()
-            spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # held out is what touches nothing
+            spec = given[group[0]][1]
             q = free_runs(spec, m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
             for k, i in enumerate(group):
                 found[i] = q[k * count : (k + 1) * count]
-        pairs = [(c, ws, m.joints.index(c.joint)) for c, ws in zip(cases, windows, strict=True)]
-        return [{c.joint: _rms(c, ws, starts, found[i], j) for c, ws, j in pairs} for i in range(len(choices))]
+        return [{c.joint: rms(c, found[i]) for c in cases} for i in range(len(choices))]
+
+    def rms(case: Case, q: Sequence[np.ndarray]) -> float:
+        """Over all readings of a joint in recordings that tell of it."""
+        j = m.joints.index(case.joint)
+        parts = [
+            _missed(r, case.joint, t, x[: len(t), j])
+            for r, t, x, run in zip(of, times, q, first.run, strict=True)
+            if int(run) not in case.plant.left_out and case.joint in r.joints
+        ]
+        square, count = np.sum(parts, 0) if parts else (0.0, 1.0)
+        return math.sqrt(square / max(count, 1.0))
 
     # every joint as its own kind first, then the best of each together; where joints pull at one another that may be
     # none of them: then each is asked once more with what the others now are
@@ -619,17 +629,11 @@ def _start(r: Recording, start: float) -> float:
     return 0.0 if start - first < STEP and first <= SOON else start
 
 
-def _rms(case: Case, ws: Windows, starts: Sequence[float], q: Sequence[np.ndarray], j: int) -> float:
-    """What free runs q, [T, J] a window from `starts` [s] on, leave of a joint at its samples in recordings that tell
-    of it."""
-    plant, left = case.plant, []
-    for w, x in enumerate(q):
-        if int(ws.run[w]) in plant.left_out:
-            continue
-        rows = ws.sample_row[ws.sample_window == w]
-        left.append(plant.q[rows] - np.interp(plant.t[rows] - starts[w], STEP * np.arange(len(x)), x[:, j]))
-    square = float(np.mean(np.concatenate(left) ** 2)) if left else 0.0
-    return math.sqrt(square) if np.isfinite(square) else math.inf
+def _missed(r: Recording, joint: str, t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[2] sum of squares and number of what a free run q [T] at t [T] s misses of a joint's readings."""
+    state = r.states.position.between(t[0] - 1e-9, t[-1] + 1e-9)
+    d = state.value[:, r.joints.index(joint)] - np.interp(state.t, t, q)
+    return np.array([np.nansum(d**2), np.isfinite(d).sum()]) if np.isfinite(q).all() else np.array([np.inf, 1.0])
 
 
 def replay_files(
@@ -663,13 +667,10 @@ def replay_files(
         end = max(r.duration, end) if whole else end
         done = replay(r, of_recording(written, r), start=start, end=None if whole else end)
         parts.append((r.path.name, start, end))
-        state = r.states.position.between(done.t[0] - 1e-9, done.t[-1] + 1e-9)
         for case in cases:
             if run in case.plant.left_out or case.joint not in r.joints:
                 continue
-            q = np.interp(state.t, done.t, done.position[:, m.joints.index(case.joint)])
-            d = state.value[:, r.joints.index(case.joint)] - q
-            mine = np.array([np.nansum(d**2), np.isfinite(d).sum()])
+            mine = _missed(r, case.joint, done.t, done.position[:, m.joints.index(case.joint)])
             total[case.joint] += mine
             here = each.setdefault(r.path.name, {})
             here[case.joint] = here.get(case.joint, np.zeros(2)) + mine
