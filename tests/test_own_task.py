@@ -348,6 +348,19 @@ def test_what_provides_a_row_on_a_hand_stands_in_the_manifest():
     assert [row[:4] for row in rows] == [("joint_position", 12, "rad", "encoders of the drives")]
 
 
+def test_another_world_takes_a_task_of_ones_own():
+    """Its drives, physics and touch are the world's, its ranges its own."""
+    from dexsim import yaml_text
+    from dexsim.paths import CONFIGS
+    from dexsim.tasks import reality
+
+    cfg = dexsim.settings(Flat, ["preset=none", "device=cpu"])
+    world = yaml_text.load(CONFIGS / "reality" / "bench.yaml", "settings")
+    there = reality.overlay(cfg | {"reality": world})
+    assert there["servo"] == world["servo"] and there["sim"]["timestep"] == world["sim"]["timestep"]
+    assert there["randomize"]["object"] == cfg["randomize"]["object"]
+
+
 def test_ranges_widen_as_a_task_is_learned():
     env = made(Flat, "task.curriculum.steps=4", "task.curriculum.start=0.2", worlds=2)
     widths = [float((stepped(env, 1), env.sampler.width)[1]) for _ in range(5)]

@@ -41,27 +41,21 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     """The config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task draws.
 
     The world's servo replaces the policy's belief; its ranges replace those of training, name by name; drives are not
-    randomized (it is one hand). What was believed before is kept under "belief". Raises UserError for a file with other
-    keys, or without the task that is played.
+    randomized (it is one hand). Of a task that the world's file does not list, the ranges of training stay. What was
+    believed before is kept under "belief". Raises UserError for a file with other keys.
     """
     world, cfg = cfg["reality"], copy.deepcopy(cfg)
     for key in world:
         if key not in KEYS:
             raise UserError(f"reality.{key}: unknown; a file of dexsim/configs/reality has {', '.join(sorted(KEYS))}")
-    task = cfg["task"]["name"]
-    if task not in world["tasks"]:
-        raise UserError(
-            f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])};"
-            f" write its settings under tasks: {task}: in that world's file (dexsim/configs/reality/)"
-        )
     cfg["sim"].update(world["sim"], engine="mujoco")
     cfg["belief"] = {"servo": cfg["servo"], "drive": math.prod(_middle(cfg, c) for c in ("efficiency", "torque_limit"))}
     cfg["servo"] = world["servo"]
     cfg["tactile"].pop("pads", None)  # what training believes of its own hand's fingertips
     cfg["tactile"].update(world["tactile"])
     cfg["randomize"]["servo"] = {name: 1.0 if name in RELATIVE else 0.0 for name in cfg["randomize"]["servo"]}
-    own = world["tasks"][task]
-    for part, over in (("randomize", cfg["randomize"]), ("sensors", cfg["task"]["sensors"])):
+    own = world["tasks"].get(cfg["task"]["name"], {})
+    for part, over in (("randomize", cfg["randomize"]), ("sensors", cfg["task"].get("sensors", {}))):
         for name, value in own.get(part, {}).items():
             node, *rest = name.split(".") if part == "randomize" else (name,)
             if rest:
