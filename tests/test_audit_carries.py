@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
+from dexsim.cli import main as cli
 from dexsim.errors import UserError
 from dexsim.gap import command
 from dexsim.gap.audit import main, renewed
@@ -236,3 +237,14 @@ def test_the_true_rate_of_each_signal_is_said(tmp_path, capsys):
     assert found["position"] == pytest.approx(20, abs=2) and found["effort"] == pytest.approx(20, abs=2)
     assert found["command"] == pytest.approx(50, abs=3)
     assert renewed(t, np.round(0.02 * t / 1.5e-3) * 1.5e-3) == 0.0 and renewed(t, motion_(t)) == 0.0
+
+
+@pytest.mark.slow
+def test_the_diagnosis_that_the_audit_ends_with_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "bare.csv", motion(0), 0)
+    main(["bare.csv", "out=mine"])
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("next: ")]
+    words = shlex.split(line.removeprefix("next: dexsim "))
+    assert cli.main([*words, "limit=5", "replay=none"]) == 0
+    assert (tmp_path / "out" / "diagnosis" / "diagnosis.json").exists()
