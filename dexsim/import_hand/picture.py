@@ -113,7 +113,7 @@ def draw_skin(hand: Hand, path: Path) -> None:
     q = qpos(hand, model, hand.pose("open"))
     data = posed(model, q)
     middle, radius = bounds(model, data)
-    shots = [Shot(0, q, middle, 2.3 * radius, azimuth, elevation, (720, 640)) for _, azimuth, elevation in VIEWS]
+    shots = [Shot(0, q, middle, 2.8 * radius, azimuth, elevation, (720, 640)) for _, azimuth, elevation in VIEWS]
     figure = Figure(figsize=(19.5, 6.6), dpi=100, layout="constrained")
     colours = colormaps["tab20"].colors  # type: ignore[attr-defined]
     for k, (shot, image) in enumerate(zip(shots, render([model], shots), strict=True)):

@@ -340,7 +340,8 @@ def main(argv: list[str]) -> int:
         raise
     if given.get("picture", "true") == "true":
         show(done, out, print)
-    print(f"{out}/{FILE}: {len(done.pads)} pads; look at {out}/hand_skin.png. dexsim train task=grasp hand={out}")
+    at = out.relative_to(Path.cwd()) if out.is_relative_to(Path.cwd()) else out
+    print(f"{at}/{FILE}: {len(done.pads)} pads; look at {at}/hand_skin.png. dexsim train task=grasp hand={at}")
     return 0
 
 
