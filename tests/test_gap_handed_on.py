@@ -151,7 +151,7 @@ PLAY = {
 }
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+@pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
 def test_training_has_the_play_and_the_rest_of_it(engine, tmp_path):
     """A servo.yaml with all of it trains: drawn inside the intervals at each episode, on that joint alone; the joint
     hangs in its play; the policy sees what the eccentric encoder reports; no host synchronisation."""

@@ -84,7 +84,7 @@ def twin():
     return grasp_env(worlds=N)
 
 
-@pytest.mark.parametrize("kind", ["mujoco", "warp"])
+@pytest.mark.parametrize("kind", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_stiffness_holds_over_mass_load_and_posture(kind, seed, twin):
     env = twin if kind == "mujoco" else _warp()

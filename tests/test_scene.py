@@ -212,7 +212,7 @@ def _lowest(variant, size: np.ndarray, rot: np.ndarray) -> float:
     return float(np.abs(down) @ size) if variant.shape.kind == "box" else float(size[0] + abs(down[2]) * size[1])
 
 
-@pytest.mark.parametrize("kind", ["mujoco", "warp"])
+@pytest.mark.parametrize("kind", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
 def test_every_shape_comes_to_lie_on_its_surface(kind):
     """In the engine itself, dropped on a slab: the lowest point of the shape's own geometry touches it, less the
     depth of MuJoCo's soft default contact (deep for a moment at 0.3 m/s)."""
