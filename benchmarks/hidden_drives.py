@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from benchmarks.foreign import seed_of_sources
@@ -44,7 +45,9 @@ RECORDINGS = {"a": ("triangles", "steps"), "b": ("chirp", "ladder"), "c": ("rand
 
 def drives(hand: Any) -> list[str]:
     """Return names of a hand's drives that other joints follow; all of them where none does."""
-    moves = hand.couplings.motion(hand.compiled.qpos0)
+    data = mujoco.MjData(hand.compiled)
+    hand.couplings.put(data, hand.pose("cupped"))  # bent: a tendon may be slack at rest
+    moves = hand.couplings.motion(data.qpos)
     others = np.ones(hand.compiled.nv, bool)
     others[hand.couplings.dof] = False
     led = [j for k, j in enumerate(hand.joints) if np.abs(moves[others, k]).max(initial=0.0) > 1e-3]
