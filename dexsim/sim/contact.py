@@ -30,7 +30,7 @@ def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair]) -> np.ndarra
                     if abs(s) in np.abs(table[i, j]):
                         continue
                     if len(free) == 0:
-                        free, table = [table.shape[2]], np.pad(table, ((0, 0), (0, 0), (0, 1)))
+                        free, table = np.array([table.shape[2]]), np.pad(table, ((0, 0), (0, 0), (0, 1)))
                     table[i, j, free[0]] = s
     return table
 
