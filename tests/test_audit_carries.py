@@ -22,8 +22,8 @@ T = np.arange(0, 6, 0.001)
 
 
 def written(path, commands, seed, off=0.0, renewed=0):
-    """Two joints that follow with a lag of 40 ms; `off` rad that joint b is elsewhere from 3 s on; renewed: samples for
-    which joint a's position stays."""
+    """Write a CSV file of two joints that follow with a lag of 40 ms; `off` rad that joint b is elsewhere from 3 s on;
+    renewed: samples for which joint a's position stays."""
     rng = np.random.default_rng(seed)
     q = {j: np.interp(T - 0.04, T, c) + 2e-4 * rng.standard_normal(len(T)) for j, c in commands.items()}
     q["b"] += off * (T > 3)
@@ -86,7 +86,7 @@ BELIEF = {"kp": 2.0, "kd": 0.05, "torque_limit": 1.0, "no_load_speed": 8.0, "cou
 
 
 def made_run(name="run", sent=None, lag=0.04, scale=1.0, seed=0, effort=0.0):
-    """A run of joint a that follows with a lag and a scale; effort: N.m for each rad of target minus position."""
+    """Return a run of joint a that follows with a lag and a scale; effort: N.m a rad of target minus position."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, 6, 0.01)
     c = 0.4 * np.sin(2 * t) + 0.2 * np.sin(5.3 * t + seed) if sent is None else sent
@@ -149,7 +149,7 @@ def late_target(c, t, k, delay):
     return c[max(k - round(delay / (t[1] - t[0])), 0)]
 
 
-def told(sent, seed=0):
+def precisions(sent, seed=0):
     model = mujoco.MjModel.from_xml_string(RIG)
     return {x.figure.words: x for x in information.informed(build(model, [made_run(sent=sent, seed=seed)])[0])}
 
@@ -157,10 +157,10 @@ def told(sent, seed=0):
 def test_a_motion_tells_only_what_it_excites():
     """A slow sine says nothing of the limits; steps at full speed do; a joint at rest nothing of what moves."""
     t = np.arange(0, 6, 0.01)
-    slow, fast = told(0.4 * np.sin(2 * t)), told(0.9 * np.sign(np.sin(3 * t)))
+    slow, fast = precisions(0.4 * np.sin(2 * t)), precisions(0.9 * np.sign(np.sin(3 * t)))
     assert not slow["torque limit"].possible and not slow["no-load speed"].possible and slow["stiffness"].possible
     assert fast["no-load speed"].possible and fast["torque limit"].steps < slow["torque limit"].steps
-    rest = told(0 * t)
+    rest = precisions(0 * t)
     assert not any(rest[w].possible for w in ("damping", "inertia", "viscous friction", "no-load speed", "play"))
     assert slow["viscous friction"].beside is not None and slow["viscous friction"].beside.words == "damping"
     how = dict(information.advice(list(slow.values())))

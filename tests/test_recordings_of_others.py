@@ -174,7 +174,7 @@ POINT = "trajectory_msgs/JointTrajectoryPoint"
 
 
 def controllers(fields):
-    """The types of messages, with a controller's state of these fields."""
+    """Return the types of messages, with a controller's state of these fields."""
     own = get_typestore(Stores.ROS2_HUMBLE)
     text = "\n".join(["std_msgs/Header header", "string[] joint_names", *(f"{POINT} {n}" for n in fields)])
     own.register(get_types_from_msg(text, CONTROLLER))

@@ -100,7 +100,7 @@ def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
 
 
 def drive_in_training(folder, profile):
-    """Speeds [6, 4] rad/s of a joint of a hand in training whose target moves at 3.3 rad/s."""
+    """Return the speeds [6, 4] rad/s of a joint of a hand in training whose target moves at 3.3 rad/s."""
     table = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text())
     table["joints"].setdefault("index_joint1", {}).update(profile)
     (folder / "servo.yaml").write_text(yaml.safe_dump(table))

@@ -29,7 +29,7 @@ def text(lines, encoding="utf-8"):
 
 
 def twice(lines):
-    """The logger is started again, and its last line is cut."""
+    """Return the lines of a logger that is started again, the last one cut."""
     return [*lines[:200], lines[0], *lines[200:], lines[-1][:9]]
 
 

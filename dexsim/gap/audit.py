@@ -215,12 +215,13 @@ def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
     rows: list[tuple[str, ...]] = []
     more: dict[tuple[str, str], list[str]] = {}
     for case in build(known.spec.compile(), mine):
-        told = informed(case, floors[case.joint])
-        good = [x for x in told if x.possible]
+        figures = informed(case, floors[case.joint])
+        good = [x for x in figures if x.possible]
         well = ", ".join(f"{x.figure.words} {x.within()}" for x in good)
-        rest = (x.figure.words + (f" (only with {x.beside.words})" if x.beside else "") for x in told if not x.possible)
-        rows.append((case.joint, f"{len(good)} of {len(told)}", well or "-", ", ".join(rest) or "-"))
-        for x in advice(told):
+        poor = [x for x in figures if not x.possible]
+        rest = [x.figure.words + (f" (only with {x.beside.words})" if x.beside else "") for x in poor]
+        rows.append((case.joint, f"{len(good)} of {len(figures)}", well or "-", ", ".join(rest) or "-"))
+        for x in advice(figures):
             more.setdefault(x, []).append(case.joint)
     text = columns_of(
         "figures of the believed drives that a fit could tell", ("joint", "told", "to about", "not told"), rows

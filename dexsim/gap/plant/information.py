@@ -58,7 +58,7 @@ FIGURES = (
 
 
 @dataclass(frozen=True)
-class Told:
+class Precision:
     """How well a figure could be told: steps (of `Figure.step`) of one standard deviation; alone: with all others
     known; beside: the figure that it can only be told together with, if any."""
 
@@ -78,7 +78,7 @@ class Told:
         return f"{scale * self.figure.step * self.steps:.2g} {self.figure.unit}"
 
 
-def informed(case: Case, floor: float = 0.0) -> list[Told]:
+def informed(case: Case, floor: float = 0.0) -> list[Precision]:
     """How well recordings could tell each figure of a joint. floor [rad]: by what repeats differ, where that is more
     than the noise."""
     plant = case.plant
@@ -116,7 +116,7 @@ def informed(case: Case, floor: float = 0.0) -> list[Told]:
         alone = float(1 / np.sqrt(information[k, k] + 1 / DOUBT**2))
         other = int(np.argmax(alike[k]))
         beside = used[other] if size[k] >= 1.0 > alone and alike[k, other] > ALIKE else None
-        out.append(Told(figure, float(size[k]), alone, beside))
+        out.append(Precision(figure, float(size[k]), alone, beside))
     return out
 
 
@@ -133,10 +133,10 @@ SUM = {"damping", "viscous friction"}
 """Figures of which a position shows the sum, whatever the motion."""
 
 
-def advice(told: Sequence[Told]) -> list[tuple[str, str]]:
+def advice(known: Sequence[Precision]) -> list[tuple[str, str]]:
     """(figure that recordings do not tell, what to record for it) in words."""
     out = []
-    for x in told:
+    for x in known:
         if not x.possible:
             both = x.beside is not None and {x.figure.words, x.beside.words} == SUM
             how = "the effort too, or a swing with the drive off" if both else f"{x.figure.motion} ({x.figure.kinds})"

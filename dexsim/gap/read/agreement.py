@@ -85,14 +85,14 @@ def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]
     alike = all(r.servo.to_dict() == runs[0].servo.to_dict() for r in runs)  # another gain has another lag
     for what in ("lag", "scale", "effort sign", "effort scale") if alike else ("scale", "effort sign"):
         field = what.split(" ")[0]
-        told = [(r.name, x) for r, s in each if (x := getattr(s, field)) is not None]
+        values_of = [(r.name, x) for r, s in each if (x := getattr(s, field)) is not None]
         if what == "effort sign":
-            values = np.array([np.sign(x) for _, x in told])
+            values = np.array([np.sign(x) for _, x in values_of])
         elif what == "lag":
-            values = np.array([x for _, x in told])
+            values = np.array([x for _, x in values_of])
         else:
-            values = np.log([abs(x) for _, x in told])
-        for k, (name, x) in enumerate(told):
+            values = np.log([abs(x) for _, x in values_of])
+        for k, (name, x) in enumerate(values_of):
             others = np.delete(values, k)
             if not len(others):
                 continue
@@ -103,7 +103,7 @@ def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]
                 least = max(least, USUAL * abs(middle))
             if (what == "effort sign" and spread) or abs(values[k] - middle) <= least:
                 continue
-            theirs = [y for n, y in told if n != name]
+            theirs = [y for n, y in values_of if n != name]
             out.append((name, *_said(joint, what, x, theirs, np.exp(abs(values[k] - middle)))))
     return out
 
@@ -182,14 +182,14 @@ def _delay(run: Run, j: int, before: str, after: str) -> float | None:
         return None
     if not np.isfinite(shown).all() or np.ptp(shown) == 0:
         return None
-    left = np.array([_left(shown[on], [f[on], *(b[on] for b in beside)]) for f in first])
-    best = int(np.argmin(left))
-    near = [left[k] for k in (best - 20, best + 20) if 0 <= k < len(left)]
-    sharp = min(near) > (1 + SHARP) * left[best]
-    return float(late[best]) if left[best] < 1 - EXPLAINED and sharp and 0 < best < len(late) - 1 else None
+    residual = np.array([_residual(shown[on], [f[on], *(b[on] for b in beside)]) for f in first])
+    best = int(np.argmin(residual))
+    near = [residual[k] for k in (best - 20, best + 20) if 0 <= k < len(residual)]
+    sharp = min(near) > (1 + SHARP) * residual[best]
+    return float(late[best]) if residual[best] < 1 - EXPLAINED and sharp and 0 < best < len(late) - 1 else None
 
 
-def _left(y: np.ndarray, columns: Sequence[np.ndarray]) -> float:
+def _residual(y: np.ndarray, columns: Sequence[np.ndarray]) -> float:
     """Part of the variance of y [n] that a least squares on columns leaves."""
     a = np.stack(columns, 1)
     a = a / np.maximum(np.abs(a).max(0), 1e-12)
