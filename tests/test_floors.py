@@ -21,8 +21,9 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
         "errors paths version rotation intervals system",
-        "guard door agents",
-        "files typed",
+        "typed door agents",
+        "guard",
+        "files",
         "console",
         "outputs yaml_text model_file",
         "assets hand",
