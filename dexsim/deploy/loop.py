@@ -47,6 +47,8 @@ HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relax
 SEEN: dict[str, float] = {ORIENTATION: 0.1, WHERE: 0.5, POSE: 0.5}
 """s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second;
 a camera's thirty, and fingers hide an object for a moment."""
+SPEED_OVER = 0.15
+"""s over which the object's speed is taken that carries its pose on (`LoopSettings.ahead`)."""
 RELAX_TRIES, RELAX_EVERY = 200, 0.005
 """How often, and s apart, the hand is told to relax where its driver fails to."""
 CONFIRM = 1.0
@@ -147,7 +149,7 @@ class Loop:
     _rest: list[np.ndarray]
     _seen: np.ndarray | None
     _seen_at: float | None
-    _poses: tuple[tuple[float, np.ndarray | None], tuple[float, np.ndarray | None]]
+    _poses: list[tuple[float, np.ndarray]]
     _action: np.ndarray
 
     def __init__(
@@ -505,11 +507,12 @@ class Loop:
         return True
 
     def _carried(self, pose: np.ndarray, stamp: float) -> np.ndarray:
-        """What is seen at its stamp [s], `ahead` later at the speed between the last two that were seen."""
-        if stamp != self._poses[1][0]:
-            self._poses = self._poses[1], (stamp, pose)
-        (t0, before), (t1, last) = self._poses
-        if not self.settings.ahead or before is None or last is None or not 0.001 < t1 - t0 < 0.2:
+        """What is seen at its stamp [s], `ahead` later at its mean speed over `SPEED_OVER`: between two readings in a
+        row the noise would be carried on with it."""
+        if not self._poses or stamp != self._poses[-1][0]:
+            self._poses = [(t, x) for t, x in self._poses if stamp - SPEED_OVER < t < stamp] + [(stamp, pose)]
+        (t0, before), (t1, last) = self._poses[0], self._poses[-1]
+        if not self.settings.ahead or t1 - t0 < 0.2 * SPEED_OVER:
             return pose
         before = -before if len(pose) == 4 and before @ last < 0 else before  # the nearer of a rotation's two signs
         pose = last + (last - before) * (self.settings.ahead / (t1 - t0))
@@ -603,7 +606,7 @@ class Loop:
         self.measure.reset()
         self.bundle.begin()
         self._unseen, self._nonsense = None, Lasting()
-        self._poses = ((0.0, None), (0.0, None))
+        self._poses = []
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:
