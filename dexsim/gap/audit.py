@@ -262,7 +262,9 @@ def rates(recordings: Sequence[Recording]) -> list[str]:
         for r in recordings:
             for part in r.parts():
                 s = part.commands if name == "command" else part.duty if name == "duty" else getattr(part.states, name)
-                for k, joint in enumerate(part.joints if s is not None and len(s) > 20 else ()):
+                if s is None or len(s) < 20:
+                    continue
+                for k, joint in enumerate(part.joints):
                     period, logged = renewed(s.t, s.value[:, k]), float(np.median(np.diff(s.t)))
                     if period > 1.5 * logged > 0:
                         slow.setdefault(joint, (period, logged))
@@ -309,8 +311,8 @@ joints:
 def begin(out: Path, joints: Sequence[str], own: dict[str, str]) -> None:
     """Write model.xml and servo.yaml to begin with into a new folder, those that `own` does not name, and name them
     there. Raises UserError where the folder is not free."""
-    new = {"model": "model.xml", "servo": "servo.yaml"}
-    new = {k: out / name for k, name in new.items() if not own.get(k)}
+    names = {"model": "model.xml", "servo": "servo.yaml"}
+    new = {k: out / name for k, name in names.items() if not own.get(k)}
     for path in new.values():
         if path.exists():
             raise UserError(f"out={out}: {path} exists; name another folder")

@@ -347,8 +347,8 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
         name = re.sub(r"^/?joint_commands/(.+)/position$", r"command.\1", name)
     name = re.sub(r"^observation[./]state[./]", "", name)  # LeRobot's names
     name = re.sub(r"^action[./](.+?)([./]pos)?$", r"command.\1", name)
-    if (of := re.fullmatch(r"t[_.](\w+)|(\w+)[_.]t", name, re.I)) is not None:  # t_cmd, pos_t
-        plain = (of[1] or of[2]).lower()
+    if (clock := re.fullmatch(r"t[_.](\w+)|(\w+)[_.]t", name, re.I)) is not None:  # t_cmd, pos_t
+        plain = (clock[1] or clock[2]).lower()
         whose = next((q for q, words in QUANTITIES.items() if q != "time" and plain in words), None)
         if whose or plain == "state":
             return "time", whose or "position", unit, "t"
