@@ -205,7 +205,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"steps={s['steps']}: {', '.join(sorted(unknown))} is none of {', '.join(STEPS)}")
     rows = []
     with ThreadPoolExecutor(max(1, s["jobs"])) as pool:
-        for row in pool.map(lambda m: _apart(m, s), models or list(found(folder, out))):
+        for row in pool.map(lambda m: _alone(m, s), models or list(found(folder, out))):
             rows.append(row)
             print(table(rows[-1:]).splitlines()[2], flush=True)
             (out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
@@ -217,7 +217,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _apart(model: Path, s: dict[str, Any]) -> dict[str, Any]:
+def _alone(model: Path, s: dict[str, Any]) -> dict[str, Any]:
     """Return the row of a hand, made in another process where several are at once."""
     if s["jobs"] > 1:
         words = [f"{k}={s[k]}" for k in ("steps", "drops", "limit", "seed", "out")]

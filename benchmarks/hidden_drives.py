@@ -163,7 +163,7 @@ def main(argv: list[str]) -> int:
     rows = []
     with ThreadPoolExecutor(max(1, s["jobs"])) as pool:
         if s["jobs"] > 1:  # each case in a process of its own, to be made beside the others
-            ask = lambda n: _apart(n, hands, seed, s["limit"], out)  # noqa: E731
+            ask = lambda n: _alone(n, hands, seed, s["limit"], out)  # noqa: E731
         else:
             ask = lambda n: case(n, hands, seed, s["limit"], out)  # noqa: E731
         for row in pool.map(ask, range(s["cases"])):
@@ -179,7 +179,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _apart(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
+def _alone(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
     """Return the same as `case`, made in another process."""
     code = (f"from pathlib import Path; from benchmarks.hidden_drives import case; case({number},"
             f" [Path(h) for h in {[str(h) for h in hands]!r}], {seed}, {limit},"

@@ -129,8 +129,8 @@ def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, flo
     when the search ended (share 1); empty where none was told. lines: (s since the start, text)."""
     found = [(t, LEFT.search(line)) for t, line in lines]
     ended = next((t for t, line in lines if line.strip().startswith("searched ")), None)
-    told = [(t, 0.01 * float(m[1]), float(m[2])) for t, m in found if m]
-    return [] if ended is None else [*told, (ended, 1.0, 0.0)]
+    said = [(t, 0.01 * float(m[1]), float(m[2])) for t, m in found if m]
+    return [] if ended is None else [*said, (ended, 1.0, 0.0)]
 
 
 def pair(job: tuple[str, int, dict[str, Any], Path, float]) -> dict[str, Any] | None:
@@ -180,11 +180,11 @@ def sure_and_wrong(row: dict[str, Any], version: str) -> bool:
 def told_right(rows: Sequence[dict[str, Any]], version: str) -> str:
     """Return how many of the times left that searches told were right within a third, in words."""
     right = [
-        abs(left - (end - t)) <= THIRD * (end - t)
+        abs(remaining - (end - t)) <= THIRD * (end - t)
         for r in rows
         if (times := r[version].get("times"))
         for end in (times[-1][0],)
-        for t, _, left in times[:-1]
+        for t, _, remaining in times[:-1]
     ]
     return f"{sum(right)} of {len(right)}"
 
@@ -200,8 +200,8 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
         same = sum(first(r["before"]) == first(r["after"]) for r in these)
         of = lambda test: [f"{sum(test(r, v) for r in these)} of {n}" for v in ("before", "after")]  # noqa: B023, E731
         took = [f"{sorted(r[v]['seconds'] for r in these)[n // 2]:.0f}" for v in ("before", "after")]
-        told = [told_right(these, v) for v in ("before", "after")]
-        lines.append((which, n, same, *of(right), *of(sure_and_wrong), *took, *told))
+        said = [told_right(these, v) for v in ("before", "after")]
+        lines.append((which, n, same, *of(right), *of(sure_and_wrong), *took, *said))
     head = ("set", "cases", "same first name", "right before", "after", "sure and wrong before", "after",
             "median s before", "after", "time left within a third before", "after")  # fmt: skip
     other = [r for r in rows if first(r["before"]) != first(r["after"])]

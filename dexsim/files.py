@@ -49,7 +49,7 @@ def check(path: Path, what: str, most: int = MAX_FILE) -> int:
 
 
 def stored(about: os.stat_result) -> int:
-    """The bytes that a file takes on its disk, without the holes of a sparse one."""
+    """Return the bytes that a file takes on its disk, without the holes of a sparse one."""
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 
@@ -74,7 +74,7 @@ def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) 
 
 
 def mapping(path: Path, what: str, most: int = MAX_TEXT) -> dict[str, Any]:
-    """A JSON file that maps keys to values. Raises UserError as `text` does, and where it is another."""
+    """Return a JSON file that maps keys to values. Raises UserError as `text` does, and where it is another."""
     try:
         out = json.loads(text(path, what, most))
     except (ValueError, RecursionError) as error:

@@ -127,7 +127,7 @@ def six_of_matrix(m: torch.Tensor) -> torch.Tensor:
 
 
 def matrix_of_six(six: torch.Tensor) -> torch.Tensor:
-    """Matrices [..., 3, 3] of `six_of_matrix`."""
+    """Return matrices [..., 3, 3] of `six_of_matrix`."""
     a, b = six[..., :3], six[..., 3:]
     return torch.stack([a, b, torch.linalg.cross(a, b)], -1)
 

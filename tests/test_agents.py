@@ -37,8 +37,8 @@ def test_a_student_with_touch_alone_learns_from_a_privileged_teacher(teacher, tm
     with pytest.raises(UserError, match=r"agent.teacher.checkpoint=null: name the policy.pt of a teacher"):
         dexsim_main(learn)
     assert main([*learn, f"agent.teacher.checkpoint={teacher}", f"out={out}"]) == 0
-    asked = dexsim.Distillation(teacher=teacher, hidden_dims=(16,)).settings()
-    assert asked == ["agent=distill", f"agent.teacher.checkpoint='{teacher}'", "agent.student.hidden_dims=[16]"]
+    requested = dexsim.Distillation(teacher=teacher, hidden_dims=(16,)).settings()
+    assert requested == ["agent=distill", f"agent.teacher.checkpoint='{teacher}'", "agent.student.hidden_dims=[16]"]
     data, taught = checkpoint.load(out / "last.pt"), checkpoint.load(teacher)
     assert data["config"]["agent"]["teacher"]["hidden_dims"] == [16]
     for name, weight in taught["actor"].items():  # which learns no more

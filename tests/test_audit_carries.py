@@ -226,10 +226,10 @@ def test_the_true_rate_of_each_signal_is_said(tmp_path, capsys):
     t = np.cumsum(0.005 + 0.001 * rng.random(800))
     at = lambda period, x: x(np.floor(t / period) * period)  # noqa: E731
     motion_ = lambda u: 0.5 * np.sin(2 * u)  # noqa: E731
-    shown = at(0.02, lambda u: np.round(motion_(u - 0.05) / 1.5e-3) * 1.5e-3)
+    printed = at(0.02, lambda u: np.round(motion_(u - 0.05) / 1.5e-3) * 1.5e-3)
     sent, effort = at(0.05, motion_), at(0.02, lambda u: motion_(u) - motion_(u - 0.05))
     head = "time,command.a,position.a,effort.a"
-    np.savetxt(tmp_path / "r.csv", np.stack([t, sent, shown, effort], 1), delimiter=",", header=head, comments="")
+    np.savetxt(tmp_path / "r.csv", np.stack([t, sent, printed, effort], 1), delimiter=",", header=head, comments="")
     main([str(tmp_path / "r.csv")])
     said = capsys.readouterr().out
     lines_ = [x for x in said.splitlines() if "a new value" in x]

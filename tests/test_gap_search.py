@@ -89,10 +89,10 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     """before, after: in windows of what was held out; ratio: of a free run over it; gain: where it was fitted and on
     conditions left out."""
 
-    def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
+    def reason(before: float, after: float, ratio: float, gain: float, loss: float, reported: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace(members=())
         search = SimpleNamespace(
-            case=SimpleNamespace(told=told),
+            case=SimpleNamespace(told=reported),
             polish=lambda t: t,
             gain=lambda a, b: gain,
             in_windows=lambda t, runs, span: before if t is none else after,
@@ -101,7 +101,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
     assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
-    assert reason(5.0, 1.1, 1.3, 0.8, 5.7, told=True) == ""  # the recorded torque knows better
+    assert reason(5.0, 1.1, 1.3, 0.8, 5.7, reported=True) == ""  # the recorded torque knows better
     assert "does not show it" in reason(1.0, 1.0, 1.0, 0.6, 2.1)  # a limit that was not reached there
     assert reason(1.0, 1.1, 1.02, 0.6, 2.1) == "" and reason(1.0, 1.0, 1.0, 0.15, 2.1) == ""
     assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found
@@ -219,7 +219,7 @@ def test_the_time_left_is_right_within_a_third_where_it_is_told(lanes, monkeypat
     for spread in np.tile([0.25, 0.45, 0.7], 20):
         took = np.round(40 * rng.lognormal(0, spread, 12)) + 1
         now[0], free = 0.0, 0
-        pace, begun, told = compute.Pace(len(took), lanes), {}, []
+        pace, begun, reported = compute.Pace(len(took), lanes), {}, []
         while free < len(took) or begun:
             while free < len(took) and len(begun) < lanes:
                 begun[free] = now[0]
@@ -230,19 +230,19 @@ def test_the_time_left_is_right_within_a_third_where_it_is_told(lanes, monkeypat
                 if now[0] - t >= took[k]:
                     pace.tell(k, 1.0)
                     del begun[k]
-            told.append((now[0], pace.left()))
-        right += [abs(x - (now[0] - t)) <= (now[0] - t) / 3 for t, x in told if x is not None]
-        lines += len(told)
+            reported.append((now[0], pace.left()))
+        right += [abs(x - (now[0] - t)) <= (now[0] - t) / 3 for t, x in reported if x is not None]
+        lines += len(reported)
     assert len(right) > 0.05 * lines
     assert np.mean(right) > 0.75
 
 
 def test_a_search_tells_how_far_it_is():
-    told = []
+    reported = []
     s = searched({})
-    s.tell = told.append
+    s.tell = reported.append
     s.settle(s.run())
-    assert len(told) >= 3 and told == sorted(told) and 0 < told[0] and told[-1] < 1
+    assert len(reported) >= 3 and reported == sorted(reported) and 0 < reported[0] and reported[-1] < 1
 
 
 def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():

@@ -68,10 +68,10 @@ def test_a_named_hand_is_imported_where_it_is_asked_for(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="hand=menagerie:claw: menagerie:claw: no such robot in"):
         load_hand("menagerie:claw")
     (tmp_path / "copy" / "claw").mkdir()
-    asked = []
+    requested = []
 
     def run(words, **_):
-        asked.append(words[2:])
+        requested.append(words[2:])
         shutil.copytree(HANDS / "xhand", tmp_path / "hands" / "claw")
         shutil.copy(load_hand("xhand").servo_path, tmp_path / "hands" / "claw" / "drives.yaml")
         file = tmp_path / "hands" / "claw" / "hand.yaml"
@@ -81,4 +81,4 @@ def test_a_named_hand_is_imported_where_it_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(subprocess, "run", run)
     assert load_hand("menagerie:claw").joints == load_hand("xhand").joints
     load_hand("menagerie:claw")
-    assert asked == [["dexsim", "import-hand", "menagerie:claw", "out=hands/claw"]]
+    assert requested == [["dexsim", "import-hand", "menagerie:claw", "out=hands/claw"]]

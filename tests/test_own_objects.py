@@ -87,7 +87,7 @@ def test_a_hollow_mesh_is_split_and_its_notch_stays_open(tmp_path, monkeypatch):
 
 
 def mug_of_bodies() -> trimesh.Trimesh:
-    """A mug as CAD programs write it: wall, bottom and handle closed each, with faces in common."""
+    """Return a mug as CAD programs write it: wall, bottom and handle closed each, with faces in common."""
     wall = trimesh.creation.annulus(r_min=0.03, r_max=0.035, height=0.08, sections=32)
     bottom = trimesh.creation.cylinder(0.03, 0.005, sections=32)
     bottom.apply_translation((0, 0, -0.0375))

@@ -182,7 +182,7 @@ def controllers(fields):
 
 
 def controller_state(typestore, t, names, fields):
-    """fields: name -> positions."""
+    """Return fields: name -> positions."""
     none, zero = np.zeros(0), TYPES["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
     kind = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
     rest = {"velocities": none, "accelerations": none, "effort": none, "time_from_start": zero}

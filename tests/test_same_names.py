@@ -62,7 +62,7 @@ def test_what_both_have_answered_is_not_run_again(tmp_path, monkeypatch, capsys)
     out.mkdir(parents=True)
     done = [row(said(PLAY), said(PLAY)), row(said(), said(), (), "none", "planted")]
     (out / "pairs.jsonl").write_text("".join(json.dumps(r) + "\n" for r in done))
-    asked = ["concealed=1", "planted=1", "seed=5", f"out={tmp_path / 'out'}"]
-    assert same_names.main([f"before={tmp_path}", *asked]) == 0
+    requested = ["concealed=1", "planted=1", "seed=5", f"out={tmp_path / 'out'}"]
+    assert same_names.main([f"before={tmp_path}", *requested]) == 0
     assert [line.split()[:3] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")][1:] == [
         ["concealed", "1", "1"], ["planted", "1", "1"]]  # fmt: skip

@@ -72,11 +72,11 @@ def test_pads_of_a_link_sum_to_what_the_physics_presses_it_with(hand, cfg, lanes
     engine, touch = feeling(hand, hand_layout(hand), 4, lanes, **cfg)
     drop_in(engine, touch, 3)
     touch.launch()
-    for names, felt in (([n for n, _ in pad_pairs(hand)], touch.force_clean), (self_pairs(hand), touch.force_other)):
+    for names, sensed in (([n for n, _ in pad_pairs(hand)], touch.force_clean), (self_pairs(hand), touch.force_other)):
         for name in set(names):
             mine = [k for k, n in enumerate(names) if n == name]
             given = engine.t.pair_normal[:, engine.pair(name)]
-            torch.testing.assert_close(felt[:, mine].sum(1), given, rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(sensed[:, mine].sum(1), given, rtol=1e-5, atol=1e-5)
     both = touch.force_clean + touch.force_other
     torch.testing.assert_close(touch.raw_clean.sum(-1), both, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(touch.force, both, rtol=1e-5, atol=1e-5)  # as the sensor measures it
@@ -139,15 +139,15 @@ def test_readings_do_not_change_when_all_is_turned(hand):
     np.testing.assert_allclose(out[0][1], out[1][1], atol=2e-5)
 
 
-@pytest.mark.parametrize("asked", ["hull:100/3", "hull:6mm", "a_2:25:all", "hull:40,links:30:all"])
-def test_taxels_lie_evenly_on_the_links_surface(asked, tmp_path):
+@pytest.mark.parametrize("requested", ["hull:100/3", "hull:6mm", "a_2:25:all", "hull:40,links:30:all"])
+def test_taxels_lie_evenly_on_the_links_surface(requested, tmp_path):
     made_hand(tmp_path)
     hand = load_hand(tmp_path)
-    pads = skin.lay(hand, asked.replace("hull", "palm"))
-    wishes = skin.wishes(asked)
+    pads = skin.lay(hand, requested.replace("hull", "palm"))
+    wishes = skin.wishes(requested)
     total = sum(len(p.point) for _, p in pads.values())
-    if "mm" not in asked:
-        assert total == {"hull:100/3": 100, "a_2:25:all": 25, "hull:40,links:30:all": 130}[asked]
+    if "mm" not in requested:
+        assert total == {"hull:100/3": 100, "a_2:25:all": 25, "hull:40,links:30:all": 130}[requested]
     for body in {b for b, _ in pads.values()}:
         own = [p for b, p in pads.values() if b == body]
         point, normal = (np.concatenate([getattr(p, k) for p in own]) for k in ("point", "normal"))
@@ -165,7 +165,7 @@ def test_taxels_lie_evenly_on_the_links_surface(asked, tmp_path):
         assert near.min() > 0.45 * spacing and near.max() < 1.7 * spacing
         if wishes[0].spacing and body == "hull":
             assert spacing == pytest.approx(wishes[0].spacing, rel=0.05)
-        if box and "all" not in asked.split(",")[0]:
+        if box and "all" not in requested.split(",")[0]:
             assert (normal @ skin.directions(hand, body)[0] > 0).all()
             top = 0.076 * 0.084
             assert 0.75 * top < area.sum() < 1.05 * top  # what fingers stand on is not shown
@@ -211,7 +211,7 @@ def test_a_hand_keeps_its_skin_and_another_replaces_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("requested", "said"),
     [
         ("palm", "skin=palm: must be LINK:TAXELS"),
         ("palm:0", "skin=palm:0=0: must be"),
@@ -223,11 +223,11 @@ def test_a_hand_keeps_its_skin_and_another_replaces_it(tmp_path):
         ("palm:1500/3,links:400:all", "2700 taxels, at most 2000"),
     ],
 )
-def test_what_cannot_be_laid_is_one_line(asked, said, tmp_path):
+def test_what_cannot_be_laid_is_one_line(requested, said, tmp_path):
     made_hand(tmp_path)
     before = sorted(p.name for p in tmp_path.iterdir())
     with pytest.raises(UserError, match=said) as caught:
-        skin.add(tmp_path, asked)
+        skin.add(tmp_path, requested)
     assert "\n" not in str(caught.value) and sorted(p.name for p in tmp_path.iterdir()) == before
 
 
@@ -292,14 +292,14 @@ def test_a_grasp_is_felt_whole(hand):
         env.step((3 * ((across if k < 40 else cupped) - env.q)).clamp(-1, 1))
         env.feel()
         touch, pair = env.touch, env.engine.t.pair_normal
-        felt = touch.force_clean.sum(1)
+        sensed = touch.force_clean.sum(1)
         whole = env.engine.t.pair_normal[:, 5:11].sum(1)  # fingers and palm
-        torch.testing.assert_close(felt, whole, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(sensed, whole, rtol=1e-4, atol=1e-3)
         objects = [name for name, _ in pad_pairs(hand)]
         for names, force in ((objects, touch.force_clean), (self_pairs(hand), touch.force_other)):
             for name in set(names):
                 mine = [k for k, n in enumerate(names) if n == name]
                 torch.testing.assert_close(force[:, mine].sum(1), pair[:, env.engine.pair(name)], rtol=1e-4, atol=1e-4)
-        most = torch.maximum(most[0], felt - touch.force_clean[:, :5].sum(1)), torch.maximum(
+        most = torch.maximum(most[0], sensed - touch.force_clean[:, :5].sum(1)), torch.maximum(
             most[1], touch.force_other.sum(1))  # fmt: skip
     assert (most[0] > 1.0).any() and (most[1] > 0.1).any()

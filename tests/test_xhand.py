@@ -473,7 +473,7 @@ def two(clock=None, sides=("right", "left"), serials=(None, None), hang=0.15, **
 
 
 def turn(d, seconds, goals):
-    """The newest states, after both hands were told their goals [rad] (None: nothing) for a while."""
+    """Return the newest states, after both hands were told their goals [rad] (None: nothing) for a while."""
     seen = []
     end = d.clock.now() + seconds
     while d.clock.now() < end:
@@ -551,9 +551,9 @@ def test_two_loops_run_their_policies_on_two_hands_of_a_bus(b):
     d = two(Clock(), serials=("FAKE0001", "FAKE0002"), hang=3.0)
     patient = {"late": 2.0, "stale": 1.0, "overruns": 1000, "hang": 3.0, "home_speed": 3.0, "tor_max": 300.0}
     make = partial(Loop, b, eye=FixedPlace([0.055, 0.0, 0.04]), calibration=Calibration.default(), clock=d.clock)
-    right, left = d.hands
+    right, remaining = d.hands
     loops = [make(right, settings=LoopSettings(seconds=1.5, **patient)),
-             make(left, settings=LoopSettings(seconds=0.5, **patient))]  # fmt: skip
+             make(remaining, settings=LoopSettings(seconds=0.5, **patient))]  # fmt: skip
     d.open()
     threads = [threading.Thread(target=loop.run) for loop in loops]
     try:

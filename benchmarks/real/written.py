@@ -129,7 +129,7 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
             limit=limit,
         ),
         say=lambda text: print(f"{time.perf_counter() - begun:6.0f} s  {text}", file=log),
-        progress=lambda done, of, name, left=None: print(
+        progress=lambda done, of, name, remaining=None: print(
             f"{time.perf_counter() - begun:6.0f} s  searching {name}, {done:.3f} of {of}", file=log
         ),
     )

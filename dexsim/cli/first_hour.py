@@ -527,7 +527,7 @@ class Hour:
 
 
     def _drives(self, b: Any) -> tuple[list[str], dict[str, Any]]:
-        """What the fitted drives have outside of what training drew, in words; all of it, by joint and column."""
+        """Return what the fitted drives have outside of what training drew, in words, by joint and column."""
         from dexsim.actuator.table import ServoTable
         from dexsim.tasks.servos import RELATIVE
 

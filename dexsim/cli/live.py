@@ -81,10 +81,10 @@ class Run:
 
     def names(self) -> list[str]:
         """List the checkpoints by iteration, then the newest policy."""
-        kept = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
-        kept.sort(key=lambda p: int(p.stem.removeprefix("model_")))
-        self._files.update({p.name: p for p in kept})
-        return [*(p.name for p in kept if p.name != self.newest), self.newest]
+        saved = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
+        saved.sort(key=lambda p: int(p.stem.removeprefix("model_")))
+        self._files.update({p.name: p for p in saved})
+        return [*(p.name for p in saved if p.name != self.newest), self.newest]
 
     def changed(self) -> bool:
         """Tell whether the newest policy was saved again."""

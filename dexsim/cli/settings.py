@@ -79,7 +79,7 @@ def parse(argv: list[str], config_dir: Path) -> Request:
 
 
 def _escaped(text: str) -> str:
-    """A text as it stands between single quotes."""
+    """Return a text as it stands between single quotes."""
     return text.strip().replace("\\", "\\\\").replace("'", "\\'")
 
 
@@ -204,8 +204,8 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
 
 
 def _of_term(cfg: DictConfig, key: str) -> Any:
-    """The usual value of a term's setting that the settings do not list, since the task's class declares it; None for
-    any other. Raises UserError for a term that the task has not."""
+    """Return the usual value of a term's setting that the task's class declares and the settings do not list; None
+    for any other. Raises UserError for a term that the task has not."""
     if key.split(".")[0] != "task" or not registry.TERMS & {key.split(".")[1]} or key.count(".") not in (2, 3):
         return None
     declared = OmegaConf.create({"task": registry.terms(resolve(cfg))})
@@ -265,7 +265,7 @@ def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfi
 
 
 def _there_too(wishes: Any, own: Any) -> Any:
-    """The part of nested settings that others have as well."""
+    """Return the part of nested settings that others have as well."""
     if not isinstance(wishes, dict) or not isinstance(own, DictConfig):
         return wishes
     return {k: _there_too(v, own.get(k)) for k, v in wishes.items() if k in own}

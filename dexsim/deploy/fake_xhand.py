@@ -171,7 +171,7 @@ class FakeXHand:
         return self.clock.now() - self.zero
 
     def move(self, t: float, which: int = 0) -> HandState:
-        """A hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
+        """Return a hand's state at time t [s]; on too slow a machine its time stands still rather than jump."""
         hand = self.hands[which]
         if t - self._slip - hand.time > 0.25:
             self._slip = t - hand.time - TRIP
@@ -240,7 +240,7 @@ class _Control:
 
     def __init__(self, fake: FakeXHand):
         self._fake, self._port = fake, ""
-        self._kept = [_Kept(self._zeros()) for _ in fake.hands]
+        self._held = [_Kept(self._zeros()) for _ in fake.hands]
         self._crc_at, self._boot_until = -np.inf, -np.inf
 
     # -- the package's calls
@@ -268,13 +268,13 @@ class _Control:
         return _error()
 
     def set_firmware_state(self, hand: int, state: int, *_: int) -> SimpleNamespace:
-        """Of EtherCAT; error object."""
+        """Return an error object, as EtherCAT does."""
         self._fake.firmware.append((self._fake.time, state))
         return _error()
 
     def list_hands_id(self) -> list[int]:
         """Ids on the bus; none on the auxiliary port."""
-        return list(range(len(self._kept))) if (self._fake.ports() | {"fake": True}).get(self._port) else []
+        return list(range(len(self._held))) if (self._fake.ports() | {"fake": True}).get(self._port) else []
 
     def get_hand_type(self, hand: int) -> tuple:
         """(error, L or R)."""
@@ -301,21 +301,21 @@ class _Control:
         """One round trip; error object."""
         if not isinstance(command, _HandCommand):
             raise TypeError("send_command(): incompatible function arguments")
-        if not self._port or not 0 <= hand < len(self._kept):
+        if not self._port or not 0 <= hand < len(self._held):
             return _error(NO_HAND, "no such hand")
-        self._kept[hand].last = _HandCommand(command)
+        self._held[hand].last = _HandCommand(command)
         return _error(self._trip(hand))
 
     def read_state(self, hand: int, force_update: bool = False) -> tuple:
         """(error, state): forced, the last command goes out once more; the cache either way."""
-        if not self._port or not 0 <= hand < len(self._kept):
+        if not self._port or not 0 <= hand < len(self._held):
             return _error(NO_HAND, "no such hand"), self._zeros()
         if force_update:
             self._trip(hand)
-        kept = self._kept[hand]
-        if kept.half is not None and self._fake.clock.now() >= kept.half[0]:
-            kept.cache, kept.half = kept.half[1], None
-        return _error(kept.code), kept.cache  # a frame is not written again once it is there
+        held = self._held[hand]
+        if held.half is not None and self._fake.clock.now() >= held.half[0]:
+            held.cache, held.half = held.half[1], None
+        return _error(held.code), held.cache  # a frame is not written again once it is there
 
     def close_device(self) -> None:
         """The hand keeps its last command."""
@@ -330,7 +330,7 @@ class _Control:
 
     def _trip(self, hand: int) -> int:
         """The command goes out, the state comes back; the code of it."""
-        fake, f, kept = self._fake, self._fake.faults, self._kept[hand]
+        fake, f, held = self._fake, self._fake.faults, self._held[hand]
         clock, t = fake.clock, fake.time
         if t >= f.abort_s:
             os.abort()
@@ -341,11 +341,11 @@ class _Control:
             self._boot_until = now + BOOTING
         if now < self._boot_until:
             clock.sleep_until(now + REFUSING)
-            kept.code = BOOT
+            held.code = BOOT
             return BOOT
         if not fake.ports() or not (fake.ports() | {"fake": True}).get(self._port):
             clock.sleep_until(now + REFUSING)
-            kept.code = NO_HAND
+            held.code = NO_HAND
             return NO_HAND
         dead = t >= f.freeze_s
         refused = t >= f.refuse_s
@@ -358,18 +358,18 @@ class _Control:
         broken = fake.rng.random() < f.crc
         frame = self._frame(fake.move(t + long, hand), broken, hand)
         clock.sleep_until(now + long)
-        self._store(frame, kept)
+        self._store(frame, held)
         if refused:
-            kept.code = 0
+            held.code = 0
             return f.refuse
         boards = t >= f.silent_s or (f.board >= 0 and t >= f.board_s)
-        kept.code = CRC if broken else NO_TAXELS if boards else 0
+        held.code = CRC if broken else NO_TAXELS if boards else 0
         if broken:
             self._crc_at = clock.now()
-        return kept.code
+        return held.code
 
     def _carry(self, which: int) -> None:
-        fake, fingers, hand = self._fake, self._kept[which].last.finger_command, self._fake.hands[which]
+        fake, fingers, hand = self._fake, self._held[which].last.finger_command, self._fake.hands[which]
         mode, kp, limit = fingers[0].mode, fingers[0].kp, np.array([f.tor_max for f in fingers], float)
         position = np.array([f.position for f in fingers])
         fake.by_hand[which].append((fake.time, (mode, kp, position, limit)))
@@ -396,7 +396,7 @@ class _Control:
             j.tipboard_err = 307 if broken and i == 2 else 0
         for k, board in enumerate(frame.sensor_data):
             if fake.time >= f.silent_s or (k == f.board and fake.time >= f.board_s) or broken:
-                frame.sensor_data[k] = self._kept[hand].cache.sensor_data[k]
+                frame.sensor_data[k] = self._held[hand].cache.sensor_data[k]
                 continue
             touch = s.tactile[k] if k < len(s.tactile) else np.zeros((TAXELS, 3))
             since = fake.clock.now() - fake.pressed[1]
@@ -420,14 +420,14 @@ class _Control:
             board.calc_temperature = 30
         return frame
 
-    def _store(self, frame: SimpleNamespace, kept: _Kept) -> None:
+    def _store(self, frame: SimpleNamespace, held: _Kept) -> None:
         """The package's thread writes the cache: now, or, of a torn frame, to its end in 1.5 ms."""
         fake = self._fake
-        kept.cache, kept.half = frame, None
+        held.cache, held.half = frame, None
         if fake.rng.random() < fake.faults.torn:
             joints = frame.finger_state[:7] + self._zeros().finger_state[7:]
-            kept.cache = SimpleNamespace(finger_state=joints, sensor_data=frame.sensor_data)
-            kept.half = fake.clock.now() + 0.0015, frame
+            held.cache = SimpleNamespace(finger_state=joints, sensor_data=frame.sensor_data)
+            held.half = fake.clock.now() + 0.0015, frame
 
     def _zeros(self) -> SimpleNamespace:
         names = ("id sensor_id position torque raw_position temperature commboard_err jonitboard_err tipboard_err"

@@ -53,8 +53,8 @@ class HandKinematics:
         return position[:f] + np.einsum("fij,fj->fi", turn[:f], self._offset), position, turn
 
     def followers(self, state: HandState) -> torch.Tensor:
-        """Angles [1, S] rad of the measured joints without a drive. Raises UserError where the driver does not read
-        them."""
+        """Return angles [1, S] rad of measured joints without a drive. Raises UserError where the driver does not
+        read them."""
         if not self._sensed:
             return torch.zeros(1, 0)
         if state.follower is None:

@@ -51,13 +51,13 @@ def parts(env: Any) -> dict[str, Any]:
         "tau/tau_max": "torque [N.m] / normalization.tau_max",
         "F/F_max": "force [N] / normalization.force_max_N",
     }
-    felt = env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    contact = env.pads if env.task.get("observe", {}).get("touch", True) else 0
     commands = 1 if env.thumb_range is None else 2
     named = {"force_command": "the commanded share of normalization.force_max_N"}
     rows = [
         (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
         for name, width, unit, source in observations.rows(
-            env.num_actions, env.fingers, felt, commands, len(env.hand.sensed))  # fmt: skip
+            env.num_actions, env.fingers, contact, commands, len(env.hand.sensed))  # fmt: skip
     ]
     return {
         "rows": rows, "initial_pose": floats(env.pose0),
@@ -72,15 +72,15 @@ def parts(env: Any) -> dict[str, Any]:
 
 def signals_of(env: Any) -> observations.Signals:
     """Return what the last observation of a simulated task was built from, noise and all."""
-    s, felt = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    s, contact = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
     followers = env.q[:, :0]
     if env.hand.sensed:  # with its noise, which is nowhere else
         widths = {name: width for name, width, _ in env.describe()["observations"]["actor"]}
         parts = env.obs["actor"].split([*widths.values()], 1)
         followers = dict(zip(widths, parts, strict=True))["follower_angle"].clone()
     return observations.Signals(
-        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, :felt],
-        env.touch.centre[:, :felt], s.tip, env.force_command(), followers)  # fmt: skip
+        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, :contact],
+        env.touch.centre[:, :contact], s.tip, env.force_command(), followers)  # fmt: skip
 
 
 class Measure:

@@ -173,7 +173,7 @@ class BusDriver:
             raise UserError(self._ended)
 
     def renew(self) -> None:
-        """What was sent until now drives no more."""
+        """Let what was sent until now drive no more."""
         self._era += 1
         if self.body is None and self._process is not None:
             self._v["era"].value = self._era  # counts at once, even where a thread hangs inside `send`

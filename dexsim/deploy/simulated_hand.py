@@ -225,7 +225,7 @@ class SimulatedHand:
                          np.clip(speed, -32.768, 32.767), follower=self._followers())  # fmt: skip
 
     def _followers(self) -> np.ndarray | None:
-        """Angles of joints without a drive, as their encoders count them."""
+        """Return angles of joints without a drive, as their encoders count them."""
         if not self.env.hand.sensed:
             return None
         return np.round(self.env.followers()[0].double().numpy() / POSITION_LSB) * POSITION_LSB

@@ -425,7 +425,7 @@ class XHandsBus:
         return {k: ", ".join(dict.fromkeys(i[k] for i in infos)) for k in infos[0]}
 
     def cycle(self, command: HandCommand | None) -> HandState | None:
-        """A round trip of each."""
+        """Make a round trip of each hand."""
         new = False
         for k, hand in enumerate(self.hands):
             hand._pause_until = max(h._pause_until for h in self.hands)  # a bus rests as a whole
@@ -444,11 +444,11 @@ class XHandsBus:
             np.concatenate([nobody if s.silent is None else s.silent for s in states]))  # fmt: skip
 
     def problem(self) -> str:
-        """Of either hand."""
+        """Return the problem of either hand."""
         return "; ".join(f"{h.label}: {why}" for h in self.hands if (why := h.problem()))
 
     def released(self) -> tuple[bool, str] | None:
-        """Of those that are let go: none of them until all are known."""
+        """Return what is known of hands that are let go: None until all are known."""
         proofs = [(h, h.released()) for h in self.hands if h._letting_go is not None]
         known = [(h, p) for h, p in proofs if p is not None]
         if not proofs or len(known) < len(proofs):
@@ -498,7 +498,7 @@ class VendorXHands(BusDriver):
     _parts_lock = threading.RLock()
 
     def part(self, k: int, command: HandCommand | None) -> None:
-        """What hand k is told: None lets go of it; nothing that was sent before drives it again."""
+        """Return what hand k is told: None lets go of it; nothing that was sent before drives it again."""
         with self._parts_lock:
             self._parts[k] = command
             driven = next((c for c in self._parts if c is not None), None)
@@ -525,7 +525,7 @@ class OneOfTwo:
         return self.bus.open()
 
     def read(self) -> HandState | None:
-        """The newest state of this hand, None before the first."""
+        """Return the newest state of this hand, None before the first."""
         state = self.bus.read()
         if state is None:
             return None

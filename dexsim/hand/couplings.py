@@ -70,8 +70,8 @@ class Couplings:
             mine = {a for a in np.flatnonzero(row) if a in self._free}
             if not mine:
                 continue
-            apart = (g for g in self._groups if all(not mine & set(np.flatnonzero(self._rows[o][0])) for o in g))
-            group = next(apart, None)
+            separate = (g for g in self._groups if all(not mine & set(np.flatnonzero(self._rows[o][0])) for o in g))
+            group = next(separate, None)
             self._groups.append([k]) if group is None else group.append(k)
         one = [np.count_nonzero(row[self._free]) <= 1 for row, *_ in self._rows]
         alone = all(one)  # of intervals of one joint that meet, the last that is entered lies in all

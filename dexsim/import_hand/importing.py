@@ -198,9 +198,9 @@ def import_hand(
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         loaded = _loads(stage)
         before = yaml_text.load(out / folder.HAND, "hand") if note and (out / folder.HAND).is_file() else {}
-        asked = settings.skin or (before.get("source") or {}).get("skin")
-        if asked:
-            hand["skin"], hand["source"]["skin"] = links.write_pads(loaded, stage, asked, tell), asked
+        requested = settings.skin or (before.get("source") or {}).get("skin")
+        if requested:
+            hand["skin"], hand["source"]["skin"] = links.write_pads(loaded, stage, requested, tell), requested
             (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
             loaded = _loads(stage)
             if picture:

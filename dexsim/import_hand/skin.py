@@ -103,14 +103,14 @@ def _way(model: mujoco.MjModel, tip: str, palm: str) -> list[str]:
     return out[::-1]
 
 
-def lay(hand: Hand, asked: str) -> dict[str, tuple[str, Pad]]:
+def lay(hand: Hand, requested: str) -> dict[str, tuple[str, Pad]]:
     """Make pads by name, each with its body. Raises UserError for links that are not there, or carry nothing on that
     side, and for more than MOST taxels."""
     known = names(hand)
     every, palm = hand.compiled, hand.palm_body
     out: dict[str, tuple[str, Pad]] = {}
     todo = []
-    for wish in wishes(asked):
+    for wish in wishes(requested):
         tips = set(hand.tip_bodies)
         links = [n for n, b in known.items() if b != palm and b not in tips] if wish.link == "links" else [wish.link]
         for link in links:
@@ -272,26 +272,26 @@ def directions(hand: Hand, body: str) -> tuple[np.ndarray, np.ndarray]:
     return normal, unit(ahead - normal * (normal @ ahead))
 
 
-def write_pads(hand: Hand, folder: Path, asked: str, say: Callable[[str], None]) -> list[dict[str, str]]:
+def write_pads(hand: Hand, folder: Path, requested: str, say: Callable[[str], None]) -> list[dict[str, str]]:
     """Write the pads that are asked for, skin_*.csv, and return their entries in hand.yaml. Raises UserError."""
     if not hand.touches:
         raise UserError(f"skin={asked}: needs pads on the fingertips, and hand {hand.name} has none (pads=8x6)")
     kind, out = hand.pads[hand.others[0]].kind, []
-    for name, (body, pad) in lay(hand, asked).items():
+    for name, (body, pad) in lay(hand, requested).items():
         out.append({"name": name, "body": body, "taxels": f"skin_{name}.csv", "kind": kind})
         (folder / f"skin_{name}.csv").write_text(pad.csv(), encoding="ascii")
         say(f"skin     {name:<9}{len(pad.point):>4} taxels on {1e4 * pad.area.sum():.2f} cm2 of {body}")
     return out
 
 
-def add(folder: Path, asked: str, say: Callable[[str], None] = lambda text: None) -> Hand:
+def add(folder: Path, requested: str, say: Callable[[str], None] = lambda text: None) -> Hand:
     """Lay the skin that is asked for over the hand in a folder, in place of what it had: skin_*.csv, entries of
     hand.yaml. Returns the hand. Raises UserError, with nothing changed."""
-    entries = write_pads(load_hand(folder), folder, asked, say)
+    entries = write_pads(load_hand(folder), folder, requested, say)
     file, note = read(folder / FILE), corrections.written(folder)
     for old in {e.taxels for e in file.skin} - {e["taxels"] for e in entries}:
         (folder / old).unlink(missing_ok=True)
-    file.skin, file.source = [SkinEntry(**e) for e in entries], {**file.source, "skin": asked}
+    file.skin, file.source = [SkinEntry(**e) for e in entries], {**file.source, "skin": requested}
     if note is None:
         write(file, folder / FILE)
     else:  # with its words, and so that the next import knows these files for its own

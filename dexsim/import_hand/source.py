@@ -307,7 +307,7 @@ def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
 
 
 def _ends(body: Any) -> int:
-    """Bodies on joints, behind which nothing moves."""
+    """Return bodies on joints, behind which nothing moves."""
     behind = sum(_ends(b) for b in body.bodies)
     return behind or int(any(j.type in ONE_DOF for j in body.joints))
 

@@ -117,7 +117,7 @@ def load_policy(
 
 
 def action_noise(actor: dict[str, torch.Tensor]) -> torch.Tensor | None:
-    """Standard deviation [A] of a trained actor's actions, by its state; None where it depends on what it sees."""
+    """Return the standard deviation [A] of a trained actor's actions; None where it depends on what it sees."""
     own = {k.rsplit(".", 1)[-1]: v for k, v in actor.items() if k.startswith("distribution.")}
     return own["log_std_param"].exp() if "log_std_param" in own else own.get("std_param")
 

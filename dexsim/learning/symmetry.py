@@ -16,7 +16,7 @@ from dexsim.errors import UserError
 def augmented(
     env: Any, obs: TensorDict | None, actions: torch.Tensor | None
 ) -> tuple[TensorDict | None, torch.Tensor | None]:
-    """Observations [B, ...] and actions [B, A], followed by those of every symmetric situation: [(1 + S) B, ...].
+    """Return observations [B, ...] and actions [B, A], then those of every symmetric situation: [(1 + S) B, ...].
 
     env: one with `symmetries()` and `describe()`. Raises UserError where it declares no symmetry.
     """
@@ -35,7 +35,7 @@ def augmented(
 
 
 def _turned(env: Any, group: str, value: torch.Tensor, by: Any) -> torch.Tensor:
-    """A group's observations [B, D] as the symmetric situation has them, row by row of its table."""
+    """Return a group's observations [B, D] as the symmetric situation has them, row by row of its table."""
     past = env.history if group == "actor" else 1
     rows = [(name, width // past) for name, width, *_ in env.describe()["observations"][group]]
     if not any(name in by for name, _ in rows):

@@ -461,13 +461,13 @@ def _clock(
 
 
 def _epoch(t: np.ndarray) -> str:
-    """The unit in which a time without one counts from 1970: "" where it may be s, or does not."""
+    """Return the unit in which a time without one counts from 1970: "" where it may be s, or does not."""
     middle = float(np.nanmedian(np.abs(t))) if np.isfinite(t).any() else 0.0
     return next((u for u, least in EPOCHS.items() if least <= middle < 1000 * least), "")
 
 
 def _json(path: Path) -> tuple[dict[str, Any], list[Finding]]:
-    """Columns of a JSON file: of its first list of mappings, of a mapping a line, or of lists by name."""
+    """Return columns of a JSON file: of its first list of mappings, of a mapping a line, or of lists by name."""
     text = files.text(path, "recording", 1 << 30)
     try:
         found = json.loads(text) if path.suffix.lower() == ".json" else [json.loads(x) for x in text.split("\n") if x]
@@ -488,7 +488,7 @@ def _json(path: Path) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """What is nested in a mapping, by names with points between them; places of a list by their number."""
+    """Return what is nested in a mapping, by names with points between them; places of a list by their number."""
     out: dict[str, Any] = {}
     for key, value in row.items():
         if isinstance(value, list):

@@ -259,15 +259,15 @@ class _Reading:
     def _of_controllers(self, out: dict[str, tuple[str, str]]) -> None:
         """Adds what ros2_control's controllers say of themselves or are sent, where commands or states are not found
         yet; a part of a controller's state for those that are."""
-        told = [t for t in self.streams if (s := self.streams[t][0].schema) and s.name.endswith(CONTROLLER)]
+        named = [t for t in self.streams if (s := self.streams[t][0].schema) and s.name.endswith(CONTROLLER)]
         for ours, part in PARTS.items():
             if ours in out:
                 theirs, own = out[ours]
-                out[ours] = (theirs, own or part) if theirs in told else (theirs, own)
+                out[ours] = (theirs, own or part) if theirs in named else (theirs, own)
                 continue
             if any(f.topic == ours and f.kind == "topic" for f in self.findings):
                 continue  # several are of its name
-            fits, what = [(t, part) for t in told], f"a controller's {part.split('|')[0]}"
+            fits, what = [(t, part) for t in named], f"a controller's {part.split('|')[0]}"
             for kind in SENT if ours == schema.COMMANDS and not fits else ():
                 taken = {theirs for theirs, _ in out.values()}
                 of_kind = [t for t in self.streams if t not in taken and self._is_a(t, SENT[kind], strict=True)]

@@ -273,8 +273,8 @@ class LeRobot:
 
 
 def _table(path: Path, columns: Sequence[str], episode: int) -> Any:
-    """The rows of an episode in a parquet file. Not by pyarrow's data sets, whose library alone takes what memory a
-    reader has."""
+    """Return the rows of an episode in a parquet file. Not by pyarrow's data sets, whose library alone takes
+    what memory a reader has."""
     from pyarrow import compute, parquet
 
     file = parquet.ParquetFile(path, memory_map=False, pre_buffer=False)

@@ -40,11 +40,11 @@ class ContactCheck:
         self.address = np.array([self.model.jnt_qposadr[self.model.joint(j).id] for j in m.joints])
         self._names = [self.model.body(b).name or f"body {b}" for b in range(self.model.nbody)]
         self._couplings = Couplings(self.model, m.joints) if m.hand is not None else None
-        self._apart = np.zeros((self.model.nbody, self.model.nbody), bool)  # pairs that are not looked at
+        self._separate = np.zeros((self.model.nbody, self.model.nbody), bool)  # pairs that are not looked at
         self.exempt: set[tuple[str, str]] = set(self.near(home))
         for pair in self.exempt:
             a, b = (self._names.index(name) for name in pair)
-            self._apart[a, b] = self._apart[b, a] = True
+            self._separate[a, b] = self._separate[b, a] = True
 
     def near(self, q: np.ndarray) -> list[tuple[str, str]]:
         """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest, or, in a hand,
@@ -63,7 +63,7 @@ class ContactCheck:
         mujoco.mj_kinematics(m, d)
         mujoco.mj_collision(m, d)
         bodies = m.geom_bodyid[d.contact.geom]
-        close = (d.contact.dist < self.clearance) & ~self._apart[bodies[:, 0], bodies[:, 1]]
+        close = (d.contact.dist < self.clearance) & ~self._separate[bodies[:, 0], bodies[:, 1]]
         if not close.any():
             return []
         pairs = {(min(a, b), max(a, b)) for a, b in ((self._names[i], self._names[k]) for i, k in bodies[close])}

@@ -283,12 +283,12 @@ class Recording:
         return [self._of(columns) for columns in groups.values()]
 
     def without(self, joints: Collection[str]) -> Recording:
-        """The recording of all joints but these; itself where it tells of none of them."""
-        left = [k for k, j in enumerate(self.joints) if j not in joints]
-        return self if len(left) == len(self.joints) else self._of(left)
+        """Return the recording of all joints but these; itself where it tells of none of them."""
+        remaining = [k for k, j in enumerate(self.joints) if j not in joints]
+        return self if len(remaining) == len(self.joints) else self._of(remaining)
 
     def with_followers(self, joints: Sequence[str], angles: np.ndarray) -> Recording:
-        """The recording with joints that nothing commands: their angles [T, S] rad at the times of the positions."""
+        """Return the recording with undriven joints: their angles [T, S] rad at the times of the positions."""
         if not joints:
             return self
         more = lambda s, x: None if s is None else replace(s, value=np.concatenate([s.value, x], 1))  # noqa: E731

@@ -77,7 +77,7 @@ class Writer:
         self._open = True
 
     def add_about(self, name: str, values: Mapping[str, str]) -> None:
-        """Text by key as a further record of metadata, of that name."""
+        """Add text by key as a further record of metadata, of that name."""
         self._mcap.add_metadata(name, dict(values))
 
     def add_command(self, t: float, position: np.ndarray, stamp: float | None = None) -> None:

@@ -142,7 +142,7 @@ def training(rows: Mapping[str, Sequence[float]]) -> str:
 
 
 def _line(values: Sequence[float]) -> str:
-    """A curve as SVG, its whole range high."""
+    """Return a curve as SVG, its whole range high."""
     y = np.nan_to_num(np.asarray(values, float))
     y = y[:: max(1, len(y) // 120)]
     low, high = float(y.min()), float(y.max())

@@ -135,7 +135,7 @@ class Run:
                 print(f"{json.dumps(self.said())}  {rate:.1f} cases/s", flush=True)
 
     def said(self) -> dict[str, int]:
-        """Cases by outcome, and the seed that is next."""
+        """Return cases by outcome, and the seed that is next."""
         return {"cases": sum(self.counts.values()), **{k: self.counts[k] for k in OUTCOMES}, "next": self.next}
 
     def _start(self, first: int, last: int) -> None:
@@ -176,7 +176,7 @@ class Run:
 
 
 def source_seed() -> int:
-    """A seed below 10^9 from the text of every module of dexsim and of these tests."""
+    """Return a seed below 10^9 from the text of every module of dexsim and of these tests."""
     read = hashlib.sha256()
     for folder in ("dexsim", "tests/fuzz"):
         for path in sorted((corpus.ROOT / folder).rglob("*.py")):

@@ -241,7 +241,7 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
 
 
 def _dataset(rng: np.random.Generator, source: Path, folder: Path) -> Path:
-    """A damaged file, or a folder with one."""
+    """Return a damaged file, or a folder with one."""
     path = folder / f"case{''.join(source.suffixes)}"
     if source.is_file():
         path.write_bytes(bytes_(source.read_bytes(), rng, [source.read_bytes()]))
@@ -257,7 +257,7 @@ def _dataset(rng: np.random.Generator, source: Path, folder: Path) -> Path:
 
 
 def _network(rng: np.random.Generator, source: Path, folder: Path) -> Path:
-    """A bundle whose network is damaged, and its digest that of the damaged one."""
+    """Return a bundle whose network is damaged, and its digest that of the damaged one."""
     case = folder / "case"
     case.mkdir()
     for name in ("golden.npz", "config.yaml"):

@@ -209,7 +209,7 @@ def dataset(path: Path) -> str:
 
 
 def network(path: Path) -> str:
-    """A bundle's network."""
+    """Return a bundle's network."""
     bundle.load(path)
     return ""
 
