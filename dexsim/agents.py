@@ -39,7 +39,7 @@ class PPO:
     """Learn from every symmetric situation too, as `agent=ppo_symmetric`."""
 
     def settings(self) -> list[str]:
-        """As on the command line."""
+        """Return the settings as the command line has them."""
         out = ["agent=ppo_lstm"] if self.recurrent else ["agent=ppo_symmetric"] if self.symmetric else []
         both = {
             "rnn_type": self.recurrent, "rnn_hidden_dim": self.rnn_hidden_dim,
@@ -72,7 +72,7 @@ class Distillation:
     gradient_length: int | None = None
 
     def settings(self) -> list[str]:
-        """As on the command line."""
+        """Return the settings as the command line has them."""
         sizes = None if self.hidden_dims is None else f"[{','.join(map(str, self.hidden_dims))}]"
         own = {
             "teacher.checkpoint": f"'{self.teacher}'", "student.hidden_dims": sizes, "num_steps_per_env": self.steps,

@@ -548,7 +548,7 @@ class OneOfTwo:
         return self.bus.problem()
 
     def released(self) -> tuple[bool, str] | None:
-        """Whether this hand is limp since it was let go, and by what that is known; None while it is not."""
+        """Return whether this hand is limp since it was let go, and by what that is known; None while it is not."""
         proof = self.bus.released()
         return proof if proof is not None and (self.name in proof[1] or not proof[0]) else None
 

@@ -133,7 +133,7 @@ def lay(hand: Hand, requested: str) -> dict[str, tuple[str, Pad]]:
             out[key] = body, pad
     total = sum(len(pad.point) for _, pad in out.values())
     if total > MOST:
-        raise UserError(f"skin={asked}: {total} taxels, at most {MOST} on a hand; ask for fewer or a wider spacing")
+        raise UserError(f"skin={requested}: {total} taxels, at most {MOST} on a hand; ask for fewer or a wider spacing")
     return out
 
 
@@ -275,7 +275,7 @@ def directions(hand: Hand, body: str) -> tuple[np.ndarray, np.ndarray]:
 def write_pads(hand: Hand, folder: Path, requested: str, say: Callable[[str], None]) -> list[dict[str, str]]:
     """Write the pads that are asked for, skin_*.csv, and return their entries in hand.yaml. Raises UserError."""
     if not hand.touches:
-        raise UserError(f"skin={asked}: needs pads on the fingertips, and hand {hand.name} has none (pads=8x6)")
+        raise UserError(f"skin={requested}: needs pads on the fingertips, and hand {hand.name} has none (pads=8x6)")
     kind, out = hand.pads[hand.others[0]].kind, []
     for name, (body, pad) in lay(hand, requested).items():
         out.append({"name": name, "body": body, "taxels": f"skin_{name}.csv", "kind": kind})
