@@ -34,6 +34,8 @@ CLAUSES = {"what", "whether", "of", "how", "where", "which", "who", "that", "as"
 """First words that make a clause of a docstring where a verb is meant."""
 PRIVATE = {"told", "left", "kept", "felt", "earned", "shown", "apart", "asked", "borne", "astray"}
 """Names that this project used with several meanings of its own."""
+LABELS = {"property", "cached_property", "fixture", "setter", *"observe reward done command event metric".split()}
+"""Decorators of methods whose docstring names a thing."""
 VERBS = set(
     """
     abort accept accumulate act add adjust advance aggregate aim align allocate allow answer append apply arrange
@@ -101,13 +103,15 @@ def words(sentence: str) -> int:
 
 
 def functions(path: Path) -> Iterator[tuple[ast.FunctionDef, str]]:
-    """Yield the functions of a file that have a docstring, with its first word in lower case."""
+    """Yield the functions of a file that have a docstring, with its first word in lower case. Left out are properties,
+    and a task's declared terms, whose docstring is the text of a table's row."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if not isinstance(node, ast.FunctionDef) or node.name.startswith("test_"):
             continue
-        decorators = {getattr(d, "id", getattr(d, "attr", "")) for d in node.decorator_list}
+        marks = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+        decorators = {getattr(d, "id", getattr(d, "attr", "")) for d in marks}
         first = re.match(r"\W*(\w+)", ast.get_docstring(node) or "")
-        if first and not decorators & {"property", "cached_property", "fixture", "setter"}:
+        if first and not decorators & LABELS:
             yield node, first[1].lower()
 
 

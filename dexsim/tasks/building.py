@@ -53,10 +53,10 @@ UNIT_PALM = 0.025
 
 
 def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[ContactPair, ...]:
-    """Contact pairs of the hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object (F .. 2F-1),
-    palm on object (2F), distal link on the hand itself (2F+1 .. 3F); of links with skin, on the object and on the hand
-    itself; then fingertips and those links on each of the bodies `parts`. A fingertip of several geoms counts as its
-    whole distal link. root: the hand's root body."""
+    """Return contact pairs of hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object
+    (F .. 2F-1), palm on object (2F), distal link on the hand itself (2F+1 .. 3F); of links with skin, on the object
+    and on the hand itself; then fingertips and those links on each of the bodies `parts`. A fingertip of several
+    geoms counts as its whole distal link. root: the hand's root body."""
     obj, own = ("body", OBJECT), ("subtree", root)
     tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
     felt = dict(pad_pairs(hand))
@@ -89,7 +89,9 @@ def self_pairs(hand: Hand) -> list[str]:
 
 
 def hand_of(cfg: dict) -> Hand:
-    """The hand of a resolved config; the xHand for checkpoints from before there was a choice. Raises UserError."""
+    """Return the hand of a resolved config; the xHand for checkpoints from before there was a choice.
+
+    Raises UserError."""
     return load_hand(cfg.get("hand") or "xhand", cfg.get("hand_mirror", False), cfg.get("hand_scale", 1.0))
 
 
@@ -233,7 +235,7 @@ class Built(VecEnv):
         self._buffers()
 
     def hand_notes(self) -> list[str]:
-        """What a reader of the first screen must know of the hand."""
+        """Return what a reader of the first screen must know of the hand."""
         guessed = self.hand.file.guessed
         return [
             *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
@@ -245,7 +247,7 @@ class Built(VecEnv):
         return self.joints
 
     def action_rows(self) -> list[tuple[str, float, float, str]]:
-        """(joint, lowest, highest, what) of the targets, for the first screen."""
+        """Return (joint, lowest, highest, what) of the targets, for the first screen."""
         what, base = f"rad ({self.task['action']['mode']})", len(self.hand.joints)
         low, high = self.q_low.tolist(), self.q_high.tolist()
         return [(j, low[k], high[k], what if k < base or k >= base + 3 else what.replace("rad", "m"))
@@ -257,7 +259,7 @@ class Built(VecEnv):
         return int(self.engine.mjm.jnt_qposadr[self.engine.joint(joint)])
 
     def v_of(self, joint: str) -> int:
-        """The same in qvel."""
+        """Return the same in qvel."""
         return int(self.engine.mjm.jnt_dofadr[self.engine.joint(joint)])
 
     def _index(self) -> None:
@@ -336,7 +338,7 @@ class Built(VecEnv):
         self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
 
     def drawn_model(self, world: int) -> mujoco.MjModel:
-        """A model of one world as it is now, with the shells and skins, to render its qpos; reads from the device."""
+        """Return a model of one world as it is now, with shells and skins, to render its qpos; reads the device."""
         drawn = self._drawn = self._drawn or self.drawn_spec.compile()
         model = copy.copy(drawn)
         for slot in self.objects.scene.slots if self.scene.object is not None else ():
@@ -349,7 +351,7 @@ class Built(VecEnv):
         return model
 
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
-        """A picture [H, W, 3] uint8 of one world as it is now, without a display; size: width, height. Raises
+        """Return a picture [H, W, 3] uint8 of one world as it is now, without a display; size: width, height. Raises
         UserError where no OpenGL opens."""
         from dexsim.view.frames import Frames
 
@@ -394,7 +396,7 @@ def _periods(sim: dict, task: dict) -> tuple[int, float]:
 
 
 def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
-    """The hand's model, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
+    """Return the hand's model, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
 
     Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the
     hand."""
@@ -414,7 +416,7 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
 
 
 def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str, several: bool) -> None:
-    """several: contacts of two hulls may be, or what lies on a table would rock."""
+    """Allow several contacts of two hulls, or what lies on a table would rock."""
     o = spec.option
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

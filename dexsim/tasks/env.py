@@ -69,7 +69,7 @@ class HandEnv(Kept):
 
     @classmethod
     def declared(cls) -> dict[str, Any]:
-        """Settings of declared terms, by part of the task's settings; see `dexsim.tasks.Task`."""
+        """Return settings of declared terms, by part of the task's settings; see `dexsim.tasks.Task`."""
         return {}
 
     @classmethod
@@ -137,7 +137,7 @@ class HandEnv(Kept):
         return None
 
     def symmetries(self) -> Sequence[Mapping[str, Callable[[torch.Tensor], torch.Tensor]]]:
-        """Situations that are as likely and end alike, beside the present one: for each, by name of a row of the
+        """Return situations that are as likely and end alike, beside the present one: for each, by name of a row of the
         observation, or "action", what makes its value [N, D] there of the present one; rows without stay as they are.
         `agent=ppo_symmetric` learns from them too."""
         return ()
@@ -307,9 +307,9 @@ class HandEnv(Kept):
             self.servo.send(self.target, arrives, self.engine.t.time + late)
 
     def lead(self) -> torch.Tensor:
-        """How far targets may run ahead of the measured angles [J] rad: what the task says, or, where that is null, to
-        where the drive's torque reaches its limit. A target that is farther away pushes no harder in simulation; on a
-        hand that is stiffer than its model it does, and unwinding it takes time everywhere."""
+        """Return how far targets may run ahead of the measured angles [J] rad: what the task says, or, where that is
+        null, to where the drive's torque reaches its limit. A target that is farther away pushes no harder in
+        simulation; on a hand that is stiffer than its model it does, and unwinding it takes time everywhere."""
         said, J = self.task["action"].get("lead", 0.0), len(self.hand.joints)
         if said is not None:
             return torch.full((J,), float(said), device=self.device)

@@ -23,7 +23,7 @@ class Episodes(Built):
         raise NotImplementedError
 
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
-        """Observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
+        """Return observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
         raise NotImplementedError
 
     def reset_all(self) -> None:
@@ -45,7 +45,8 @@ class Episodes(Built):
 
     @contextmanager
     def _drawn_ahead(self, name: str) -> Iterator[None]:
-        """On a GPU, all random numbers of a part of the step at once; evaluation draws as ever, whatever the device."""
+        """Draw all random numbers of a part of the step at once on a GPU; evaluation draws as ever, whatever the
+        device."""
         with self.sampler.drawn_ahead(name) if self.graphs and self.draws_ahead else nullcontext():
             yield
 
@@ -92,7 +93,8 @@ class Episodes(Built):
         torch.where(mask[:, None], target, self.target, out=self.target)
 
     def _clear_touch(self, mask: torch.Tensor) -> None:
-        """Where mask [N] holds, nothing is touched: no force, centres at the pads' centres (poses are refreshed)."""
+        """Clear the touch of worlds where mask [N] holds: no force, centres at the pads' centres (poses are
+        refreshed)."""
         touch, state = self.touch, self.engine.wp
         wp.launch(
             state_kernels.clear_touch,
@@ -118,11 +120,11 @@ class Episodes(Built):
             self.reality.read(self)
 
     def followers(self) -> torch.Tensor:
-        """Angles [N, S] rad of the hand's joints without a drive that are measured (`sensed` of its hand.yaml)."""
+        """Return angles [N, S] rad of measured joints without a drive (`sensed` of hand.yaml)."""
         return torch.nan_to_num(self.engine.t.qpos[:, self._sensed_q].float())
 
     def _read_object(self) -> None:
-        """Pose and velocity of an object on a joint; `object_joint` [N] rad or m and `object_speed` [N]."""
+        """Read pose and velocity of an object on a joint; `object_joint` [N] rad or m and `object_speed` [N]."""
         e = self.engine.t
         if self.scene.object is None:
             return
@@ -136,7 +138,7 @@ class Episodes(Built):
         self.object_velocity[:, part : part + 3] = self.object_speed[:, None] * self.object_axis
 
     def _kernels(self) -> None:
-        """What `read_state` and `_clear_touch` launch."""
+        """Choose the kernels that `read_state` and `_clear_touch` launch."""
         e, state = self.engine, self.engine.wp
         self._read = state_kernels.read_kernel(e.real)
         self._read_dim = self.num_envs, self.num_actions + state_kernels.OBJECT_NUMBERS + self.fingers + 1
@@ -171,13 +173,13 @@ class Episodes(Built):
         ]  # fmt: skip
 
     def kernels(self) -> list[wp.Kernel]:
-        """Kernels of a step beside its physics, one of each module at least; a task adds its own."""
+        """Return kernels of a step beside its physics, one of each module at least; a task adds its own."""
         real = self.engine.real
         own = [self._read, state_kernels.act, nan_dump.keep_world]
         write = [] if self.scene.object is None else [object_kernel.write_kernel(real)]
         return [*own, *write, servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
-        """For `compile_side_by_side`, which asks of a launch only which kernel it is of."""
+        """Return the kernels' names, for `compile_side_by_side`."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)

@@ -110,12 +110,12 @@ class GraspEnv(Launches):
         base_path.of((t.get("evaluation") or {}).get("base", "turn"))  # refused now, not after the training
 
     def memory(self) -> dict:
-        """As declared; a picture's age within those that are kept."""
+        """Return the declared memory; a picture's age within those that are stored."""
         return super().memory() | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
 
     # -- an episode begins, and goes on
     def begin(self, mask: torch.Tensor) -> None:
-        """An object falls on the open hand."""
+        """Begin episodes: an object falls on the open hand."""
         self.launch_begin(mask)
         self._command_thumb(mask)
         self.place(mask, self.begun.hand, self.begun.pose, self.begun.velocity)

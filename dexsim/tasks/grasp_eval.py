@@ -516,7 +516,7 @@ def _hold_plot(ax: Axes, r: dict) -> None:
 
 
 def scripted(env: GraspEnv, rate: float, wait: float) -> Callable[[Mapping], torch.Tensor]:
-    """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then
+    """Return a policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then
     close thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd
     of its maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
     if env.task["action"]["mode"] != "relative":

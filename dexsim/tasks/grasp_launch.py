@@ -91,7 +91,7 @@ class Launches(Task):
         self._xfrc = wp.from_torch(self.engine.t.xfrc_applied)
 
     def _shape(self) -> Any:
-        """Forms of rewards and terminations as the settings have them now."""
+        """Return forms of rewards and terminations as the settings have them now."""
         r, end, u = self.task["reward"], self.task["termination"], self.unit
         names = ("force_sigma", "force_low", "force_high", "torque_sigma", "torque_low", "torque_high")
         return filled(
@@ -109,7 +109,7 @@ class Launches(Task):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
     def _draw_orders(self) -> tuple[Any, Any]:
-        """A new command and push for every world, as the kernels take them: how a command is drawn, and what was."""
+        """Draw a new command and push for every world, as the kernels take them."""
         c, s, fixed = self.task["command"], self.sampler, self.fixed_command
         (first, last), low = c["hold_s"], c["low"]
         how = filled(
@@ -128,7 +128,7 @@ class Launches(Task):
         return how, drawn
 
     def launch_begin(self, mask: torch.Tensor) -> None:
-        """Where mask [N] holds: a fall, a command and a push of a new episode, into `begun` and the memory."""
+        """Draw a fall, a command and a push of a new episode where mask [N] holds, into `begun` and the memory."""
         s, o = self.sampler, self.objects
         fall = filled(
             kernels.Fall, joint=s.draw("initial.joint", self.num_actions), object_xy=s.draw("initial.object_xy", 2),
@@ -158,7 +158,7 @@ class Launches(Task):
         self._launch(kernels.sense, (self.num_envs, J + F + 1), advance, noise, self._truth, self._readings)
 
     def launch_rewards(self) -> dict[str, torch.Tensor]:
-        """Terms by name, weighted [N]; what the log shows into `measured`."""
+        """Return terms by name, weighted [N]; write what the log shows into `measured`."""
         w, names = self.task["rewards"], tuple(grasp_rewards.TERMS)
         rows = len(names) + len(grasp_rewards.METRICS) + 1
         out = torch.empty(rows, self.num_envs, device=self.device)

@@ -14,15 +14,15 @@ class Kept(Episodes):
     """Worlds that a run goes on with as if it had not stopped; see `HandEnv`."""
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
-        highest."""
+        """Return the state that a control step leaves to the next, live; a task adds its own. Whole numbers with
+        their lowest and highest."""
         names = ("action", "last_action", "target", "q", "qd", "torque", "object_pose", "object_velocity", "tips")
         out = {name: getattr(self, name) for name in (*names, "nan")}
         out |= {f"obs_{group}": value for group, value in self.obs.items()}
         return out | {"episode_length": (self._episode_length, 0, 2**31), "width": self.sampler.width}
 
     def keep_worlds(self) -> dict[str, torch.Tensor]:
-        """A copy of all worlds: with it, a run goes on as if it had not stopped (`tasks/worlds.py`)."""
+        """Return a copy of all worlds: with it, a run goes on as if it had not stopped (`tasks/worlds.py`)."""
         return worlds.keep(self)
 
     def load_worlds(self, state: dict[str, torch.Tensor]) -> None:
@@ -30,7 +30,7 @@ class Kept(Episodes):
         worlds.put_back(self, state)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """What a resumed run needs beside the worlds: counters and random state."""
+        """Return what a resumed run needs beside the worlds: counters and random state."""
         return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:

@@ -176,7 +176,7 @@ def relabelled(turn: torch.Tensor) -> dict[str, Callable[[torch.Tensor], torch.T
 
 
 def axis_and_turn(goal: Mapping[str, Any], mirror: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Unit vector [3] that goals are turned about, and the turn from one to the next [4]; mirror: of a mirrored hand,
+    """Return the unit vector [3] that goals turn about, and the turn to the next [4]; mirror: of a mirrored hand,
     whose goals are the mirror image of those in the settings."""
     axis = torch.tensor([float(x) for x in goal["axis"]]) * torch.tensor([-1.0, 1.0, -1.0] if mirror else [1.0] * 3)
     axis = axis / axis.norm()
@@ -184,7 +184,7 @@ def axis_and_turn(goal: Mapping[str, Any], mirror: bool) -> tuple[torch.Tensor, 
 
 
 def check(t: Mapping[str, Any]) -> None:
-    """UserError for settings of the task that no rotation can have."""
+    """Raise UserError for settings of the task that no rotation can have."""
     ends, goal, r = t["termination"], t["goal"], t["reward"]
     what = t["observe"].get("last_action", "step")
     if what not in ("target", "step"):
@@ -208,7 +208,7 @@ def check(t: Mapping[str, Any]) -> None:
 
 
 def check_drawn_goals(t: Mapping[str, Any], palms: Sequence[str]) -> None:
-    """UserError for settings of drawn goals, and of where the palm looks, that cannot be."""
+    """Raise UserError for settings of drawn goals, and of where the palm looks, that cannot be."""
     goal, palm, ends = t["goal"], t["palm"], t["termination"]
     if not palm or not set(palm) <= set(palms):
         raise UserError(f"task.palm={palm}: must be a list of {', '.join(palms)}")

@@ -32,7 +32,7 @@ class Held(Task):
     def __init__(
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
-        """grasps: start from these instead of the file `task.initial.poses`."""
+        """Take the held poses; grasps: start from these instead of the file `task.initial.poses`."""
         self.check_objects(cfg["task"])
         if self.needs_taxels(cfg["task"]):
             cfg = {**cfg, "tactile": {**cfg["tactile"], "raw": True}}
@@ -70,7 +70,7 @@ class Held(Task):
             ensure(cfg)
 
     def set_objects(self) -> None:
-        """The held poses that episodes begin with, and how low each object may lie."""
+        """Set the held poses that episodes begin with, and how low each object may lie."""
         t, dev = self.task, self.device
         if self.grasps is None:
             edges = [self.unit * x for x in self.sampler.range("object.size")[:2]]
@@ -94,7 +94,7 @@ class Held(Task):
         return tuple(called(name) for name in self.shape_names)
 
     def judge_kept_out(self, kept_out: bool) -> None:
-        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        """Begin episodes with objects kept out of the training from now on, or with those of it."""
         self.allowed = self.poses_of[kept_out]  # one and the same tensor each time: a recorded step holds on to it
 
     def draw_object(self, mask: torch.Tensor) -> None:
@@ -108,7 +108,7 @@ class Held(Task):
         self.give_object(mask, g.shape[self._pick], g.edge[self._pick][:, None] / 2 / self.box_half)
 
     def begin_held(self, mask: torch.Tensor) -> torch.Tensor:
-        """Where mask holds: hand and object in the pose that `draw_object` has drawn, the targets give or take
+        """Place hand and object, where mask holds, in the pose that `draw_object` has drawn, the targets give or take
         `randomize.initial.target`. Returns the object's pose [N, 7]."""
         g, pick = self.grasps, self._pick
         assert g is not None  # since setup
@@ -202,7 +202,7 @@ class TipMotion(Task):
         return torch.as_tensor(lifted.point, dtype=torch.float32, device=self.device)
 
     def plain_centre(self, point: torch.Tensor) -> torch.Tensor:
-        """Contact centres [N, P, 3] without force weighting: the mean position of the taxels, `taxels()`, that feel
+        """Return contact centres [N, P, 3] without force weighting: the mean position of the taxels that feel
         anything."""
         assert self.touch.raw is not None  # asked for by the task
         on = (self.touch.raw > 0).float()

@@ -157,7 +157,7 @@ TERMS = {"observations", "terminations", "commands", "events"}
 
 
 def terms(cfg: dict[str, Any]) -> dict[str, Any]:
-    """Those parts, as the class of a resolved config's task declares them; empty of a class without terms."""
+    """Return those parts, as the class of a resolved config's task declares them; empty of a class without terms."""
     return task_class(cfg).declared()
 
 

@@ -45,7 +45,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
     # -- setting up
     @classmethod
     def needs_taxels(cls, task: dict) -> bool:
-        """The plain mean does, for one."""
+        """Return whether the task needs taxels; the plain mean does, for one."""
         return not task["observe"]["force_weighted"]
 
     @classmethod
@@ -59,7 +59,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         return {"randomize": randomize, "sensors": {"joint_noise": 0.001}}
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
-        """The rows of the paper's ablation, `observe` and `perception`, as switches of observations."""
+        """Set the rows of the paper's ablation, `observe` and `perception`, as switches of observations."""
         t = self.task
         blind, o = t["perception"] == "proprioception", t["observe"]
         self.history = t["history"] if blind else 1
@@ -80,7 +80,8 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.taxel_point = None if t["observe"]["force_weighted"] else self.taxels()
 
     def symmetries(self) -> list[dict[str, Callable[[torch.Tensor], torch.Tensor]]]:
-        """A cube looks the same from each side: the quarter turns of its own frame about its z."""
+        """Return the symmetries of a cube, which looks the same from each side: the quarter turns of its own frame
+        about its z."""
         if self.names != (CUBE,):
             return []
         turns = [rotation.about(self.up, torch.tensor(k * math.pi / 2, device=self.device)) for k in (1, 2, 3)]
@@ -100,7 +101,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     # -- how it goes and ends
     def end_curriculum(self) -> None:
-        """As the base class; and the cube may go as far as `termination.distance`."""
+        """End the curriculum; the cube may go as far as `termination.distance`."""
         super().end_curriculum()
         self.farthest.fill_(self.unit * self.task["termination"]["distance"])
 
@@ -112,7 +113,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.reached = there & ~self.nan & ~(self.dropped | self.tipped)
 
     def lasts(self, p: torch.Tensor) -> None:
-        """Which episodes go on, by the object's place [N, 3] m: dropped, too low or too far from where it began;
+        """Return which episodes go on, by the object's place [N, 3] m: dropped, too low or too far from where it began;
         tipped, the goal's upper face looks away from the axis."""
         self.dropped = ((p - self.home).norm(dim=1) > self.farthest) | (p[:, 2] < self.lowest[self.objects.variant])
         self.tipped = self._tilt_from_goal() > self.task["termination"]["tilt"]
@@ -283,7 +284,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         return (self.touch.force_clean > 0.05).float().sum(1)
 
     def notes(self) -> list[str]:
-        """The held poses, and when a goal counts."""
+        """Return notes on the held poses, and on when a goal counts."""
         assert self.grasps is not None  # since setup
         edge, r, far = 1000 * self.grasps.edge, self.task["reward"], float(self.farthest)
         what = "cubes" if self.names == (CUBE,) else ", ".join(self.names)

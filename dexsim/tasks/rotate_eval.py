@@ -50,15 +50,15 @@ class Trials:
     """How a rotation is evaluated, for its environment to inherit."""
 
     def trial_facts(self) -> dict[str, torch.Tensor]:
-        """What an evaluation keeps of each trial as it begins, [N] each."""
+        """Return what an evaluation keeps of each trial as it begins, [N] each."""
         return {}
 
     def trial_counts(self) -> dict[str, torch.Tensor]:
-        """What an evaluation counts, step by step, while a trial lasts, bool [N] each."""
+        """Return what an evaluation counts, step by step, while a trial lasts, bool [N] each."""
         return {}
 
     def of_trials(self, r: dict) -> dict:
-        """Further metrics of an evaluation, from the arrays [E] of its trials."""
+        """Return further metrics of an evaluation, from the arrays [E] of its trials."""
         return {}
 
     def evaluate(self, policy: Policy, episodes: int = 256, seed: int = 0, progress: Progress | None = None) -> dict:

@@ -73,16 +73,16 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     @classmethod
     def another_world(cls, u: Any, friction: float, size: float) -> dict[str, Any]:
-        """None: its camera is no IMU."""
+        """Return None: its camera is no IMU."""
         return {}
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
-        """As the base class; without a pose where `observe.orientation` is none."""
+        """Adapt the settings; without a pose where `observe.orientation` is none."""
         posed = {"actor": self.task["observe"]["orientation"] != "none"}
         return {**super().adapt(), "object_position": posed, "pose_age": posed}
 
     def set_objects(self) -> None:
-        """Cubes that fingertips hold."""
+        """Set cubes that fingertips hold."""
         if self.grasps is None and self.task["initial"]["poses"] is None:
             edges, hand = [self.unit * x for x in self.sampler.range("object.size")[:2]], self.hand
             if hand.name != "xhand":
@@ -118,7 +118,8 @@ class FingertipEnv(TipTrials, RotateEnv):
         self.reach_rad = math.radians(t["goal"]["reach"]) + 1e-3
 
     def symmetries(self) -> list:
-        """None: its goals are turns about the palm's axes from how the cube was held, drawn for one frame of it."""
+        """Return none: its goals are turns about the palm's axes from how the cube was held, drawn for one frame of
+        it."""
         return []
 
     # -- an episode begins
@@ -199,7 +200,7 @@ class FingertipEnv(TipTrials, RotateEnv):
         super().update()
 
     def lasts(self, p: torch.Tensor) -> None:
-        """Which episodes go on: dropped, too far from where it began; tipped, leaned against for too long."""
+        """Return which episodes go on: dropped, too far from where it began; tipped, leaned against for too long."""
         limit = self.task["termination"]
         self.dropped = (p - self.home).norm(dim=1) > limit["distance"]
         self.tipped = self.leaning > limit["lean_s"]
@@ -226,7 +227,7 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     # -- what is seen
     def sense_object(self, fresh: torch.Tensor) -> None:
-        """The camera in place of the IMU: a pose, late, noisy, off by a constant; while hidden, the last one stays."""
+        """Sense by a camera in place of the IMU: a pose, late, noisy, off by a constant; hidden, the last stays."""
         sense, s = self.task["sensors"], self.sampler
         off = rotation.from_vector(self.camera_tilt + sense["camera_rotation"] * s.normal(3))
         now = torch.cat([
@@ -290,7 +291,7 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     # -- what the log and an evaluation show
     def notes(self) -> list[str]:
-        """Palm and goals beside those of the base class."""
+        """Note palm and goals beside those of the base class."""
         t = self.task
         return [*super().notes(),
                 f"palm {', '.join(t['palm'])}; goals within {t['goal']['reach']} degrees of the start"]  # fmt: skip

@@ -178,7 +178,7 @@ class Task(HandEnv):
         return {}
 
     def _complete(self) -> None:
-        """Every term has its settings: a checkpoint may be older than a term, and a task's file need not list them."""
+        """Complete the settings of terms: a checkpoint may be older than a term, a task's file need not list them."""
         t, follow = self.task, self.adapt()
         if not (isinstance(self.history, int) and 1 <= self.history <= 64):
             raise UserError(f"task.history={self.history}: must be a whole number in [1, 64]")
@@ -190,7 +190,7 @@ class Task(HandEnv):
             t[part] = Watched(usual, f"task.{part}", t.read)
 
     def _named(self, value: Any) -> Any:
-        """A value, or the one of the setting of the task that it names."""
+        """Return a value, or the one of the setting of the task that it names."""
         if not isinstance(value, str):
             return value
         node: Any = self.task
@@ -247,7 +247,7 @@ class Task(HandEnv):
         self.draw_from(self.held_rows) if kept_out else self.draw_from(self.train_rows, self.emphasis)
 
     def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
-        """Objects of new episodes are drawn from these rows of the scene's table [R]: every shape equally often, or by
+        """Draw objects of new episodes from these rows of the scene's table [R]: every shape equally often, or by
         its emphasis (one number a row of the table)."""
         weight = self._odds[rows] if emphasis is None else (self._odds * emphasis)[rows]
         self._rows, self._chances = rows, (weight / weight.sum()).cumsum(0)
@@ -420,7 +420,7 @@ class Task(HandEnv):
         self._left[name].copy_(torch.where(mask, held, self._left[name]))
 
     def before_physics(self) -> None:
-        """Ranges widen; commands that are held long enough change; events that are due happen."""
+        """Widen ranges, change commands that are held long enough, and let events happen that are due."""
         c = self.task.get("curriculum") or {"steps": 0}
         if c["steps"]:
             self.learned += 1
@@ -651,7 +651,7 @@ def _columns(value: torch.Tensor, n: int, what: str) -> torch.Tensor:
 
 
 def _terms_settings(terms: Mapping[str, list[Term]]) -> dict[str, dict[str, Any]]:
-    """The settings of terms as their decorators have them."""
+    """Return the settings of terms as their decorators have them."""
     return {
         "observations": {t.name: _observation(t) for t in terms["observe"]},
         "terminations": {t.name: True for t in terms["done"]},
@@ -678,7 +678,7 @@ def _only(term: Term) -> dict[str, bool]:
 
 
 def _word(value: Any) -> str:
-    """A value as it is typed."""
+    """Return a value as it is typed."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
