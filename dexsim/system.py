@@ -52,6 +52,11 @@ def terminal_gone(number: int) -> bool:
     return number in (getattr(signal, "SIGHUP", None), getattr(signal, "SIGBREAK", None))
 
 
+def parent() -> int:
+    """Return the process that began this one; another once that has ended."""
+    return os.getppid()
+
+
 def lives(pid: int) -> bool:
     """Return whether there is a process of this number on this machine."""
     if sys.platform == "win32":  # os.kill(pid, 0) is Ctrl-C there

@@ -568,8 +568,9 @@ MODELS = {
     "pipe included by an included one": ("<asset>", '<include file="more.xml"/><asset>', "names a pipe"),
     "copies": (WORLD, COPIES, "takes more than"),
     "copies that no parser of ours sees": (WORLD, "<!-- \x01 -->" + COPIES, "takes more than|is not XML"),
-    "heights": ("<asset>", '<asset><hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/>', "more than 1 GiB"),
-    "figures of users": ("<asset>", '<size nuser_body="1000000000"/><asset>', "more than 1 GiB"),
+    "heights": ("<asset>", '<asset><hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/>',
+                r"more than 1(\.01)? GiB"),  # fmt: skip
+    "figures of users": ("<asset>", '<size nuser_body="1000000000"/><asset>', r"more than 1(\.01)? GiB"),
 }
 
 

@@ -35,6 +35,7 @@ EXTRAS = {
     "cluster": ("submitit", "on=slurm, on=dask"),
     "hub": ("huggingface_hub", "checkpoint=hub:..."),
     "wandb": ("wandb", "agent.logger=wandb"),
+    "hands": ("robot_descriptions", "hand=menagerie:NAME, hand=robot_descriptions:NAME"),
 }
 SHARED_MIN = 256 << 20
 """Bytes of /dev/shm that NCCL's channels of eight GPUs take at most, with room."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 import webbrowser
 from pathlib import Path
 from typing import Any
 
+from dexsim import system
 from dexsim.cli.start import Start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -62,7 +62,7 @@ def run(start: Start, env: Any, policy: Policy) -> int:
 
 def _end_with(process: int, view: Any) -> None:
     """Stop the view once its parent is another process than this."""
-    while os.getppid() == process:
+    while system.parent() == process:
         time.sleep(0.5)
     view.stop()
 
