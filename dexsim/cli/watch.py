@@ -23,7 +23,8 @@ class Watch:
     """The page of one run. cfg: the run's settings; where: its folder. Raises UserError where nothing can be served."""
 
     def __init__(self, cfg: dict[str, Any], where: Path):
-        self._cfg, self._where, self._process = cfg, where, None
+        self._cfg, self._where = cfg, where
+        self._process: subprocess.Popen | None = None
         check_free("127.0.0.1", cfg["view_port"])
 
     def begin(self) -> None:
@@ -37,7 +38,7 @@ class Watch:
                    f"out={self._where / 'view'}", *task]  # fmt: skip
         env = os.environ | {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
         with log.open("w") as out:
-            self._process: subprocess.Popen | None = subprocess.Popen(
+            self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, start_new_session=True
             )
         print(

@@ -73,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
     if argv[0] == "skin":
         from dexsim.import_hand import skin
 
-        return skin.main(argv[1:])
+        return skin.main(list(argv[1:]))
     model, given, said = arguments(argv)
     if "out" not in given:
         raise UserError("say where to write: out=FOLDER, e.g. out=hands/mine")

@@ -228,11 +228,11 @@ def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> 
             if not equality.name2:
                 continue  # a length of its own: the tendon's joints are among those above
             found.append(f"tendon equality ({both})")
-            arms = set(drives.fixed_arms(spec.tendon(equality.name1)))
+            led = set(drives.fixed_arms(spec.tendon(equality.name1)))
             if np.any(np.array(equality.data)[2:5]):
                 closed.append(f"tendon '{equality.name1}' follows '{equality.name2}' by a polynomial")
-            passive |= arms - moved
-            if not arms - moved:
+            passive |= led - moved
+            if not led - moved:
                 closed.append(f"every joint of tendon '{equality.name1}' has an actuator, and follows"
                               f" '{equality.name2}'")  # fmt: skip
         else:

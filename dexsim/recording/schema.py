@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -291,7 +292,10 @@ class Recording:
         """Return the recording with undriven joints: their angles [T, S] rad at the times of the positions."""
         if not joints:
             return self
-        more = lambda s, x: None if s is None else replace(s, value=np.concatenate([s.value, x], 1))  # noqa: E731
+
+        def more(series: Any, x: np.ndarray) -> Any:
+            return None if series is None else replace(series, value=np.concatenate([series.value, x], 1))
+
         none = np.full_like(angles, np.nan)
         states, names = self.states, (*self.joints, *joints)
         return replace(

@@ -37,7 +37,7 @@ class Episodes(Built):
             self.begin_episodes(mask)
         self.engine.refresh()
         self._clear_touch(mask)
-        self.episode_length_buf.masked_fill_(mask, 0)
+        self._episode_length.masked_fill_(mask, 0)
         self.action.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask[:, None], 0.0)
         self.read_state()

@@ -69,9 +69,9 @@ class Launches(Task):
         self._orders = filled(
             kernels.Orders, push=self.push_force, **{name: getattr(self, name) for name in names}
         )
-        names = ("first_xy", "z_history", "z_delay", "z_seen", "torque_bias")
+        begun = ("first_xy", "z_history", "z_delay", "z_seen", "torque_bias")
         self._begun = filled(
-            kernels.Begun, **vars(self.begun), **{name: getattr(self, name) for name in names}
+            kernels.Begun, **vars(self.begun), **{name: getattr(self, name) for name in begun}
         )
         low, high = (round(x / self.dt) for x in t["sensors"]["vision_delay"])
         self._place = filled(

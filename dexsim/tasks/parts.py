@@ -201,11 +201,16 @@ class TipMotion(Task):
         lifted = layout.lifted(tip_skins(self.hand)) if self.touch.cfg.lift and self.pads else layout
         return torch.as_tensor(lifted.point, dtype=torch.float32, device=self.device)
 
+    @property
+    def raw_taxels(self) -> torch.Tensor:
+        """Force on each taxel [N, P, T], N, of a task that needs taxels."""
+        assert self.touch.raw is not None
+        return self.touch.raw
+
     def plain_centre(self, point: torch.Tensor) -> torch.Tensor:
         """Return contact centres [N, P, 3] without force weighting: the mean position of the taxels that feel
         anything."""
-        assert self.touch.raw is not None  # asked for by the task
-        on = (self.touch.raw > 0).float()
+        on = (self.raw_taxels > 0).float()
         count = on.sum(-1, keepdim=True)
         mean = torch.einsum("nft,ftc->nfc", on, point) / count.clamp(min=1)
         return self.of_pads(torch.where(count > 0, mean, self.pad_centre))

@@ -256,12 +256,12 @@ class FingertipEnv(TipTrials, RotateEnv):
         """force-weighted mean of taxel positions, palm frame; of observe.taxels where they are set"""
         if self.clean or self.patches is None:
             return super().contact_centre()
-        return self.of_pads(self.patches.read(self.touch.raw)[1])
+        return self.of_pads(self.patches.read(self.raw_taxels)[1])
 
     @observe("N")
     def contact_force(self) -> torch.Tensor:
         """sum of a pad's normal forces; of observe.taxels where they are set"""
-        return self.touch_force if self.clean or self.patches is None else self.patches.read(self.touch.raw)[0]
+        return self.touch_force if self.clean or self.patches is None else self.patches.read(self.raw_taxels)[0]
 
     @observe("m", only="actor")
     def object_position(self) -> torch.Tensor:

@@ -208,8 +208,8 @@ class Task(HandEnv):
             raise UserError(f"task.curriculum={c}: steps must be 0 (none) or more, start must lie in [0, 1]")
         for name, known in self.choices.items():
             group, _, key = name.rpartition(".")
-            owner = self.task.get(group, {}) if group else self.task  # older checkpoints lack some
-            if (value := owner.get(key, known[0])) not in known:
+            values = self.task.get(group, {}) if group else self.task  # older checkpoints lack some
+            if (value := values.get(key, known[0])) not in known:
                 raise UserError(f"task.{name}={_word(value)}: must be {' or '.join(map(_word, known))}")
 
     def _check_names(self) -> None:

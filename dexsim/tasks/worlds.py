@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
+    from dexsim.tasks.keeping import Kept
 
 Memory = Mapping[str, "torch.Tensor | tuple[torch.Tensor, int, int]"]
 """Live tensors by name; whole numbers with lowest and highest: they index memory, and a file may hold anything."""
@@ -21,7 +21,7 @@ SAME = ("worlds", "task", "sim", "servo", "tactile", "randomize", "model_file", 
 """Settings that must be as they were: other ones hold for new episodes."""
 
 
-def live(env: HandEnv) -> dict[str, tuple[torch.Tensor, int, int]]:
+def live(env: Kept) -> dict[str, tuple[torch.Tensor, int, int]]:
     """(tensor, lowest, highest) of all memory by name; the bounds matter for whole numbers only."""
     out: dict[str, tuple[torch.Tensor, int, int]] = {}
     things = () if env.scene.object is None else (env.objects,)
@@ -35,12 +35,12 @@ def live(env: HandEnv) -> dict[str, tuple[torch.Tensor, int, int]]:
     return out
 
 
-def keep(env: HandEnv) -> dict[str, torch.Tensor]:
+def keep(env: Kept) -> dict[str, torch.Tensor]:
     """A copy of the worlds, on their device, and of the environment's random state."""
     return {name: tensor.clone() for name, (tensor, _, _) in live(env).items()} | {"rng": env.rng.get_state()}
 
 
-def put_back(env: HandEnv, state: Mapping[str, torch.Tensor]) -> None:
+def put_back(env: Kept, state: Mapping[str, torch.Tensor]) -> None:
     """Make the worlds what they were. Raises ValueError, and changes nothing, where the state is not of this
     environment or holds a whole number that cannot be."""
     own = live(env)
@@ -64,14 +64,14 @@ def put_back(env: HandEnv, state: Mapping[str, torch.Tensor]) -> None:
     env.rng.set_state(rng)
 
 
-def of_another_version(env: HandEnv, state: Mapping[str, torch.Tensor]) -> bool:
+def of_another_version(env: Kept, state: Mapping[str, torch.Tensor]) -> bool:
     """Tell whether a state is of a task that had other memory, as an earlier dexsim wrote it: it has names that this
     one has not, and lacks some."""
     own = {*live(env), "rng"}
     return bool(set(state) - own) and bool(own - set(state))
 
 
-def size(env: HandEnv) -> int:
+def size(env: Kept) -> int:
     """Bytes of all worlds."""
     return sum(tensor.numel() * tensor.element_size() for tensor, _, _ in live(env).values())
 
