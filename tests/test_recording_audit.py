@@ -331,8 +331,9 @@ def test_touch_without_commands_is_no_error(tmp_path, capsys):
 def test_without_commands_diagnosis_and_replay_say_what_to_log(tmp_path):
     made = recordings.signal(6.0, joints=("knuckle",))
     made.commands = Series.empty(COMMANDS, 1)
-    for use, error in ((lambda: inputs.to_run(made, SimpleNamespace(joints=("knuckle",)), []), inputs.Unusable),
-                       (lambda: mechanism.replay(made, SimpleNamespace(joints=("knuckle",))), UserError)):  # fmt: skip
+    model = SimpleNamespace(joints=("knuckle",), hand=None)
+    for use, error in ((lambda: inputs.to_run(made, model, []), inputs.Unusable),
+                       (lambda: mechanism.replay(made, model), UserError)):  # fmt: skip
         with pytest.raises(error, match=r"\(in a CSV: a column command\.JOINT\)"):
             use()
 

@@ -51,7 +51,7 @@ def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
 
 
 def test_wrong_table_and_row_are_one_line():
-    with pytest.raises(UserError, match="table=walk: must be rotation, grasp, fingertips"):
+    with pytest.raises(UserError, match="table=walk: must be rotation, grasp, skin, fingertips"):
         rows.main(["table=walk"])
     with pytest.raises(UserError, match="rows=nothing: must be of both, force, torque"):
         rows.main(["table=grasp", "rows=nothing"])

@@ -184,6 +184,7 @@ def signed(hand, geom: str, points: np.ndarray, corners: np.ndarray, box: bool) 
     return distance_of("box" if box else "capsule", np.asarray(g.size), q)
 
 
+@pytest.mark.slow
 def test_two_thousand_taxels_feel(tmp_path):
     made_hand(tmp_path)
     done = skin.add(tmp_path, "palm:1400/4,links:150")

@@ -123,6 +123,9 @@ def lay(hand: Hand, requested: str) -> dict[str, tuple[str, Pad]]:
                     + (f"; did you mean {near[0]}?" if near else "")
                 )
             todo.append((name, wish))
+    few = f"skin={requested}: {{}} taxels, at most {MOST} on a hand; ask for fewer or a wider spacing"
+    if (total := sum(wish.count or 0 for _, wish in todo)) > MOST:
+        raise UserError(few.format(total))
     for name, wish in todo:
         body = known[name]
         pads = _lay_link(hand, every, body, wish, f"skin={wish.link}")
@@ -133,7 +136,7 @@ def lay(hand: Hand, requested: str) -> dict[str, tuple[str, Pad]]:
             out[key] = body, pad
     total = sum(len(pad.point) for _, pad in out.values())
     if total > MOST:
-        raise UserError(f"skin={requested}: {total} taxels, at most {MOST} on a hand; ask for fewer or a wider spacing")
+        raise UserError(few.format(total))
     return out
 
 
