@@ -21,8 +21,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.options import options
 from dexsim import export, intervals
 from dexsim.calibration.file import Calibration
+from dexsim.console.ending import guard
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import Clock, VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
@@ -83,7 +85,7 @@ def episode(
 
 def main(argv: list[str]) -> int:
     """Prints a line a way, and writes all episodes."""
-    given = DEFAULTS | dict(a.split("=", 1) for a in argv)
+    given = options(argv, DEFAULTS)
     torch.set_num_threads(1)
     n, first = int(given["episodes"]), int(given["seed"])
     with tempfile.TemporaryDirectory() as folder:
@@ -108,4 +110,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))
