@@ -498,7 +498,7 @@ class VendorXHands(BusDriver):
     _parts_lock = threading.RLock()
 
     def part(self, k: int, command: HandCommand | None) -> None:
-        """Return what hand k is told: None lets go of it; nothing that was sent before drives it again."""
+        """Send hand k its command: None lets go of it; nothing that was sent before drives it again."""
         with self._parts_lock:
             self._parts[k] = command
             driven = next((c for c in self._parts if c is not None), None)

@@ -416,7 +416,7 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
 
 
 def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str, several: bool) -> None:
-    """Allow several contacts of two hulls, or what lies on a table would rock."""
+    """Set the solver's options; several: two hulls may have several contacts, or what lies on a table would rock."""
     o = spec.option
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

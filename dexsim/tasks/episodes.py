@@ -180,6 +180,6 @@ class Episodes(Built):
         return [*own, *write, servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
-        """Return the kernels' names, for `compile_side_by_side`."""
+        """Launch each kernel once, for `compile_side_by_side`, which only notes what is launched."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)

@@ -59,7 +59,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         return {"randomize": randomize, "sensors": {"joint_noise": 0.001}}
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
-        """Set the rows of the paper's ablation, `observe` and `perception`, as switches of observations."""
+        """Return the rows of the paper's ablation, `observe` and `perception`, as switches of observations."""
         t = self.task
         blind, o = t["perception"] == "proprioception", t["observe"]
         self.history = t["history"] if blind else 1
@@ -113,7 +113,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.reached = there & ~self.nan & ~(self.dropped | self.tipped)
 
     def lasts(self, p: torch.Tensor) -> None:
-        """Return which episodes go on, by the object's place [N, 3] m: dropped, too low or too far from where it began;
+        """Judge which episodes go on, by the object's place [N, 3] m: dropped, too low or too far from where it began;
         tipped, the goal's upper face looks away from the axis."""
         self.dropped = ((p - self.home).norm(dim=1) > self.farthest) | (p[:, 2] < self.lowest[self.objects.variant])
         self.tipped = self._tilt_from_goal() > self.task["termination"]["tilt"]

@@ -77,7 +77,7 @@ class FingertipEnv(TipTrials, RotateEnv):
         return {}
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
-        """Adapt the settings; without a pose where `observe.orientation` is none."""
+        """Return the switches of the base class; without a pose where `observe.orientation` is none."""
         posed = {"actor": self.task["observe"]["orientation"] != "none"}
         return {**super().adapt(), "object_position": posed, "pose_age": posed}
 
@@ -200,7 +200,7 @@ class FingertipEnv(TipTrials, RotateEnv):
         super().update()
 
     def lasts(self, p: torch.Tensor) -> None:
-        """Return which episodes go on: dropped, too far from where it began; tipped, leaned against for too long."""
+        """Judge which episodes go on: dropped, too far from where it began; tipped, leaned against for too long."""
         limit = self.task["termination"]
         self.dropped = (p - self.home).norm(dim=1) > limit["distance"]
         self.tipped = self.leaning > limit["lean_s"]
@@ -291,7 +291,7 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     # -- what the log and an evaluation show
     def notes(self) -> list[str]:
-        """Note palm and goals beside those of the base class."""
+        """Return notes on palm and goals, beside those of the base class."""
         t = self.task
         return [*super().notes(),
                 f"palm {', '.join(t['palm'])}; goals within {t['goal']['reach']} degrees of the start"]  # fmt: skip
