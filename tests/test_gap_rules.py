@@ -6,21 +6,15 @@ from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pytest
-import test_gap_rules_belief
-import test_gap_rules_signal
-import test_gap_rules_torque
-import test_gap_rules_touch
 from test_gap_least import Judged, judged
 
-from dexsim.gap import diagnosis as diagnosing
-from dexsim.gap import locate, rules
+from dexsim.gap import locate
 from dexsim.gap.compute import Deadline, TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
-from dexsim.gap.effects.catalogue import EFFECTS, inseparable
+from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.judge import conclude, confidence, handed_on, held_out, joint_answer
 from dexsim.gap.judge.joint_answer import JointAnswer, stretched
@@ -60,27 +54,6 @@ def trial(loss, members=()):
     return SimpleNamespace(loss=np.broadcast_to(np.asarray(loss, float), (40,)), members=members, ids=("lag",))
 
 
-def test_every_rule_says_what_it_is_and_its_test_exists():
-    for name, value, means, source, test in rules.described():
-        assert value > 0 and len(means) > 10 and source, name
-        assert "judgement" not in source, f"{name}: say what speaks for its value, or take out what reads it"
-        assert callable(TESTS[test]), name
-
-
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-@pytest.mark.parametrize("name", [name for name, *_ in rules.described()])
-def test_a_rule_that_is_moved_fails_its_test(name, factor):
-    test = {n: t for n, *_, t in rules.described()}[name]
-    room, _, rule = name.partition(".")
-    value = getattr(getattr(rules.RULES, room), rule)
-    try:
-        object.__setattr__(getattr(rules.RULES, room), rule, rules.moved(name, factor))
-        with pytest.raises(AssertionError):
-            TESTS[test]()
-    finally:
-        object.__setattr__(getattr(rules.RULES, room), rule, value)
-
-
 def test_an_effect_must_remove_a_least_share():
     search, old = Made(), trial(10.0)
     assert not search._earns(trial(9.0), old) and search._earns(trial(8.6), old)
@@ -92,54 +65,6 @@ def test_what_can_imitate_another_effect_must_do_better():
     price = lambda variant: complexity_price(SimpleNamespace(members=[SimpleNamespace(variant=variant)]))  # noqa: E731
     for better, chosen in ((0.05, False), (0.10, True)):
         assert ((1 - better) * price(other) < price(one)) is chosen, better
-
-
-def test_an_effect_must_help_in_nearly_all_bootstraps():
-    search, old = Made(), trial(10.0, ("another",))
-    search.none_loss = old.loss
-    for useless, earns in ((0.02, True), (0.045, False)):  # share of the draws in which it is of no use
-        search._boot = lambda x, useless=useless: np.sort(np.linspace(0, 1, 1000)) - useless
-        assert search._earns(trial(8.0), old) is earns, useless
-
-
-def test_a_further_effect_must_matter_beside_the_first():
-    search, old, new = Made(), trial(1.0, ("another",)), trial(0.5)
-    search.none_loss = np.full(40, 100.0)
-    assert search._earns(new, old)
-    search.none_loss = np.full(40, 900.0)
-    assert not search._earns(new, old)
-
-
-def test_far_from_the_noise_whole_recordings_decide():
-    search = Made()
-    search.fold_by, search.deadline, search._boot = "conditions", Deadline(), lambda x: np.full(100, -1.0)
-    errors = {"old": np.array([10.0, 10.0, 10.0])}
-    search._free_left = lambda t: errors["old" if t.members else "new"]
-    for left, new, earns in (
-        (120.0, (9.0, 9.0, 9.0), True),
-        (80.0, (9.0, 9.0, 9.0), False),  # windows are to be trusted
-        (120.0, (9.5, 9.5, 9.5), False),  # less than a least share of the squared error
-        (120.0, (4.0, 10.1, 10.1), False),  # in one condition only
-    ):
-        errors["new"], old = np.array(new), trial(2 * left, ("another",))
-        search.none_loss = old.loss
-        assert search._earns(trial(left), old) is earns, (left, new)
-    errors["new"] = np.array([9.0, 9.0, 9.0])
-    assert not search._earns(trial(120.0), trial(240.0))  # of a first effect windows decide
-    assert not search._earns(trial(120.0), trial(125.0, ("another",)))  # no better where it was fitted
-
-
-def test_a_size_at_its_bound_must_do_far_better_than_another():
-    search = Made()
-    search.case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0}))
-    p = param("scale", "position_scale", "set", 0.7, 1.4, 1.0)
-    member = Member(EFFECTS["position_scale"], Variant((p,), ((1.1,),)))
-    for x, loss, wins in ((0.7, 13.0, False), (0.7, 20.0, True), (0.8, 13.0, True)):
-        there = trial(10.0, (member,))
-        there.fit = SimpleNamespace(x=np.array([x]))
-        other = trial(loss, (member,))
-        other.fit = SimpleNamespace(x=np.array([0.9]))
-        assert (search._score(there) < search._score(other)) is wins, (x, loss)
 
 
 def row(share, price, effect="lag"):
@@ -157,14 +82,6 @@ def test_every_kind_of_a_dead_zone_is_tried():
     scan = [row(0.9, 0.0), *(row(0.8 - 0.1 * k, 0.0, "deadband") for k in range(3)), row(0.2, 0.0)]
     ids = [x[2].id for x in Made()._shortlist(scan, 2, 20.0, ())]
     assert ids == ["lag", "deadband", "deadband", "deadband"] + ["lag"] * (EFFECTS["lag"].kinds - 1)
-
-
-def test_within_the_noise_nothing_is_looked_for_nearby():
-    search = Made()
-    assert (
-        search._restarted([], SimpleNamespace(loss=1.3)) == "restarted"
-        and search._restarted([], SimpleNamespace(loss=1.1)) != "restarted"
-    )
 
 
 def test_intervals_hold_the_laws_that_do_as_well():
@@ -239,13 +156,6 @@ class Selecting(Made):
     _overtaken = _pair = lambda *_: None
     _price_factor = lambda self, trial: 1.0  # noqa: E731
     plain = lambda self: None  # noqa: E731
-
-
-def test_a_joint_has_at_most_so_many_effects():
-    offered = [(e, 0.0) for e in ("lag", "supply_sag", "thermal", "backlash", "payload", "deadband")]
-    search = Selecting(lambda ids: (1e6 * 0.5 ** len(ids),) * 2, *offered)
-    search._shortlist = lambda scan, *_: scan
-    assert len(search.run().best.ids) == 4
 
 
 @pytest.mark.parametrize("alone, found", [(2.0, ("deadband",)), (49.0, ("lag",))])
@@ -428,63 +338,6 @@ def test_a_name_earns_its_confidence_by_what_it_removes():
     assert less(0.89) == 1.0 and 0.85 < less(0.91) < 0.95
 
 
-class Refuted:
-    """An answer on what was held out, by the error after it over that before, and what it removed where it was
-    fitted."""
-
-    def __init__(self, followed=1.0, gain=0.0, told=False):
-        self.case = SimpleNamespace(joint="j", told=told)
-        self.kept = SimpleNamespace(test=[], span_test=None)
-        best = SimpleNamespace(members=())
-        self.outcome = SimpleNamespace(none=SimpleNamespace(fit=SimpleNamespace(loss=4.0)), best=best)
-        self.search = self
-        self.gain, self.polish = lambda best, none: gain, lambda trial: trial
-        self.in_windows = lambda trial, test, span: 4.0 * (followed if trial is best else 1.0)
-
-
-def test_findings_that_do_not_help_are_taken_back():
-    for ratio, kept in ((0.985, True), (0.995, False)):
-        d = SimpleNamespace(
-            joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0, "told_before": 1.0, "told_after": ratio}},
-            evidence=[],
-            notes=[],
-            data={"nuisance": {}},
-        )
-        refuted = Refuted()
-        refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
-        assert (conclude._take_back(d, [refuted], [named()], {}) == set()) is kept, ratio
-
-
-def test_what_most_of_what_was_held_out_bears_out_is_a_hint():
-    for ratio, kept in ((0.985, True), (0.995, False)):
-        e = doubtful(effect="deadband")
-        joints = {"j": {"before": 1.0, "after": 1.0, "mae_before": 1.0, "told_before": 0.1, "told_after": 0.1 * ratio}}
-        d = SimpleNamespace(joints=joints, evidence=[e], notes=[], data={"nuisance": {}})
-        refuted = Refuted()
-        refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
-        e.joint = "j"
-        assert (conclude._take_back(d, [refuted], [named()], {}) == set()) is kept, ratio
-        assert (joint_answer.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
-
-
-def test_what_was_held_out_may_side_with_neither():
-    reason = lambda a, ratio: conclude._not_refuted(a, a.outcome, ratio, [], None)  # noqa: E731
-    assert (
-        reason(Refuted(gain=0.25), 1.01)
-        and not reason(Refuted(gain=0.25), 1.02)
-        and not reason(Refuted(gain=0.23), 1.01)
-    )
-    assert "free run" in reason(Refuted(0.75), 3.0) and not reason(Refuted(0.77), 3.0)
-    assert not reason(Refuted(0.1, told=True), 1.0)
-
-
-def test_what_shows_in_what_was_held_out_alone():
-    shown = lambda before, fitted: conclude._shown_there_alone(  # noqa: E731
-        {"j": {"before": before, "sigma": 0.1, "fitted": fitted}}, []
-    )
-    assert shown(0.51, 0.49) == ["j"] and shown(0.49, 0.1) == [] and shown(2.0, 0.51) == []
-
-
 def test_many_effects_on_one_joint_are_doubted():
     pair, three, five = (
         [doubtful(effect=e) for e in ("deadband", "supply_sag", "backlash", "lag", "thermal")[:n]] for n in (2, 3, 5)
@@ -524,29 +377,6 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(held_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
             assert (judged(Judged(1.0, 0.1))["confidence"] < 0.5) is hint, lost
-
-
-def test_an_effect_that_harms_some_recordings_is_a_hint():
-    answer = Judged(1.0, 0.1)
-    answer.best = "with it"
-    # it harms in 4 and in 7 % of the draws of recordings
-    for helped, harmed, hint in ((10, [1.9, 1.9], False), (7, [2.2], True)):
-        left = np.r_[np.full(helped, 0.5), harmed]
-        answer.search = SimpleNamespace(
-            by_run=lambda trial, left=left: left if trial == "with it" else np.ones(len(left))
-        )
-        assert (JointAnswer._harmed(answer, "without it") != "") is hint
-
-
-def test_what_was_held_out_surely_shows_is_doubted_only():
-    """An effect that harms some recordings, by what it surely removes of the error on what was held out."""
-    for surely, hint in ((0.13, True), (0.17, False)):
-        answer = Judged(1.0, 0.1)
-        answer._harmed = lambda without_it: "it harms some"
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(held_out, "gain_interval", lambda *_, surely=surely: (surely, 0.9))
-            sure = judged(answer)["confidence"]
-        assert (sure < rules.JUDGE.firm) is hint and sure <= rules.JUDGE.doubted, surely
 
 
 def test_moments_that_nothing_follows_do_not_speak():
@@ -626,25 +456,6 @@ def test_a_stand_in_is_offered_where_much_is_left():
             patch.setattr(handed_on, "fit_stand_in", lambda *_: SimpleNamespace(text="a torque stands in"))
             Drives.stand_in(drives, d)
         assert (len(d.standins) == 1) is offered, left
-
-
-def test_friction_at_one_load_is_a_set():
-    rng = np.random.default_rng(0)
-    for spread, alike in ((0.2, ["load_friction"]), (0.45, [])):
-        load = 0.5 + spread * 0.5 * np.clip(rng.normal(size=4000), -2, 2) / 0.88
-        case = SimpleNamespace(regimes={"speed": np.ones(4000), "_load": load}, scales=SimpleNamespace(speed=1.0),
-                               plant=SimpleNamespace(run_of=np.zeros(4000, int)))  # fmt: skip
-        assert inseparable("coulomb_friction", case, [0]) == alike, spread
-        assert inseparable("lag", case, [0]) == []
-
-
-def test_what_stands_tells_of_no_load_under_which_it_slides():
-    load = np.where(np.arange(4000) % 2, 0.1, 1.0)  # two loads, and under the second it moves so fast:
-    for speed, alike in ((0.015, True), (0.03, False)):
-        case = SimpleNamespace(regimes={"speed": np.where(np.arange(4000) % 2, speed, 1.0), "_load": load},
-                               scales=SimpleNamespace(speed=1.0),
-                               plant=SimpleNamespace(run_of=np.zeros(4000, int)))  # fmt: skip
-        assert bool(inseparable("coulomb_friction", case, [0])) is alike, speed
 
 
 class Shook(ringing.Ringing):
@@ -743,97 +554,10 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
 
-def test_each_parameter_costs_a_part_of_the_loss():
-    search = Made()
-    search._price_factor = lambda trial: 1.0
-    member = lambda n: SimpleNamespace(variant=SimpleNamespace(params=range(n)))  # noqa: E731
-    for loss, better in ((0.96, True), (0.98, False)):  # with a parameter more
-        assert (search._score(trial(loss, (member(2),))) < search._score(trial(1.0, (member(1),)))) is better, loss
-
-
-def test_rivals_are_told_apart_by_what_they_lose():
-    search = Made()
-    fit = SimpleNamespace(loss=1.0, params=[], x=np.zeros(0))
-    mine, other = (SimpleNamespace(id=n, variant=SimpleNamespace(params=())) for n in ("lag", "backlash"))
-    current, rival = (SimpleNamespace(loss=np.full(40, x), fit=fit, members=(m,), ids=(m.id,), left_out=None)
-                      for x, m in ((1.0, mine), (1.03, other)))  # fmt: skip
-    search.none_loss, search.fitted = np.full(40, 50.0), {frozenset(("backlash",)): rival}
-    search._fix, search._on, search._price_factor = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
-    search.cross, search._by_condition = lambda _: None, lambda *_: []
-    search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.zeros(()))
-    rows, own, _ = search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"]
-    assert rows[0][0] == "backlash" and rows[0][1] / own == pytest.approx(np.exp(-1), rel=0.01)
-
-
-def test_a_law_that_training_lacks_must_explain_far_more():
-    class Beside(Selecting):
-        _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
-
-    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), approximate=True)
-    other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
-    for before, after, taken in ((10.0, 4.0, True), (10.0, 6.0, False), (1.5, 0.1, False), (2.0, 1.2, True)):
-        search = Beside(lambda ids, a=after, b=before: (a if "load_friction" in ids else b,) * 2)
-        search.allowed, search.case.scales = None, None
-        current = search.fit((Member(EFFECTS["coulomb_friction"], replace(law, approximate=False)),))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(selecting, "CATALOGUE", [other])
-            ids = JointSearch._approximate(search, current).ids
-        assert ids == (("load_friction",) if taken else ("coulomb_friction",)), (before, after)
-
-
-def test_a_law_that_training_lacks_is_asked_in_the_place_of_what_imitates_its_likes():
-    class Beside(Selecting):
-        _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
-        _earns = lambda self, new, old, further=True: self._left(new).sum() < 0.9 * self._left(old).sum()  # noqa: E731
-
-    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), approximate=True)
-    other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
-    plain = replace(law, approximate=False)
-    for found, taken in ((("stribeck_friction",), True), (("stribeck_friction", "deadband"), True), (("lag",), False)):
-        search = Beside(lambda ids: (4.0 if ids == ("load_friction",) else 10.0,) * 2)
-        search.allowed, search.case.scales = None, None
-        members = tuple(Member(EFFECTS[e], replace(plain, params=(param("size", e, "set", 0.0, 1.0),))) for e in found)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(selecting, "CATALOGUE", [other, EFFECTS["coulomb_friction"]])
-            patch.setattr(EFFECTS["coulomb_friction"].__class__, "variants", lambda self, _: [plain])
-            assert JointSearch._approximate(search, search.fit(members)).ids == (("load_friction",) if taken else found)
-
-
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
     """Return what a search of a joint ended with, at `loss`; and now, with what is known of the others."""
     one = SimpleNamespace(members=members, fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)))
     return SimpleNamespace(none=one, best=one)
-
-
-def test_joints_that_are_not_followed_are_looked_at_again():
-    assert not diagnosing._unsettled(followed(1.5)) and diagnosing._unsettled(followed(1.9))
-    assert diagnosing._unsettled(followed(1.0, members=("lag",)))
-
-
-def test_of_encoders_along_one_chain_the_clearest_alone_moves_the_others():
-    chain = '<body><joint name="{}"/><geom size="0.1"/>{}</body>'
-    finger = chain.format("a", chain.format("b", chain.format("c", "")))
-    model = mujoco.MjModel.from_xml_string(f'<mujoco><worldbody>{finger}{chain.format("d", "")}</worldbody></mujoco>')
-
-    def found(removed: float, *effects: str) -> SimpleNamespace:
-        trial = lambda loss, of: SimpleNamespace(fit=SimpleNamespace(loss=loss), members=of)  # noqa: E731
-        members = [SimpleNamespace(effect=EFFECTS[e]) for e in effects]
-        return SimpleNamespace(none=trial(1.0 + removed, []), best=trial(1.0, members))
-
-    joints = [found(60.0, "position_offset"), found(80.0, "lag"), found(2.0, "position_offset"),
-              found(3.0, "position_scale")]  # fmt: skip
-    trials = diagnosing._moved_by(model, "abcd", joints)
-    assert [t is x.best for t, x in zip(trials, joints, strict=True)] == [True, True, False, True]
-    joints[2] = found(90.0, "position_offset")
-    trials = diagnosing._moved_by(model, "abcd", joints)
-    assert [t is x.best for t, x in zip(trials, joints, strict=True)] == [False, True, True, True]
-
-
-def test_a_joint_is_searched_again_where_the_others_move_it_otherwise():
-    for now, again in ((2.14, False), (2.3, True), (1.7, True)):
-        fitter = SimpleNamespace(loss=lambda _, now=now: np.array([now]), evaluate=lambda *_: np.zeros(1))
-        search = SimpleNamespace(_fix=lambda _: nullcontext(), fitter=fitter)
-        assert diagnosing._other(search, followed(2.0)) is again, now
 
 
 def test_jitter_is_reported_where_the_likelihood_gains_much():
@@ -874,26 +598,6 @@ def test_what_cannot_follow_is_no_rival():
     for here, least in ((2.0, 5.0), (0.1, 2.5)):  # what is left, and the least that no rival leaves
         assert takes_part(here, 0.95 * least) and not takes_part(here, 1.05 * least)
         assert takes_part(here, here, draft=0.95 * least) and not takes_part(here, here, draft=1.05 * least)
-
-
-def test_a_rival_that_wins_clearly_takes_the_place():
-    search, current = Made(), SimpleNamespace(members=(SimpleNamespace(id="lag"),))
-    search.fitted = {frozenset(("backlash",)): "rival"}
-    for own, overtakes in ((0.45, True), (0.53, False)):  # share of the draws, the rival's being 0.6
-        found = search._overtaken(current, {"lag": ([("backlash", 0.6)], own, 0.5)})
-        assert (found == "rival") is overtakes, own
-
-
-def test_a_plain_models_figure_differs_beyond_what_is_believed():
-    case, plain = SimpleNamespace(scales=SimpleNamespace(nominal={"kp": 1.0})), param("kp", "kp", "set", 0.0, 10.0)
-    assert selecting._differs(plain, 1.17, case) and not selecting._differs(plain, 1.13, case)
-
-
-def test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws():
-    for left, useless, earns in ((7.0, 0.06, True), (7.0, 0.09, False), (4.0, 0.12, True), (4.0, 0.18, False)):
-        search = Made()
-        search._boot = lambda x, useless=useless: np.sort(np.linspace(0, 1, 1000)) - useless
-        assert search._earns(trial(left), trial(10.0)) is earns, (left, useless)
 
 
 def test_the_short_list_asks_a_promise():
@@ -985,13 +689,6 @@ def test_the_end_of_a_recording_is_held_out():
     assert all(7.0 < parts.span_train[i][1] < 8.0 and parts.span_test[i][1] == 10.0 for i in (0, 1))
 
 
-def test_a_condition_that_is_most_of_the_time_is_fitted():
-    for seconds, chosen in ((4.3, True), (4.7, False)):  # of the first of three, which visits all that the others do
-        runs = [SimpleNamespace(duration=s) for s in (seconds, 2.9, 7.1 - seconds)]
-        found = held_out._condition(runs, [0, 1, 2], np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]]))
-        assert (found == 0) is chosen, seconds
-
-
 def moving_case(**regimes):
     """Return a joint of which a regime's variable rises evenly."""
     n = 1000
@@ -1015,19 +712,6 @@ def test_regimes_of_heat():
     assert all(0.25 < found[f"a {k} j"].mean() < 0.35 for k in ("warm", "cold"))
 
 
-def test_a_regime_is_visited_for_a_while():
-    alone = lambda here, there: held_out._alone(["x"], np.array([[here, there]]), [0], [1]) == ["x"]  # noqa: E731
-    assert alone(0.3, 0.0) and not alone(0.2, 0.0) and alone(1.0, 0.2) and not alone(1.0, 0.3)
-
-
-def test_a_recording_at_rest_tells_nothing():
-    def at_rest(moved: float, commanded: float) -> bool:
-        run = SimpleNamespace(joints=("j",), q=np.array([[0.0], [moved]]), cmd=np.array([[0.0], [commanded]]))
-        return diagnosing._at_rest([run])
-
-    assert at_rest(1.5e-3, 0.0) and not at_rest(2.5e-3, 0.0) and at_rest(0.0, 1.5e-3) and not at_rest(0.0, 2.5e-3)
-
-
 def test_a_belief_without_a_trace_is_not_refitted():
     beliefs = [replace(param(k, k, "set", 0.0, 1.0, 0.5), nuisance=True) for k in ("kp", "kd")]
     search = Started(np.zeros(100), np.zeros(100))
@@ -1037,10 +721,6 @@ def test_a_belief_without_a_trace_is_not_refitted():
     search.all_nuisances = beliefs
     search.start()
     assert [p.key for p in search.nuisances] == ["kp"]
-
-
-FILES = (test_gap_rules_touch, test_gap_rules_torque, test_gap_rules_belief, test_gap_rules_signal)
-TESTS = {k: v for file in FILES for k, v in vars(file).items()} | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():

@@ -1,5 +1,4 @@
-"""What any machine may be off by: each figure of `rules.BELIEF` decides what it says. `tests/test_gap_rules.py` moves
-each and sees its test fail."""
+"""What any machine may be off by: figures of `rules.BELIEF`."""
 
 from __future__ import annotations
 
@@ -12,7 +11,6 @@ from dexsim.gap.effects import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
 from dexsim.gap.plant.case import misfit, quiet_noise, usual_noise
-from dexsim.gap.plant.columns import Scales
 from dexsim.gap.search import hypotheses
 from dexsim.gap.search.fit import disbelief
 
@@ -42,16 +40,6 @@ def test_any_drive_may_filter_its_speed():
 
 def test_what_holds_a_joint_gives_a_little():
     assert 1.5e-3 < give(SimpleNamespace(slide=False)) < 3e-3 and 4e-5 < give(SimpleNamespace(slide=True)) < 8e-5
-
-
-def test_sensors_have_zeros():
-    """For encoders with counts of 1 mrad, and of a reading of the effort at a limit of 2 N.m."""
-    drive = SimpleNamespace(nominal={"torque_limit": 2.0}, tau=1.0)
-    scales = SimpleNamespace(apart=True, effort_zero=Scales.effort_zero.fget(drive))
-    case = SimpleNamespace(scales=scales, quantum=1e-3, sigma=1e-4, sigma_torque=0.1)
-    by = {p.key: p for p in hypotheses._of_the_sensors(case)}
-    assert 1.5e-3 < by["zero"].high < 3e-3 and 0.015 < by["effort_zero"].high < 0.03
-    assert by["zero"].low == -by["zero"].high and by["effort_zero"].low == -by["effort_zero"].high
 
 
 def _told(t: np.ndarray, q: np.ndarray) -> float | None:

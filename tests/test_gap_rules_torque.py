@@ -1,9 +1,7 @@
-"""Each figure of `rules.TORQUE` decides what it says: pushes from outside, drives whose torque or duty was logged, and
-the plain model beside every answer. `tests/test_gap_rules.py` moves each and sees its test fail."""
+"""Pushes from outside, drives whose torque or duty was logged, and the plain model: figures of `rules.TORQUE`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +9,13 @@ import pytest
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.effects.friction import LoadFriction, ViscousFriction
-from dexsim.gap.effects.signals import Lag
 from dexsim.gap.inquiry import Judged, empty
 from dexsim.gap.judge import conclude
-from dexsim.gap.read import inputs, stage_tests
+from dexsim.gap.read import inputs
 from dexsim.gap.read.stage_tests import Stage
-from dexsim.gap.rules import BELIEF, JUDGE
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import baseline, inverse_dynamics, logged_torque
-from dexsim.gap.search.inverse_dynamics import WEIGHT, Columns, least
+from dexsim.gap.search.inverse_dynamics import Columns, least
 from dexsim.gap.search.logged_torque import IdentifiedJoint
 
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
@@ -58,18 +55,6 @@ def left_by_a_plain_fit(of: Columns) -> float:
     return float(np.var(of.u - of.X @ least(of.X, of.u)) / np.var(of.torque))
 
 
-def test_a_joint_that_rings_is_not_pushed():
-    """It lies still, and then moves fast and shakes beside that, so many times as much as its motion does."""
-    t = np.arange(0.0, 20.0, 0.01)
-    slow = np.where(t < 10.0, 0.0, np.sin(2 * np.pi * 1.5 * (t - 10.0)))
-    moves = (t > 10.5) & (t < 19.5)
-    for times, ringing in ((2.0, False), (4.5, True)):
-        own = float(np.sqrt(np.mean(np.diff(slow[moves], 2) ** 2)))
-        shakes = own * np.sqrt(times**2 - 1) / 4.0 / np.sqrt(0.5) * np.sin(2 * np.pi * 49.0 * t + 0.3)
-        run = SimpleNamespace(t=t, q=(slow + np.where(moves, shakes, 0.0))[:, None])
-        assert logged_torque._by_ringing([(t, moves)], [run], [0], 10.0) is ringing, times
-
-
 def test_a_plain_fit_must_leave_much_for_a_push():
     for share, told in ((0.4, True), (0.22, False)):
         tried = [recorded(h * stretches(0.3), 0.01) for h in np.geomspace(0.5, 5.0, 60)]
@@ -101,21 +86,6 @@ def test_a_push_is_no_small_part_of_the_torque():
     assert on[large > 0].all() and on[spots[0.32]].mean() > 0.8 and on[spots[0.15]].mean() < 0.1
 
 
-def test_a_joint_at_rest_carries_some_more_than_its_friction():
-    A, x = np.array([[0.0, 0.0, 1.0, 0.0]] * 2), np.array([0.0, 0.0, 2.0, 0.0])
-    for torque, beyond in ((2.0 * 1.05, False), (2.0 * 1.2, True)):
-        found = logged_torque._beyond(np.array([torque, -torque]), A, x, 2, np.zeros(2, bool))
-        assert (np.abs(found) > 0).all() == beyond == (np.abs(found) > 0).any(), torque
-
-
-def test_a_force_lasts_and_noise_does_not():
-    block = np.repeat(np.arange(20), 100)
-    noise = np.tile([1.0, -1.0], 1000)
-    for share, slow in ((0.35, True), (0.17, False)):  # of the variance that lies between the blocks
-        force = np.sqrt(share / (1 - share)) * np.where(block % 2, 1.0, -1.0)
-        assert logged_torque._slow(noise + force, block) is slow, share
-
-
 def test_what_pushes_most_of_the_time_is_no_stretch():
     half = len(T) // 2
     for share, clear in ((0.45, True), (0.75, False)):  # of all samples; at rest mostly
@@ -140,19 +110,6 @@ def test_a_joint_is_judged_without_pushes_where_enough_is_left():
             patch.setattr(inputs, "free_air", lambda *_, s=seconds: ([SimpleNamespace(name="a", duration=s)], []))
             rest, _ = logged_torque.without_pushes([push], [run], [], [])
         assert (rest[0].duration == seconds) is cut, seconds
-
-
-def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
-    run = SimpleNamespace(name="a", t=np.zeros(1))
-    t = 0.01 * np.arange(1000)
-
-    def found(*spans):
-        on = np.any([(t > a - 1e-6) & (t < b + 1e-6) for a, b in spans], 0)
-        return logged_torque._spans([(t, on)], [run], 0.1).get("a", [])  # of a filter of 10 Hz
-
-    assert len(found((1.0, 2.0), (2.08, 3.0))) == 1 and len(found((1.0, 2.0), (2.15, 3.0))) == 2
-    assert len(found((1.0, 1.15))) == 1 and found((1.0, 1.08)) == []
-    assert found(*((k, k + 0.08) for k in np.arange(1.0, 5.0, 0.2))) == [], "a ripple of the joint's own"
 
 
 def push(clear: bool) -> float:
@@ -183,30 +140,6 @@ def test_a_drive_is_sound_by_its_logged_duty():
     assert sound(delay=0.006) and not sound(delay=0.012) and not sound(delay=-0.012)
 
 
-def test_a_drive_may_act_late_by_its_loops_period_or_the_readings():
-    for rate, apart, late in ((1000.0, 0.01, 0.0075), (None, 0.01, 0.0075), (50.0, 0.01, 0.015), (500.0, 1e-3, 1.5e-3)):
-        run = SimpleNamespace(t=apart * np.arange(20))
-        found = stage_tests._late(SimpleNamespace(loop_rate=rate), [run])
-        assert found == pytest.approx(BELIEF.late / 0.75 * late), (rate, apart)
-
-
-def test_a_cutoff_is_halved_while_that_sheds_noise():
-    for left, cutoff in ((0.7, 30.0), (0.9, 60.0)):  # of the misfit, by the first halving; nothing by others
-        at = lambda c, left=left: (recorded(np.zeros(len(T)), 0.2 * (1.0 if c == 60.0 else left)),) * 2  # noqa: E731
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(inverse_dynamics, "_further", lambda own: {})
-            assert inverse_dynamics.solve(at, 60.0).cutoff == cutoff, left
-
-
-def test_a_weight_is_believed_where_the_torque_cannot_tell():
-    name = next(iter(WEIGHT))
-    for noise, believed in ((0.35, []), (0.6, [name])):  # what 80 half seconds of 1 N.m of gravity tell: 0.45
-        of = recorded(np.zeros(len(T)), noise)
-        pull = np.sqrt(2) * np.cos(2 * np.pi * 0.17 * T)
-        of = replace(of, X=np.column_stack([of.X, pull]), names=(*NAMES, name))
-        assert inverse_dynamics._not_weighed(of) == believed, noise
-
-
 def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -> bool:
     """Return whether friction that differs by direction is named, of this column, beside a constant torque."""
     own = SimpleNamespace(X=np.ones((len(u), 1)), u=u, blocks=block, pack=lambda x: {"viscous_friction": 10.0})
@@ -233,12 +166,6 @@ def test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps():
         assert named(np.where(where, way, 0.0), np.where(where, way, 0.01 * way), block) is told, stretches_
 
 
-def test_a_torque_that_acts_far_later_is_no_lag():
-    """A radian of 5 Hz is 32 ms."""
-    for late, is_lag in ((0.03, True), (0.035, False)):
-        assert inverse_dynamics._sensible(Lag.by_torque, 2.0 * late, {"inertia": 2.0}) is is_lag, late
-
-
 def test_a_torque_that_fits_nothing_is_no_witness():
     value = {n: 1.0 for n in NAMES}
     for left, told in ((0.5, True), (0.6, False)):
@@ -247,22 +174,6 @@ def test_a_torque_that_fits_nothing_is_no_witness():
                                told=False, plant=SimpleNamespace(nominal=np.zeros((1, len(INDEX)))))  # fmt: skip
         logged_torque.believe([IdentifiedJoint(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
         assert case.told is told, left
-
-
-@dataclass
-class Followed:
-    plant: object
-    sigma: float = 0.0
-
-
-def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
-    whole = SimpleNamespace(q=np.zeros(10), windows=lambda *_, **__: SimpleNamespace(sample_row=np.arange(10)))
-    trial = SimpleNamespace(fit=SimpleNamespace(params=[SimpleNamespace(key="kd")], x=np.array([1.0])), members=())
-    for error, stand in ((1.03, True), (1.08, False)):  # with the torque's figure; 1 with the loop's own
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(logged_torque, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
-            search = SimpleNamespace(whole=whole)
-            assert logged_torque._alike(Followed(None), search, trial, {"kd": error}, [0], None) is stand, error
 
 
 def told(after: float) -> float:

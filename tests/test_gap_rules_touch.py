@@ -1,5 +1,4 @@
-"""The figures that decide about touch: each rule is held from both sides, by made-up readings and losses (moved by
-tests/test_gap_rules.py)."""
+"""Figures that decide about touch, by made-up readings and losses."""
 
 from __future__ import annotations
 
@@ -8,13 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_confusable
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import judge, read
 from dexsim.gap.touch import search as pad_search
 from dexsim.gap.touch.diagnosis import Pad, Touch
 from dexsim.gap.touch.judge import PadAnswer
-from dexsim.gap.touch.plant import PARAMS
 from dexsim.gap.touch.search import PadFit, PadSearch, TouchTrial
 from dexsim.recording.schema import TACTILE, Series
 
@@ -31,13 +29,6 @@ class Felt(PadSearch):
 
 def test_a_touch_effect_must_remove_a_least_share():
     assert not Felt()._earns(0.9, 1.0) and Felt()._earns(0.86, 1.0)
-
-
-def test_a_touch_effect_must_help_in_nearly_all_bootstraps():
-    search = Felt()
-    for useless, earns in ((0.02, True), (0.045, False)):
-        search._boot = lambda x, useless=useless: np.sort(np.linspace(0, 1, 1000)) - useless
-        assert search._earns(0.5, 1.0) is earns, useless
 
 
 def rest(gains, width=0.05):
@@ -159,15 +150,6 @@ def test_a_gain_for_every_taxel_must_follow_clearly_better_than_one():
         assert (Mapped(left)._try(TouchTrial((), {}), gain).gains is not None) is mapped, left
 
 
-def test_touch_rivals_are_told_apart_by_what_they_lose():
-    search = Choosing(lambda ids: ((1.0 if "tactile_delay" in ids else 50.0 if not ids else 1.03), 1.0))
-    current, rival, base = (search.fit(ids, {}) for ids in (("tactile_delay",), ("thermal",), ()))
-    search.without, search.scan = lambda *_: base, lambda *_: [TOUCH_EFFECTS["thermal"]]
-    search._try = lambda *_: None
-    rows, own = PadSearch._rivals(search, current, "tactile_delay", {frozenset(("thermal",)): rival})
-    assert [name for name, _ in rows] == ["thermal"] and rows[0][1] / own == pytest.approx(np.exp(-1), rel=0.01)
-
-
 def claimed(after=0.5, share=0.0):
     """Return the finding of a pad's gain that leaves so much of 1 N on what was held out, its like having a share of
     the draws."""
@@ -193,19 +175,6 @@ def test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed():
     assert claimed(after=0.981) is None and claimed(after=0.979) is not None
 
 
-def test_exchanged_taxels_fit_in_the_place_of_each_other():
-    """Each reading is a mix of what both places predict; `own`: its part that its own place does."""
-    place = np.eye(3, 30)  # at different times
-    for own, found in ((0.57, True), (0.56, False)):
-        other = 1 - own  # what is left in the other's place: (other / own)^2 = 0.57 and 0.62 of what its own leaves
-        z = np.stack([other * place[0] + own * place[1], own * place[0] + other * place[1], place[2]])
-        search = SimpleNamespace(runs=[SimpleNamespace(z=z.T)], noise=0.01)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pad_search, "readings", lambda *_: place.T)
-            order = PadSearch._swaps(search, {})
-        assert (order is not None and order.tolist() == [1, 0, 2]) is found, own
-
-
 def sigma_of(z, t):
     """Return the noise [N] that the fit gives readings z [S, 1] at times t [S], a sensor without noise or counts."""
     run = SimpleNamespace(t=t, z=z, lsb=0.0, full=np.zeros(z.shape, bool), recording="a")
@@ -224,15 +193,6 @@ def test_a_plant_of_touch_is_trusted_to_so_much_of_a_reading():
 def test_the_time_of_a_reading_is_uncertain():
     t = np.arange(50) * 1e-4
     assert sigma_of(100.0 * t[:, None], t) == pytest.approx(0.3, rel=1e-3)  # 100 N/s, up to 0.5 N
-
-
-def test_a_size_that_hangs_on_the_spread_of_a_force_is_as_wide_as_its_law():
-    pad = SimpleNamespace(train=np.ones(20, bool), block=np.arange(20), folds=[], doubt=1.0, warm=1.0, scale_known=True)
-    fitted = TouchTrial((), {"stiffness": 1.0}, keys=("stiffness",), jac=np.ones((20, 1)), res=np.zeros(20))
-    pad.fit, pad.cross, pad._rounding = lambda *_: fitted, lambda _: None, lambda _: np.zeros(1)
-    pad._bounds = lambda key: (PARAMS[key].low, PARAMS[key].high)
-    low, high = PadFit.intervals(pad, fitted)["stiffness"]
-    assert (high - low) / 2 == pytest.approx(1.645 * 0.1, rel=1e-6)
 
 
 def test_the_gain_of_a_taxel_is_believed_to_be_one():
@@ -298,16 +258,6 @@ def test_a_drift_needs_a_temperature_or_a_second_recording():
         assert TOUCH_EFFECTS["thermal"].possible(search) is possible, (thermometer, runs)
 
 
-def test_a_touch_rival_follows_about_as_well():
-    other = next(e for e in TOUCH_CATALOGUE if not e.by_taxel and not touch_confusable(e.id, "tactile_delay"))
-    for left, counts in ((1.6, True), (1.8, False)):  # x what the hypothesis leaves where it was fitted
-        search = Choosing(lambda ids, left=left: (1.0, left if other.id in ids else 1.0))
-        current, rival, base = (search.fit(ids, {}) for ids in (("tactile_delay",), (other.id,), ()))
-        search.without, search.scan, search._try = lambda *_, base=base: base, lambda *_: [other], lambda *_: None
-        rows, _ = PadSearch._rivals(search, current, "tactile_delay", {frozenset((other.id,)): rival})
-        assert (rows != []) is counts, left
-
-
 class Scanned(PadSearch):
     """A search of one pad whose one effect would take a share of what is left, by a linear score."""
 
@@ -351,15 +301,6 @@ def test_a_reading_that_never_changes_is_stuck():
     assert silent(pressed=0.0, lsb=0.1, reading=0.25) == {1: 0.25} and silent(pressed=0.0, lsb=0.1, reading=0.15) == {}
 
 
-def test_exchanged_taxels_save_more_than_noise():
-    for size, found in ((0.06, True), (0.04, False)):  # N; less than 5 x the noise of 0.01 is not felt
-        place = size * np.eye(3, 30)
-        search = SimpleNamespace(runs=[SimpleNamespace(z=place[[1, 0, 2]].T)], noise=0.01)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pad_search, "readings", lambda *_, place=place: place.T)
-            assert (PadSearch._swaps(search, {}) is not None) is found, size
-
-
 def test_a_little_force_is_no_touch():
     t = 0.01 * np.arange(200)
     on = (t > 0.5) & (t < 1.0)
@@ -372,12 +313,3 @@ def test_a_little_force_is_no_touch():
     for newtons, touched in ((0.25, 0), (0.4, 1)):
         force = np.stack([newtons * on, 0 * t, 0 * t], 1)
         assert len(read.stretches(SimpleNamespace(tactile=None, external_force=Series(t, force, "")))) == touched
-
-
-def test_neighbours_of_a_dead_taxel_feel_the_touch():
-    few, many = [[1, 2]] + [[0]] * 4, [[1, 2, 3, 4]] + [[0]] * 4
-    felt = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
-    assert judge._constant(felt, few) == set() and judge._constant(felt, many) == {0}
-    near = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], [0, 1, 2]]
-    for share, dead in ((0.17, {0}), (0.13, set())):
-        assert judge._constant(np.array([0.0, share, share, share, 1.0]), near) == dead, share

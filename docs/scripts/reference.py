@@ -163,15 +163,24 @@ def effects() -> str:
 
 
 def rules() -> str:
-    """Return the figures that the diagnosis decides by."""
-    from dexsim.gap.rules import RULES, described
+    """Return the figures that the diagnosis decides by: each with the comment above or beside it."""
+    import inspect
 
-    head = ("figure", "value", "what it means", "where its value came from")
+    from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE, TOUCH
+
     parts = []
-    for room in ("search", "judge", "touch", "torque", "belief"):
-        of = [r for r in described() if r[0].startswith(f"{room}.")]
-        rows = [(f"`{name}`", f"{value:.4g}", means, source) for name, value, means, source, _ in of]
-        parts.append(f"## {room.capitalize()}\n\n{type(getattr(RULES, room)).__doc__}\n\n{table(head, rows)}")
+    for name, room in zip(("search", "judge", "touch", "torque", "belief"), (SEARCH, JUDGE, TOUCH, TORQUE, BELIEF)):
+        rows, means = [], ""
+        for line in map(str.strip, inspect.getsource(type(room)).splitlines()):
+            code, _, comment = line.partition("# ")
+            means = f"{means} {comment}".strip()
+            if code:
+                key = code.partition(":")[0]
+                if hasattr(room, key):
+                    rows.append((f"`{name}.{key}`", f"{getattr(room, key):.4g}", means))
+                means = ""
+        of = table(("figure", "value", "what it means"), rows)
+        parts.append(f"## {name.capitalize()}\n\n{type(room).__doc__}\n\n{of}")
     return "\n".join(parts)
 
 
