@@ -2,6 +2,7 @@
 
     [project.entry-points."dexsim.tasks"]      a task: a class derived from dexsim.tasks.Task
     [project.entry-points."dexsim.effects"]    an effect of the diagnosis: derived from dexsim.gap.effects.Effect
+    [project.entry-points."dexsim.laws"]       a law of drives: a dexsim.actuator.law.Law
     [project.entry-points."dexsim.drivers"]    a hand's driver: what makes a dexsim.deploy.driver.HandDriver
     [project.entry-points."dexsim.readers"]    a format of recordings
 

@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
-    given = _settings(argv)
+    given = typed.settings(argv, KEYS)
 
     from dexsim import files, outputs
     from dexsim.recording.excitation import FILES, Limits, plan, write_plan
@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError("say where to write: out=DIR")
     quiet_warp("cpu")
     gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
-    hand = stated_hand(given.get("hand"), _flag(given, "hand_mirror"))
+    hand = stated_hand(given.get("hand"), typed.truth("hand_mirror", given.get("hand_mirror", "false")))
     if hand is not None and given.get("model"):
         raise UserError(f"model={given['model']}: is not moved beside hand=; say one of them")
     m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity, hand=hand)
@@ -133,25 +133,9 @@ RANGES: dict[str, tuple[float, float, float, bool]] = {
 """Of numbers that are no limit of the motion: what they are where nothing is said, lowest, highest, whether whole."""
 
 
-def _settings(argv: Sequence[str]) -> dict[str, str]:
-    out = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if not equals or key not in KEYS:
-            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
-        out[key] = value
-    return out
-
-
 def _list(given: dict[str, str], key: str) -> list[str] | None:
     value = given.get(key, "all")
     return None if value in ("all", "") else [v.strip() for v in value.split(",") if v.strip()]
-
-
-def _flag(given: dict[str, str], key: str) -> bool:
-    if given.get(key, "false") not in ("true", "false"):
-        raise UserError(f"{key}={given[key]}: must be true or false")
-    return given.get(key) == "true"
 
 
 def _within(given: dict[str, str], key: str) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 from dexsim import files
 from dexsim.errors import UserError
-from dexsim.typed import whole
+from dexsim.typed import settings, truth, whole
 
 USAGE = """usage: dexsim export checkpoint=FILE out=DIR [key=value ...]
        dexsim export check=DIR
@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
-    given = _settings(argv)
+    given = settings(argv, KEYS, ("agent.",))
     if "task" in given:
         from dexsim.tasks import registry
 
@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
         whole("steps", given.get("steps", "64"), 2, 100_000),
         whole("seed", given.get("seed", "0")),
         frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
-        _truth(given.get("mirror", "false")),
+        truth("mirror", given.get("mirror", "false")),
     )
     return 0 if check(out) else 1
 
@@ -443,22 +443,6 @@ def _golden_rows(file: Path) -> dict[str, Any]:
         return files.arrays(file)
     except ValueError as error:
         raise UserError(f"{file}: {error}; export the bundle again") from None
-
-
-def _truth(text: str) -> bool:
-    if text not in ("true", "false"):
-        raise UserError(f"mirror={text}: must be true or false")
-    return text == "true"
-
-
-def _settings(argv: Sequence[str]) -> dict[str, str]:
-    out = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if not equals or (key not in KEYS and not key.startswith("agent.")):
-            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
-        out[key] = value
-    return out
 
 
 if __name__ == "__main__":

@@ -38,21 +38,13 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = {"scale": "1", "hulls": str(own.PARTS), "out": "", "picture": "true"}
-    meshes = []
-    for text in argv:
-        key, equals, value = text.partition("=")
-        if not equals:
-            meshes.append(text)
-        elif key in given:
-            given[key] = value
-        else:
-            raise UserError(f"'{text}': no such setting; there are {', '.join(given)}")
+    meshes = [text for text in argv if "=" not in text]
+    given |= typed.settings([text for text in argv if "=" in text], given)
     if len(meshes) != 1:
         raise UserError(f"one mesh is needed, {len(meshes)} given: dexsim import-object mug.obj out=objects/mug")
     if not given["out"]:
         raise UserError("say where to write: out=FOLDER, e.g. out=objects/mug")
-    if given["picture"] not in ("true", "false"):
-        raise UserError(f"picture={given['picture']}: must be true or false")
+    typed.truth("picture", given["picture"])
     scale, hulls = typed.number("scale", given["scale"]), typed.whole("hulls", given["hulls"], 1, MOST_PARTS)
     path, out = files.place(meshes[0]), files.place(given["out"])
     if path.is_dir():

@@ -3,7 +3,9 @@ file."""
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -48,6 +50,31 @@ def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:
     if value is None or not low <= value <= high:
         raise UserError(f"{key}={text}: must be a whole number from {low} to {high}")
     return value
+
+
+def settings(argv: Iterable[str], keys: Collection[str], also: tuple[str, ...] = ()) -> dict[str, str]:
+    """Take the key=value of a command line apart; also: what further keys begin with. Raises UserError for another."""
+    out = {}
+    for text in argv:
+        key, equals, value = text.partition("=")
+        if not equals or not (key in keys or key.startswith(also)):
+            near = difflib.get_close_matches(key, keys, 1)
+            hint = f" (did you mean {near[0]}=?)" if near else ""
+            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(keys)}{hint}")
+        out[key] = value
+    return out
+
+
+def truth(key: str, text: str) -> bool:
+    """Return the truth value that was typed. Raises UserError."""
+    return one_of(key, text, ("true", "false")) == "true"
+
+
+def one_of(key: str, text: str, known: Collection[str]) -> str:
+    """Return a word as it was typed. Raises UserError for one that is not known."""
+    if text not in known:
+        raise UserError(f"{key}={text}: must be {', '.join([*known][:-1])} or {[*known][-1]}")
+    return text
 
 
 def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:

@@ -108,7 +108,7 @@ def cable_pull(stiffness: Any, q: Any):
             torque += cable_pull(of[PULL], q)
             by_position -= type(q)(3.0) * of[PULL] * q * q
 '''),),
-    (("    return torque, by_position, np.zeros_like(v)", '''    if "cable" in features:
+    (("    return torque, by_position, by_speed", '''    if "cable" in features:
         torque = torque - p["cable"] * q**3
         by_position = by_position - 3 * p["cable"] * q**2
 '''),),

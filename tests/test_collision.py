@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from rig import pendulum_spec
 from worlds import grasp_env
 
 from dexsim.errors import UserError
 from dexsim.sim import make_engine, warmup
 from dexsim.sim.collision import unsupported
-from dexsim.sim.pendulum import pendulum_spec
 from tests import cylinder_exact
 from tests import narrow_phase as bench
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from rig import pendulum_spec
 
 from dexsim import excite
 from dexsim.actuator.table import ServoTable
@@ -18,7 +19,6 @@ from dexsim.recording.excitation import Limits
 from dexsim.recording.mechanism import Mechanism, drive, mechanism
 from dexsim.recording.schema import Series
 from dexsim.recording.waveforms import KINDS, through
-from dexsim.sim.pendulum import pendulum_spec
 
 torch.set_num_threads(1)
 SERVO = {"joints": {"*": {"kp": 2.0, "kd": 0.05, "torque_limit": 0.5, "no_load_speed": 10.0}}}

@@ -12,7 +12,6 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from dexsim.assets.objects import library, load_mesh, names, primitive_mass_properties
-from dexsim.assets.objects.bake import contact_sheet
 from dexsim.assets.objects.baking import UNIT, bake_grid, pack, shape_from_hulls, unpack
 from dexsim.assets.objects.geometry import (
     hull_planes,
@@ -23,8 +22,9 @@ from dexsim.assets.objects.geometry import (
     simplify_hull,
     union_boundary,
 )
-from dexsim.assets.objects.shapes import SHAPES, hulls_of
 from dexsim.errors import UserError
+from tools.assets.objects import contact_sheet
+from tools.assets.shapes import SHAPES, hulls_of
 
 GRID_SHAPES = list(SHAPES)
 CONVEX = [n for n in GRID_SHAPES if len(library()[n].hulls) == 1]

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 from fresh import call, provide
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,6 +41,11 @@ seen = batch.reset(seed=1)[0]
 assert len(seen) == 3 and batch.step(batch.action_space.sample())[1].shape == (3,)
 one = gymnasium.make("dexsim/CatchIt-v0", device="cpu", settings=["preset=none"])
 assert one.reset(seed=1)[0].shape == seen.shape[1:]
+"""
+WORN = """
+drive: torque
+joints:
+  "*": {kp: 2.0, kd: 0.05, torque_limit: 1.1, no_load_speed: 12.0, tight_spot: 0.05, tight_spot_at: 0.4}
 """
 
 
@@ -86,11 +92,25 @@ def test_a_driver_of_ones_own(installed, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own(installed, tmp_path):
-    provide(installed, "run_in.py", code_of("howto/own_effect.md"), "dexsim.effects", "run_in = run_in:RunIn")
-    said = call(installed, tmp_path, "dexsim", "diagnose", "demo=coulomb_friction",
-                "effects=[run_in,coulomb_friction]", "out=found")  # fmt: skip
-    assert "coulomb_friction" in said and (tmp_path / "found" / "diagnosis.json").is_file()
+def test_a_law_and_an_effect_of_ones_own(installed, tmp_path):
+    """Both files of the page in an installed package: what the law does is found, named, written and trained with."""
+    law, effect = re.findall(r"```python\n(.*?)```", (ROOT / "docs/howto/own_effect.md").read_text("utf-8"), re.S)
+    provide(installed, "tight_spot_law.py", law, "dexsim.laws", "tight_spot = tight_spot_law:TIGHT_SPOT")
+    provide(installed, "tight_spot_effect.py", effect, "dexsim.effects", "tight_spot = tight_spot_effect:TightSpot")
+
+    def run(*words):
+        return call(installed, tmp_path, "dexsim", *words)
+
+    said = run("diagnose", "demo=tight_spot", "effects=[tight_spot,coulomb_friction,command_delay]", "out=found")
+    found = json.loads((tmp_path / "found" / "diagnosis.json").read_text())["findings"]
+    assert [f["effect"] for f in found if f["where"]["joints"]] == ["tight_spot"], said
+    at = found[0]["parameters"]["place"]
+    assert at["low"] - 0.05 < 0.4 < at["high"] + 0.05
+    served = yaml.safe_load((tmp_path / "found" / "servo.yaml").read_text())["joints"]["knuckle"]["tight_spot"]
+    assert served["low"] < served["value"] < served["high"]
+    (tmp_path / "worn.yaml").write_text(WORN)
+    run("train", "worlds=2", "iterations=1", "device=cpu", "final_episodes=0", "agent.num_steps_per_env=4", "out=run",
+        "servo_file=worn.yaml", "+randomize.servo.tight_spot=[0,0.02]")  # fmt: skip
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from rig import pendulum_spec
 
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
@@ -20,7 +21,6 @@ from dexsim.recording import mechanism as mech
 from dexsim.recording.audit import audit, table
 from dexsim.recording.compare import compare
 from dexsim.recording.realistic import Hardware, realistic, sample_times
-from dexsim.sim.pendulum import pendulum_spec
 
 torch.set_num_threads(1)
 SERVO = {

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from rig import pendulum_spec
 
 from dexsim.errors import UserError
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
-from dexsim.sim.pendulum import pendulum_spec
 
 ENGINES = ("mujoco", "warp")
 G = 9.81
@@ -653,7 +653,7 @@ LOGS = """
 import sys, mujoco, numpy as np
 if sys.argv[1] == "dexsim":
     from dexsim.sim import make_engine
-    from dexsim.sim.pendulum import pendulum_spec
+    from rig import pendulum_spec
     e = make_engine(pendulum_spec(), 2, "cpu", "mujoco")
     e.t.qpos[0] = float("nan")
     e.step(2)

@@ -12,11 +12,11 @@ import pytest
 import torch
 import warp as wp
 from mujoco_warp._src import solver as theirs
+from rig import pendulum_spec
 from worlds import grasp_env
 
 from dexsim.errors import UserError
 from dexsim.sim import make_engine
-from dexsim.sim.pendulum import pendulum_spec
 from dexsim.sim.solver import NewtonSolver, newton, unsupported
 from dexsim.sim.solver.kernel import solve_kernel
 

@@ -483,7 +483,7 @@ def test_spring_sum_agrees_with_the_contact_law_in_the_median():
     import yaml
 
     from dexsim.tactile.config import tactile_config
-    from dexsim.tactile.fit_stiffness import CONTACT_STIFFNESS, press_library
+    from tools.assets.fit_stiffness import CONTACT_STIFFNESS, press_library
 
     path = CONFIGS / "tactile" / "default.yaml"
     cfg = tactile_config(yaml.safe_load(path.read_text()))

@@ -194,12 +194,7 @@ def _model(said: Mapping[str, float]) -> str:
 def main(argv: list[str]) -> int:
     """Returns the exit status. Raises UserError."""
     keys = ("in", "out", "joint", "kp", "supply_voltage", "armature", "actuator")
-    own = {"joint": "*", "actuator": "xl330"}
-    for text in argv:
-        key, equals, value = text.partition("=")
-        if not equals or key not in keys:
-            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(keys)}")
-        own[key] = value
+    own = {"joint": "*", "actuator": "xl330"} | typed.settings(argv, keys)
     for key in ("in", "out"):
         if key not in own:
             raise UserError(f"say {key}=FILE (python -m dexsim.actuator.bam --help)")

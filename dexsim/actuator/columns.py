@@ -12,37 +12,11 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
+from dexsim.actuator.law import Column, brought
 from dexsim.errors import UserError
 
 INF = math.inf
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column: `neutral` is the value at which the effect is absent, `low`..`high` the values that are allowed,
-    `usual` how far a strong one on a joint of a hand lies from neutral (where that is infinite: from 0), to each side
-    that the limits leave: tests draw it so.
-
-    feature: the part of the servo's kernel that has its law and is compiled in only where a drive asks for it; empty:
-    all servos have it. asks: whether a value other than the neutral one asks for that part; False where the column says
-    nothing without another one of it. encoder: it is part of what the encoder is off by (`ENCODER`). delays: it is part
-    of a command's delay [s], at most what it says (`DELAYS`). remembers: the numbers that its law keeps from one step
-    to the next (`MEMORY`), in units of its own; it needs a feature."""
-
-    name: str
-    unit: str
-    neutral: float
-    low: float
-    high: float
-    usual: float
-    text: str
-    feature: str = ""
-    asks: bool = True
-    encoder: bool = False
-    delays: bool = False
-    remembers: tuple[str, ...] = ()
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -410,6 +384,7 @@ COLUMNS: tuple[Column, ...] = (
         feature="shape",
         asks=False,
     ),
+    *(c for law in brought().values() for c in law.columns),
 )
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)

@@ -20,6 +20,7 @@ from typing import Any
 import warp as wp
 
 from dexsim.actuator.columns import INDEX, MEMORY
+from dexsim.actuator.law import of_kind
 
 TORQUE_LIMIT, NO_LOAD_SPEED, EFFICIENCY = (INDEX[n] for n in ("torque_limit", "no_load_speed", "efficiency"))
 THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE = (
@@ -44,6 +45,30 @@ SETPOINT, SETPOINT_SPEED, SETPOINT_NEW = (MEMORY[n] for n in ("setpoint", "setpo
 DELAY, SPEED_LAG, FILTERED = INDEX["delay"], INDEX["speed_lag"], MEMORY["filtered"]
 COUPLING, SAG = INDEX["coupling"], INDEX["sag"]
 ASYMMETRY, PRESLIDING = INDEX["friction_asymmetry"], INDEX["presliding"]
+
+# -- of installed packages ---------------------------------------------------------------------------------------------
+
+
+def added(kind: str, features: frozenset[str]) -> Any:
+    """Return the Warp function of (of, q, v) that sums the laws of installed packages of one kind (`law.Law`), for a
+    kernel with these features; None where there is none."""
+    total = None
+    for law in of_kind(kind, features):
+        total = _plus(total, law.warp, INDEX[law.columns[0].name])
+    return total
+
+
+def _plus(before: Any, law: Any, at: int) -> Any:
+    @wp.func
+    def first(of: wp.array(dtype=Any), q: Any, v: Any):
+        return law(of, wp.static(at), q, v)
+
+    @wp.func
+    def both(of: wp.array(dtype=Any), q: Any, v: Any):
+        return before(of, q, v) + law(of, wp.static(at), q, v)
+
+    return first if before is None else both
+
 
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
@@ -432,6 +457,7 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
     A further such law is a function of this file and a term of `steady` here, and in `reference.dry_friction`:
     training, search and what a diagnosis hands on take their friction from these two. How a level acts on the joint is
     told by `friction_acts`; that it sticks is the kernels' own."""
+    own = added("dry_friction", features)
 
     @wp.func
     def friction(
@@ -454,6 +480,8 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
         outside: what the joint felt from outside then; carries: whether that, or a column of the feature `load`,
         counts; warm: factor on all of it."""
         steady = warm * of[COULOMB]
+        if wp.static(own is not None):
+            steady += warm * own(of, q, v)
         fading = type(q)(0.0)
         share = warm * load_share(motor, v, of[LOAD], of[LOAD_BACK])
         loaded = share * wp.abs(motor)
@@ -575,6 +603,7 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
 
     A further such law is a function of this file and a term here, and in `reference.parasitic_torque`: training, search
     and what a diagnosis hands on take their torque from these two."""
+    own = added("parasitic_torque", features)
 
     @wp.func
     def parasitic(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
@@ -590,6 +619,11 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
             wave = ripple_wave(of[RIPPLE_PER_TURN] * q + of[RIPPLE_PHASE], form)
             torque += of[RIPPLE] * wave[0]
             by_position += of[RIPPLE] * of[RIPPLE_PER_TURN] * wave[1]
+        if wp.static(own is not None):
+            more = own(of, q, v)
+            torque += more[0]
+            by_position += more[1]
+            by_speed += more[2]
         return wp.vector(torque, by_position, by_speed), memory
 
     return parasitic

@@ -12,6 +12,7 @@ import numpy as np
 
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX, MEMORY
 from dexsim.actuator.kernel import BORROWED, EDGE, SEED, SNAP, STOP_GAIN, STOP_RATE
+from dexsim.actuator.law import of_kind
 from dexsim.actuator.laws import LEAST_ROTOR
 
 Numbers = float | np.ndarray
@@ -318,7 +319,11 @@ def parasitic_torque(
         wave = (1.0 - np.abs(form)) * wave + np.abs(form) * tooth
         tilt = (1.0 - np.abs(form)) * tilt + form / np.pi
     torque, by_position = p["torque_ripple"] * wave, p["torque_ripple"] * p["ripple_per_turn"] * tilt
-    return torque, by_position, np.zeros_like(v)
+    by_speed = np.zeros_like(v)
+    for law in of_kind("parasitic_torque", features):
+        more = law.numpy(p, q, v)
+        torque, by_position, by_speed = torque + more[0], by_position + more[1], by_speed + more[2]
+    return torque, by_position, by_speed
 
 
 def gear_load_friction(
@@ -358,6 +363,8 @@ def dry_friction(
         level = level + fades * (np.abs(lost) + small * square * (motor * outside < 0.0))
     else:
         level = level + share * np.abs(motor)
+    for law in of_kind("dry_friction", features):
+        level = level + law.numpy(p, q, v)
     return level
 
 

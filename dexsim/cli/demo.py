@@ -7,8 +7,8 @@ import socket
 import webbrowser
 from pathlib import Path
 
+from dexsim import typed
 from dexsim.errors import UserError
-from dexsim.typed import whole
 
 USAGE = """usage: dexsim demo [key=value ...]
 
@@ -32,18 +32,11 @@ def main(argv: list[str]) -> int:
     if {"-h", "--help"} & set(argv):
         print(USAGE.format(policies=", ".join(policies.included())), end="")
         return 0
-    given = dict(KEYS)
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if key not in KEYS or not equals:
-            raise UserError(f"{argument}: dexsim demo takes {', '.join(f'{k}=' for k in KEYS)}")
-        given[key] = value
-    if given["policy"] not in policies.included():
-        raise UserError(f"policy={given['policy']}: must be one of {', '.join(policies.included())}")
-    if given["browser"] not in ("true", "false"):
-        raise UserError(f"browser={given['browser']}: must be true or false")
-    seconds = whole("seconds", given["seconds"], 1, 10**6) if given["seconds"] else None
-    port = whole("port", given["port"], 1, 65535) if given["port"] else None
+    given = KEYS | typed.settings(argv, KEYS)
+    typed.one_of("policy", given["policy"], policies.included())
+    typed.truth("browser", given["browser"])
+    seconds = typed.whole("seconds", given["seconds"], 1, 10**6) if given["seconds"] else None
+    port = typed.whole("port", given["port"], 1, 65535) if given["port"] else None
     from dexsim.cli import commands
     from dexsim.gap import command
 

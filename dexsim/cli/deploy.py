@@ -320,20 +320,12 @@ def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
     from dexsim.deploy.loop import LoopSettings
 
     fields = {f.name: str(f.type) for f in dataclasses.fields(LoopSettings) if f.name != "home"}
-    given: dict[str, str] = {}
+    given = typed.settings(argv, (*OWN, *fields))
     changes: dict[str, Any] = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if not equals or key not in (*OWN, *fields):
-            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join((*OWN, *fields))}")
-        if key in OWN:
-            given[key] = value
-            continue
-        if "bool" in fields[key]:
-            if value not in ("true", "false"):
-                raise UserError(f"{key}={value}: must be true or false")
-            changes[key] = value == "true"
+    for key in [k for k in given if k in fields]:
+        value, kind = given.pop(key), fields[key]
+        if "bool" in kind:
+            changes[key] = typed.truth(key, value)
         else:
-            whole = fields[key] == "int"
-            changes[key] = typed.whole(key, value) if whole else typed.number(key, value, 0.0)
+            changes[key] = typed.whole(key, value) if kind == "int" else typed.number(key, value, 0.0)
     return given, changes

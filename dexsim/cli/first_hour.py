@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import typed
 from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState, VirtualClock
 from dexsim.deploy.readings import copied, implausible
 from dexsim.errors import UserError
@@ -587,23 +588,11 @@ def main(argv: Sequence[str]) -> int:
     if argv and argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0
-    given: dict[str, Any] = dict(KEYS)
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if not equals or key not in KEYS:
-            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
-        given[key] = value
-    numbers = {}
+    given: dict[str, Any] = KEYS | typed.settings(argv, KEYS)
     for key, low, high in (("current", 10, 2000), ("excite_current", 10, 4000), ("limit", 10, 36000)):
-        try:
-            numbers[key] = float(given[key])
-        except ValueError:
-            numbers[key] = -1.0
-        if not low <= numbers[key] <= high:
-            raise UserError(f"{key}={given[key]}: must be a number of {low} to {high}")
+        typed.number(key, given[key], low, high)
     for key in ("yes", "hand_mirror"):
-        if given[key] not in ("true", "false"):
-            raise UserError(f"{key}={given[key]}: must be true or false")
+        typed.truth(key, given[key])
     names = [n for n in given["steps"].split(",") if n] or list(STEPS)
     if unknown := [n for n in names if n not in STEPS]:
         raise UserError(f"steps={unknown[0]}: must be of {', '.join(STEPS)}")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import typed
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim record ros2=STATE_TOPIC[,COMMAND_TOPIC] out=FILE.mcap [key=value ...]
@@ -35,21 +36,12 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
-    given = {"effort": "torque_Nm", "seconds": "inf"}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if not equals or key not in KEYS:
-            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
-        given[key] = value
+    given = {"effort": "torque_Nm", "seconds": "inf"} | typed.settings(argv, KEYS)
     for key in ("ros2", "out"):
         if not given.get(key):
             raise UserError(f"say {key}= (dexsim record --help)")
-    if given["effort"] not in ("torque_Nm", "current_A", "none"):
-        raise UserError(f"effort={given['effort']}: must be torque_Nm, current_A or none")
-    try:
-        seconds = float(given["seconds"])
-    except ValueError:
-        seconds = -1.0
+    typed.one_of("effort", given["effort"], ("torque_Nm", "current_A", "none"))
+    seconds = typed.real(given["seconds"])
     if not seconds > 0:
         raise UserError(f"seconds={given['seconds']}: must be a number above 0")
     from dexsim import files, outputs

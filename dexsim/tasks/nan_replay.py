@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.sim.quiet import quiet_warp
 from dexsim.tasks import make_env
@@ -64,8 +65,8 @@ def main(argv: list[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     files = [a for a in argv if "=" not in a]
-    given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if len(files) != 1 or set(given) - {"engine", "device"}:
+    given = typed.settings([a for a in argv if "=" in a], ("engine", "device"))
+    if len(files) != 1:
         raise UserError("say which dump: dexsim nan-dump FILE.npz [engine=mujoco|warp] [device=cpu]")
     device = given.get("device", "cpu")
     quiet_warp(device)

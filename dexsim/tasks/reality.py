@@ -23,6 +23,7 @@ import numpy as np
 import torch
 import yaml
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.tasks.servos import RELATIVE
@@ -204,20 +205,15 @@ def text(world: dict[str, Any]) -> str:
 
 def main(argv: list[str]) -> int:
     """`seed=N out=PATH`: draw a world and write its file."""
-    own: dict[str, Any] = {"seed": 20261121, "out": None, "hand": "xhand"}
-    for item in argv:
-        key, eq, value = item.partition("=")
-        if not eq or key not in own:
-            raise UserError(f"{item!r}: the settings are seed=N, out=PATH and hand=NAME or PATH")
-        own[key] = yaml.safe_load(value) if key == "seed" else value
-    if not isinstance(own["seed"], int) or own["seed"] < 0:
-        raise UserError(f"seed={own['seed']}: must be a whole number from 0 up")
-    if own["out"] is None:
+    own = {"seed": "20261121", "out": "", "hand": "xhand"}
+    own |= typed.settings(argv, own)
+    seed = typed.whole("seed", own["seed"])
+    if not own["out"]:
         raise UserError("out=PATH: say where to write the world, e.g. out=dexsim/configs/reality/bench.yaml")
     hand = load_hand(own["hand"])
     servo = yaml.safe_load(hand.servo_path.read_text(encoding="utf-8"))
     out = Path(own["out"]).expanduser()
-    world = draw(own["seed"], servo, hand)
+    world = draw(seed, servo, hand)
     world["name"] = out.stem
     out.write_text(text(world), encoding="utf-8")
     print(f"world    {out}")

@@ -1,6 +1,6 @@
 """Objects to grasp: primitives, irregular shapes made by `shapes.py`, and a user's own meshes.
 
-The irregular shapes are loaded from `library.npz`, which `python -m dexsim.assets.objects.bake` writes; trimesh is
+The irregular shapes are loaded from `library.npz`, which `python -m tools.assets.objects` writes; trimesh is
 imported only to read a user's mesh.
 """
 

@@ -14,8 +14,7 @@ from dexsim import files, guard
 from dexsim.assets.objects.baking import MARGIN, shape_from_hulls
 from dexsim.assets.objects.decompose import CONVEX
 from dexsim.assets.objects.geometry import mass_properties, principal_axes, simplify_hull, union_boundary
-from dexsim.assets.objects.shape import Shape
-from dexsim.assets.objects.shapes import MAX_HULLS, MAX_VERTICES
+from dexsim.assets.objects.shape import MAX_HULLS, MAX_VERTICES, Shape
 from dexsim.errors import UserError
 
 SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+MAX_VERTICES, MAX_HULLS = 32, 3
+"""Of a hull, and of a shape: what the kernels of collision and touch hold."""
+
 
 @dataclass(frozen=True)
 class Grid:

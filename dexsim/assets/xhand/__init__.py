@@ -37,7 +37,7 @@ COLUMNS, ROWS = 10, 12
 TAXELS_PER_FINGER = COLUMNS * ROWS
 
 # Collision bits. Hand geoms have contype HAND_BIT and conaffinity OBJECT_BIT; an object's geom has
-# contype OBJECT_BIT and conaffinity HAND_BIT. Bits 4 and up are the hand's own, see build.py.
+# contype OBJECT_BIT and conaffinity HAND_BIT. Bits 4 and up are the hand's own, see tools/assets/xhand_model.py.
 OBJECT_BIT, HAND_BIT = 1, 2
 
 

@@ -1,4 +1,4 @@
-"""The fingertip skin as a smooth surface through the taxel lattice, and the convex tip built from it.
+"""The fingertip skin as a smooth surface through the taxel lattice, and the points of the tip built from it.
 
 Everything here works in the *sensor axes* of a pad, in metres: a = across the pad, b = along the finger,
 c = out of the pad. They are the link axes of the distal body in another order: thumb pad (a, b, c) = link (x, y, z),
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.spatial import ConvexHull, HalfspaceIntersection, cKDTree
 
 COLUMNS, ROWS = 10, 12
 
@@ -124,18 +123,6 @@ def _chord(points: np.ndarray, axis: int) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(step)])
 
 
-def tangents(normals: np.ndarray) -> np.ndarray:
-    """Sensor x direction on the skin [..., 3] (sensor axes): across the pad, following its curve.
-
-    It is y' x n with y' the sensor's y axis (along the finger) projected on the tangent plane. On the flat of the
-    pad that is the sensor's x axis projected on the tangent plane; on the flanks, where the sensor's x axis is
-    parallel to the normal and its projection has no direction, it goes on smoothly around the finger.
-    """
-    along = np.array([0.0, 1.0, 0.0]) - normals * normals[..., 1:2]
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    return np.cross(along, normals)
-
-
 def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
                under: float = -2e-5) -> tuple[np.ndarray, np.ndarray]:
     """Dense points on the distal fingertip: (skin [n, 3], rest [m, 3]) in sensor axes.
@@ -187,58 +174,3 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
         lo, hi = np.where(ok, mid, lo), np.where(ok, hi, mid)
     rest = starts + rays * lo[:, None]
     return skin.reshape(-1, 3), rest
-
-
-def hull_distance(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
-    """Signed distance [n] to the planes of a convex hull: positive outside (a lower bound there), exact inside."""
-    return (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
-
-
-TIP_MARGIN = 0.0015
-"""Rounding of the fingertips [m]: the collision mesh is the tip shrunk by this, and its geom's `margin` adds it back.
-The mesh itself then never overlaps an object (rubber yields about 1 mm), so that the collision of convex shapes stays a
-distance query, several times cheaper than a penetration query, and the edges of its facets are rounded."""
-
-
-def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: float = 1.5e-4) -> np.ndarray:
-    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the
-    points at least TIP_MARGIN inside the tip.
-
-    Greedy: add the dense point farthest outside the present hull, and its mirror image. Skin points are raised by
-    `raise_by` along the normal first, so that the facets' sagging is spread to both sides of the skin; points
-    of the back count a tenth, for nothing is measured there.
-    """
-    u, v = lattice.grid(73, 89)
-    skin, normal = lattice.position(u, v).reshape(-1, 3), lattice.normal(u, v).reshape(-1, 3)
-    _, rest = tip_points(lattice, pad)
-    raised = skin + normal * (raise_by * lattice.regular(u, v).reshape(-1, 1))
-    whole = np.concatenate([raised, rest])
-    planes = np.unique(ConvexHull(whole).equations.round(9), axis=0) + [0, 0, 0, TIP_MARGIN]
-    points = HalfspaceIntersection(planes, whole.mean(axis=0)).intersections
-    points = np.unique(points[np.isfinite(points).all(axis=1)].round(8), axis=0)
-    near = cKDTree(whole).query(points)[1]
-    weight = np.where(near < len(raised), 1.0, 0.1)
-    half = points[:, 0] >= -1e-6
-    points, weight = points[half], weight[half]
-    points[:, 0] = np.where(points[:, 0] < 2e-5, 0.0, points[:, 0])
-
-    chosen: list[int] = []
-    for direction in [(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (1, -1, 1), (1, -1, -1), (1, 1, 1)]:
-        index = int(np.argmax(points @ np.array(direction, dtype=float)))
-        if index not in chosen:
-            chosen.append(index)
-
-    def mirrored(index: list[int]) -> np.ndarray:
-        half = points[index]
-        other = half[half[:, 0] > 0] * np.array([-1.0, 1.0, 1.0])
-        return np.concatenate([half, other])
-
-    while True:
-        hull = ConvexHull(mirrored(chosen))
-        distance = hull_distance(points, hull) * weight
-        best = int(np.argmax(distance))
-        if distance[best] < 5e-6 or len(mirrored([*chosen, best])) > vertices:
-            break
-        chosen.append(best)
-    out = mirrored(chosen)
-    return out[ConvexHull(out).vertices]

@@ -1,4 +1,4 @@
-"""Write xhand_right.xml, meshes/*.obj and the derived taxel columns: `python -m dexsim.assets.xhand.build`.
+"""Write xhand_right.xml, meshes/*.obj and the derived taxel columns: `python -m tools.assets.xhand_model`.
 
 Input: joints.csv, bodies.csv and the x, y, z columns of taxels_*.csv (measured). The results are committed.
 """
@@ -9,10 +9,11 @@ import csv
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull, HalfspaceIntersection, cKDTree
 
 from dexsim.assets import xhand
-from dexsim.assets.xhand import shells
-from dexsim.assets.xhand.surface import PADS, TIP_MARGIN, Lattice, tangents, tip_hull, tip_points, to_link, to_sensor
+from dexsim.assets.xhand.surface import PADS, Lattice, PadShape, tip_points, to_link, to_sensor
+from tools.assets import shells
 
 # Neither is published. Armature: the order of magnitude of a small geared motor's rotor seen at the joint
 # (g cm^2 times a gear ratio of 100 to 200 squared); several times the links' own inertia about the joint.
@@ -111,7 +112,7 @@ def write_skin(pad_name: str) -> None:
     """The surface that carries a pad's taxels, to the last bit, for hand.yaml."""
     finger = next(f for f in xhand.FINGERS if xhand.pad_of(f) == pad_name)
     vertices, faces = xhand.tip_skin_mesh(finger)
-    lines = ["# dexsim, drawn by dexsim/assets/xhand/build.py; metres: the surface that carries the taxels"]
+    lines = ["# dexsim, drawn by tools/assets/xhand_model.py; metres: the surface that carries the taxels"]
     lines += ["v " + " ".join(repr(float(x)) for x in v) for v in vertices]
     lines += ["f " + " ".join(str(int(k) + 1) for k in f) for f in faces]
     (xhand.FOLDER / f"skin_{pad_name}_hull.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
@@ -187,7 +188,7 @@ def build() -> str:
     folder = xhand.FOLDER / "meshes"
     folder.mkdir(exist_ok=True)
     for name, mesh in meshes.items():
-        shells.write_obj(folder / f"{name}.obj", mesh, "dexsim, drawn by dexsim/assets/xhand/build.py; metres")
+        shells.write_obj(folder / f"{name}.obj", mesh, "dexsim, drawn by tools/assets/xhand_model.py; metres")
 
     bodies = {row["body"]: row for row in _read("bodies.csv")}
     joints = {row["body"]: row for row in _read("joints.csv")}
@@ -314,8 +315,75 @@ def _visual(body: str, visuals: dict) -> list[str]:
     return out
 
 
+def tangents(normals: np.ndarray) -> np.ndarray:
+    """Sensor x direction on the skin [..., 3] (sensor axes): across the pad, following its curve.
+
+    It is y' x n with y' the sensor's y axis (along the finger) projected on the tangent plane. On the flat of the
+    pad that is the sensor's x axis projected on the tangent plane; on the flanks, where the sensor's x axis is
+    parallel to the normal and its projection has no direction, it goes on smoothly around the finger.
+    """
+    along = np.array([0.0, 1.0, 0.0]) - normals * normals[..., 1:2]
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.cross(along, normals)
+
+
+def hull_distance(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
+    """Signed distance [n] to the planes of a convex hull: positive outside (a lower bound there), exact inside."""
+    return (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
+
+
+TIP_MARGIN = 0.0015
+"""Rounding of the fingertips [m]: the collision mesh is the tip shrunk by this, and its geom's `margin` adds it back.
+The mesh itself then never overlaps an object (rubber yields about 1 mm), so that the collision of convex shapes stays a
+distance query, several times cheaper than a penetration query, and the edges of its facets are rounded."""
+
+
+def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: float = 1.5e-4) -> np.ndarray:
+    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the
+    points at least TIP_MARGIN inside the tip.
+
+    Greedy: add the dense point farthest outside the present hull, and its mirror image. Skin points are raised by
+    `raise_by` along the normal first, so that the facets' sagging is spread to both sides of the skin; points
+    of the back count a tenth, for nothing is measured there.
+    """
+    u, v = lattice.grid(73, 89)
+    skin, normal = lattice.position(u, v).reshape(-1, 3), lattice.normal(u, v).reshape(-1, 3)
+    _, rest = tip_points(lattice, pad)
+    raised = skin + normal * (raise_by * lattice.regular(u, v).reshape(-1, 1))
+    whole = np.concatenate([raised, rest])
+    planes = np.unique(ConvexHull(whole).equations.round(9), axis=0) + [0, 0, 0, TIP_MARGIN]
+    points = HalfspaceIntersection(planes, whole.mean(axis=0)).intersections
+    points = np.unique(points[np.isfinite(points).all(axis=1)].round(8), axis=0)
+    near = cKDTree(whole).query(points)[1]
+    weight = np.where(near < len(raised), 1.0, 0.1)
+    half = points[:, 0] >= -1e-6
+    points, weight = points[half], weight[half]
+    points[:, 0] = np.where(points[:, 0] < 2e-5, 0.0, points[:, 0])
+
+    chosen: list[int] = []
+    for direction in [(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (1, -1, 1), (1, -1, -1), (1, 1, 1)]:
+        index = int(np.argmax(points @ np.array(direction, dtype=float)))
+        if index not in chosen:
+            chosen.append(index)
+
+    def mirrored(index: list[int]) -> np.ndarray:
+        half = points[index]
+        other = half[half[:, 0] > 0] * np.array([-1.0, 1.0, 1.0])
+        return np.concatenate([half, other])
+
+    while True:
+        hull = ConvexHull(mirrored(chosen))
+        distance = hull_distance(points, hull) * weight
+        best = int(np.argmax(distance))
+        if distance[best] < 5e-6 or len(mirrored([*chosen, best])) > vertices:
+            break
+        chosen.append(best)
+    out = mirrored(chosen)
+    return out[ConvexHull(out).vertices]
+
+
 _TEMPLATE = """\
-<!-- Right xHand v1.3, written by dexsim/assets/xhand/build.py from joints.csv, bodies.csv and taxels_*.csv;
+<!-- Right xHand v1.3, written by tools/assets/xhand_model.py from joints.csv, bodies.csv and taxels_*.csv;
      do not edit by hand. World frame = palm frame: x along the fingers, y to the little finger, z out of the palm. -->
 <mujoco model="xhand_right">
   <compiler angle="radian" meshdir="meshes" autolimits="true"/>

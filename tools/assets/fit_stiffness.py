@@ -1,4 +1,4 @@
-"""Choose the foundation stiffness: `python -m dexsim.tactile.fit_stiffness`.
+"""Choose the foundation stiffness: `python -m tools.assets.fit_stiffness`.
 
 Presses primitives and the object library on each kind of pad and compares the plain sum of springs with the contact law
 of the physics, force = K * depth (K is our assumption: 5 N at 0.71 mm). For each force law it prints the stiffness at

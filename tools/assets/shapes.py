@@ -14,8 +14,6 @@ import numpy as np
 from dexsim.assets.objects.geometry import hull_vertices, mass_properties, principal_axes, union_boundary
 
 EXTENT = 0.060  # m, largest extent at scale 1
-MAX_VERTICES = 32
-MAX_HULLS = 3
 
 Hulls = list[np.ndarray]
 

@@ -1,4 +1,4 @@
-"""Bakes the irregular shapes into `library.npz`: `python -m dexsim.assets.objects.bake [--picture PATH.png]`."""
+"""Bakes the irregular shapes into `library.npz`: `python -m tools.assets.objects [--picture PATH.png]`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dexsim import files
 from dexsim.assets.objects.baking import pack, shape_from_hulls
 from dexsim.assets.objects.geometry import union_boundary
 from dexsim.assets.objects.shape import Shape
-from dexsim.assets.objects.shapes import SHAPES, hulls_of
+from tools.assets.shapes import SHAPES, hulls_of
 
-LIBRARY = Path(__file__).with_name("library.npz")
+LIBRARY = Path(__file__).resolve().parents[2] / "dexsim" / "assets" / "objects" / "library.npz"
 
 
 def bake_all() -> dict[str, Shape]:
