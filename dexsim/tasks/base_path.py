@@ -29,7 +29,6 @@ GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s2, the palm up
 LEAST_ROWS, MOST_S = 4, 60.0
 MOST_ACCELERATION, MOST_SPIN = 100.0, 2.5  # m/s2, rad/s: a faster turn throws things outwards, which gravity cannot say
 LIFT, LIFT_S = 0.3, 0.75  # m up along the palm's normal, s: minimum jerk
-REST_S = 1.0  # s
 SHAKE, SHAKE_HZ, SHAKES = 0.02, 3.0, 2  # m either way, 1/s, periods along the fingers, then across them
 
 

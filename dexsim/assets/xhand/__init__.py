@@ -28,11 +28,6 @@ TIP_BODIES = (
     "right_hand_mid_link2", "right_hand_ring_link2", "right_hand_pinky_link2",
 )  # fmt: skip
 TIP_GEOMS = tuple(f"tip_{finger}" for finger in FINGERS)
-TIP_SITES = tuple(f"tip_{finger}" for finger in FINGERS)
-JOINTS_OF_FINGER = {
-    "thumb": (0, 1, 2), "index": (3, 4, 5), "mid": (6, 7), "ring": (8, 9), "pinky": (10, 11),
-}  # fmt: skip
-FLEXION_ROOT = {"thumb": 1, "index": 4, "mid": 6, "ring": 8, "pinky": 10}  # joint index whose torque closes the finger
 COLUMNS, ROWS = 10, 12
 TAXELS_PER_FINGER = COLUMNS * ROWS
 
