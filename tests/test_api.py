@@ -154,3 +154,14 @@ def test_an_environment_a_policy_and_its_episodes(tmp_path, monkeypatch):
         policy="zero", episodes=2, device="cpu", settings=["worlds=2"], out=tmp_path / "it's here, [played]"
     )
     assert metrics["episodes"] == 2 and (tmp_path / "it's here, [played]" / "metrics.json").is_file()
+
+
+@pytest.mark.slow
+def test_wrong_names_are_red_in_an_editor(tmp_path):
+    from mypy import api
+
+    lines = ('env.stpe(1)', 'dexsim.train(taks="x")', "dexsim.PPO(gama=0.9)", "dexsim.diagnose([]).findngs")
+    page = tmp_path / "typo.py"
+    page.write_text("\n".join(("import dexsim", "env = dexsim.make_env()", *lines)) + "\n")
+    said = api.run(["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports=silent", str(page)])[0]
+    assert [f"typo.py:{k}:" in said for k in range(1, 7)] == [False, False, True, True, True, True], said
