@@ -321,7 +321,7 @@ BAD = {
     "degrees": (lambda t: t.replace('upper="1.7"', 'upper="97"', 1), r"joint 'index_1'.*in degrees"),
     "endless": (
         lambda t: t.replace('name="ring_1" type="revolute"', 'name="ring_1" type="continuous"'),
-        r"joint 'ring_1' is continuous",
+        r"joint 'ring_1' has no limits",
     ),
     "one name twice": (lambda t: t.replace("ring_far", "middle_far"), r"two links have the name 'middle_far'"),
     "millimetres": (lambda t: _scaled(t), r"longest finger is .* m, allowed .*millimetres"),

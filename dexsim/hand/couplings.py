@@ -61,6 +61,11 @@ class Couplings:
             if (found := _fixed(m, t)) is None:
                 continue
             found, low, high = _tied(m, t, found)
+            for at, other, law in self._laws[::-1]:  # a tendon pulls what follows by pulling its leader
+                if found[at] and other >= 0 and _joint(m, other) in free:
+                    still = found[at] * (m.qpos0[at] + law[0] - law[1] * m.qpos0[other])
+                    found[other] += law[1] * found[at]
+                    found[at], low, high = 0.0, low - still, high - still
             if np.isfinite([low, high]).any():
                 self._rows.append((found, low, high))
                 held |= {int(a) for a in np.flatnonzero(found)}
@@ -94,13 +99,8 @@ class Couplings:
         """Return qpos [..., nq] with the joints that follow where the others hold them. A new tensor."""
         import torch
 
-        m, q = self.model, qpos.clone()
-        for at, other, law in self._laws:
-            x = q[..., other] - m.qpos0[other] if other >= 0 else torch.zeros_like(q[..., at])
-            total = torch.full_like(x, float(law[4]))
-            for c in law[3::-1]:
-                total = total * x + float(c)
-            q[..., at] = m.qpos0[at] + total
+        q = qpos.clone()
+        self._follow(q)
         if self._free:
             free, rest, low, high, rows = self._tensors(q)
             q[..., free] = rest.clamp(low, high)
@@ -113,7 +113,21 @@ class Couplings:
                     most = max(most, float(miss.abs().max())) if q.device.type == "cpu" else 1.0
                 if most < CLOSE:  # nobody waits for a GPU to say so
                     break
+            if any(other in self._free for _, other, _ in self._laws):
+                self._follow(q)
         return q
+
+    def _follow(self, q: torch.Tensor) -> None:
+        """Place in q [..., nq] what follows another joint by an equality."""
+        import torch
+
+        m = self.model
+        for at, other, law in self._laws:
+            x = q[..., other] - m.qpos0[other] if other >= 0 else torch.zeros_like(q[..., at])
+            total = torch.full_like(x, float(law[4]))
+            for c in law[3::-1]:
+                total = total * x + float(c)
+            q[..., at] = m.qpos0[at] + total
 
     def _tensors(self, q: torch.Tensor) -> tuple[Any, ...]:
         """Return addresses, rest and limits [F] of the joints that tendons hold, and groups of rows, one a tendon, that
@@ -124,7 +138,7 @@ class Couplings:
         key = (q.device, q.dtype)
         if key not in self._on:
             m, at = self.model, self._free
-            joints = [int(np.flatnonzero(m.jnt_qposadr == a)[0]) for a in at]
+            joints = [_joint(m, a) for a in at]
             limits = np.where(m.jnt_limited[joints, None], m.jnt_range[joints], [-np.inf, np.inf])
             rest = np.where(m.jnt_stiffness[joints] > 0, m.qpos_spring[at], m.qpos0[at])
 
@@ -172,6 +186,11 @@ class Couplings:
 
 def _one_dof(m: mujoco.MjModel, j: int) -> bool:
     return int(m.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def _joint(m: mujoco.MjModel, address: int) -> int:
+    """Return the joint whose position stands at an address of qpos."""
+    return int(np.flatnonzero(m.jnt_qposadr == address)[0])
 
 
 def _fixed(m: mujoco.MjModel, t: int) -> np.ndarray | None:

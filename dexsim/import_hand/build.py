@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,7 +129,7 @@ def build(
             if not len(faces):
                 continue
             file = f"{_safe(m.body(b).name)}_{n}.obj"
-            while file in out.meshes:  # names that differ in a dot or a case alone
+            while file.lower() in {other.lower() for other in out.meshes}:  # names that differ in a dot or a case alone
                 file = f"_{file}"
             out.meshes[file] = obj(vertices, faces)
             files.append(file)
@@ -149,7 +150,7 @@ def build(
     assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
     apart = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
     out.xml = _TEMPLATE.format(
-        name=_t(name), note=note.replace("--", "-"), assets=assets, bodies="\n".join(lines), solref=SOLREF,
+        name=_t(name), note=re.sub("-{2,}", "-", note), assets=assets, bodies="\n".join(lines), solref=SOLREF,
         margin=MARGIN,
         contact=(f"\n  <contact>\n{apart}\n  </contact>" if apart else "") + tendons + equalities,
     )  # fmt: skip
@@ -174,41 +175,45 @@ def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> str:
 def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]) -> tuple[list[str], str, str]:
     """Return lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
     names = {m.joint(j).name for j in tree.every}
-    drums, tendons, ties = [], [], []
+    drums, tendons, ties, kept = [], [], [], set()
     for pull in pulls:
-        arms = {j: c for j, c in pull.arms.items() if j in names}
-        at = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in arms.items())
+        at = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in pull.arms.items())
         drum = _t(f"{DRIVE}{pull.name}")
         drums.append(
             f'      <body name="{drum}"><inertial pos="0 0 0" mass="1e-4" diaginertia="1e-9 1e-9 1e-9"/><joint'
             f' name="{_t(pull.name)}" axis="0 0 1" range="{_n(pull_range(m, pull))}" ref="{_n(at)}"'
             f' armature="{_n(figures.armature[pull.name])}" damping="{_n(figures.damping[pull.name])}"/></body>'
         )
-        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in {**arms, pull.name: -1.0}.items())
+        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in {**pull.arms, pull.name: -1.0}.items())
         tendons.append(f'    <fixed name="{drum}">{along}</fixed>')
         ties.append(f'    <tendon tendon1="{drum}" solref="{TIE}"/>')
     for t in range(m.ntendon):
         wraps = range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t])
         arms = {m.joint(m.wrap_objid[w]).name: m.wrap_prm[w] for w in wraps}
-        if not set(arms) <= names:
+        still = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in arms.items() if j not in names)
+        arms = {j: c for j, c in arms.items() if j in names}
+        if not arms:
             continue
+        kept.add(t)
         along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in arms.items())
         own = "".join(f' {key}="{_n(value)}"' for key, value in (
             ("stiffness", m.tendon_stiffness[t]), ("damping", m.tendon_damping[t]),
-            ("frictionloss", m.tendon_frictionloss[t])) if value)  # fmt: skip
+            ("armature", m.tendon_armature[t]), ("frictionloss", m.tendon_frictionloss[t])) if value)  # fmt: skip
         if m.tendon_stiffness[t]:
-            own += f' springlength="{_n(m.tendon_lengthspring[t])}"'
+            own += f' springlength="{_n(m.tendon_lengthspring[t] - still)}"'
         if m.tendon_limited[t]:
-            own += f' range="{_n(m.tendon_range[t])}"'
+            own += f' range="{_n(m.tendon_range[t] - still)}"'
         tendons.append(f'    <fixed name="{_t(m.tendon(t).name or f"tendon_{t}")}"{own}>{along}</fixed>')
     for e in range(m.neq):
         pair = [int(m.eq_obj1id[e]), int(m.eq_obj2id[e])]
         if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT:
-            what, of = "joint", [m.joint(k).name for k in pair if k >= 0]
-            if not set(of) <= names:
+            what, of = "joint", [m.joint(k).name for k in pair if k >= 0 and m.joint(k).name in names]
+            if m.joint(pair[0]).name not in names:
                 continue
         else:
-            what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k >= 0]
+            what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k in kept]
+            if pair[0] not in kept:
+                continue
         both = " ".join(f'{what}{n}="{_t(x)}"' for n, x in enumerate(of, 1))
         ties.append(f'    <{what} {both} polycoef="{_n(m.eq_data[e, :5])}" solref="{TIE}"/>')
     return (

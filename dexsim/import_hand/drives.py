@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
 import numpy as np
+
+OF_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)  # the same of a hinge and of a slide
 
 
 @dataclass
@@ -40,20 +43,23 @@ def read(spec: mujoco.MjSpec) -> Drives:
     Several actuators on one joint add up: `position` beside `velocity` is a PD drive.
     """
     out = Drives()
-    unused: dict[str, list[str]] = {}
+    skipped: dict[str, list[str]] = {}
+    drums: dict[str, str] = {}  # by tendon, what pulls it
 
     def leave(what: str, name: str) -> None:
-        unused.setdefault(what, []).append(name)
+        skipped.setdefault(what, []).append(name)
 
     for k, a in enumerate(spec.actuators):
         name = a.name or a.target or f"actuator {k}"
-        at = a.target
-        if a.trntype == mujoco.mjtTrn.mjTRN_TENDON and (arms := fixed_arms(spec.tendon(a.target))):
-            at = name if spec.joint(name) is None else f"{name}_drive"
-            tendon = spec.tendon(a.target)
-            low, high = (float(x) for x in (tendon.range if np.ptp(tendon.range) > 0 else a.ctrlrange))
-            out.pulls.append(Pull(at, arms, (low, high) if low < high else None))
-        elif a.trntype != mujoco.mjtTrn.mjTRN_JOINT or spec.joint(a.target) is None:
+        at, tendon = a.target, spec.tendon(a.target) if a.trntype == mujoco.mjtTrn.mjTRN_TENDON else None
+        if tendon is not None and (arms := fixed_arms(tendon)):
+            at = drums.setdefault(a.target, name if spec.joint(name) is None else f"{name}_drive")
+            ends = np.array(tendon.range, float) if tendon.limited != 0 else np.zeros(2)
+            if not np.ptp(ends) and a.biasprm[1] < 0 and a.ctrllimited != 0 and a.gear[0]:  # commands are lengths
+                ends = np.sort(np.array(a.ctrlrange, float) * a.gainprm[0] / (-a.biasprm[1] * a.gear[0]))
+            if all(p.name != at for p in out.pulls):
+                out.pulls.append(Pull(at, arms, (float(ends[0]), float(ends[1])) if np.ptp(ends) else None))
+        elif a.trntype not in OF_JOINT or spec.joint(a.target) is None:
             leave("actuators that do not turn a joint", name)
             continue
         else:
@@ -69,6 +75,9 @@ def read(spec: mujoco.MjSpec) -> Drives:
             reach = float(np.abs(a.forcerange).max()) * abs(gear)
         if not affine and a.ctrllimited != 0 and np.abs(a.ctrlrange).max() > 0:
             most = float(np.abs(a.ctrlrange).max() * abs(gain[0] * gear))
+            reach = min(reach, most) if reach else most
+        if tendon is not None and tendon.actfrclimited != 0 and np.abs(tendon.actfrcrange).max() > 0:
+            most = float(np.abs(tendon.actfrcrange).max())
             reach = min(reach, most) if reach else most
         if reach > 0:
             out.effort[at] = out.effort.get(at, 0.0) + reach
@@ -90,9 +99,22 @@ def read(spec: mujoco.MjSpec) -> Drives:
                 turn = np.degrees(1.0) if _degrees(spec) and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
                 if span > 0 and np.abs(ends * turn - np.array(joint.range, float)).max() > 0.01 * span:
                     leave("ctrlrange (commands reach the joint's own range)", name)
+        if a.armature or np.any(a.damping):
+            leave("armature and damping of actuators", name)
         if a.dyntype != mujoco.mjtDyn.mjDYN_NONE:
             leave("the time constant of a filter", name)
-    out.notes = [f"not used: {what}: {', '.join(names)}" for what, names in unused.items()]
+    out.notes = [f"not used: {what}: {', '.join(names)}" for what, names in skipped.items()]
+    return out
+
+
+def within(pulls: Iterable[Pull], m: mujoco.MjModel, names: set[str]) -> list[Pull]:
+    """Return the pulls of a hand's joints `names`: what a tendon passes before the palm stands still, as drawn."""
+    out = []
+    for p in pulls:
+        arms = {j: c for j, c in p.arms.items() if j in names}
+        still = sum(c * float(m.qpos0[m.joint(j).qposadr[0]]) for j, c in p.arms.items() if j not in names)
+        if arms:
+            out.append(Pull(p.name, arms, p.range and (p.range[0] - still, p.range[1] - still)))
     return out
 
 
@@ -123,18 +145,26 @@ def contacts(spec: mujoco.MjSpec) -> list[str]:
     return [f"not used: {', '.join(said)} of the file's shapes: dexsim has its own law of contact"] if said else []
 
 
-def joints(spec: mujoco.MjSpec) -> list[str]:
-    """Return lines for what the file says of joints and links and dexsim's hand does not have."""
-    plain = mujoco.MjSpec().worldbody.add_body().add_joint()
+def unused(spec: mujoco.MjSpec) -> list[str]:
+    """Return lines for what the file says of joints, links and what ties them, and dexsim's hand does not have."""
+    plain = mujoco.MjSpec()
+    law = ("solref_limit", "solimp_limit", "solref_friction", "solimp_friction")
+    groups = (
+        ("joints", spec.joints, plain.worldbody.add_body().add_joint(), ("margin", *law, "actgravcomp")),
+        ("tendons", spec.tendons, plain.add_tendon(), ("margin", *law)),
+        ("equalities", spec.equalities, plain.add_equality(), ("solref", "solimp")),
+    )
     out = []
-    for what in ("margin", "solref_limit", "solimp_limit", "solref_friction", "solimp_friction", "actgravcomp"):
-        names = [j.name for j in spec.joints if not np.allclose(getattr(j, what), getattr(plain, what))]
-        if names:
-            out.append(f"not used: {what.replace('solref_', 'solref').replace('solimp_', 'solimp')} of joints"
-                       f" {', '.join(names)}")  # fmt: skip
+    for kind, items, usual, attributes in groups:
+        for what in attributes:
+            names = [x.name or getattr(x, "name1", "") for x in items
+                     if not np.allclose(getattr(x, what), getattr(usual, what))]  # fmt: skip
+            if names:
+                said = what.replace("solref_", "solref").replace("solimp_", "solimp")
+                out.append(f"not used: {said} of {kind} {', '.join(names)}")
     for what in ("stiffness", "damping"):
-        names = [j.name for j in spec.joints if np.any(np.ravel(getattr(j, what))[1:])]
+        names = [j.name for j in [*spec.joints, *spec.tendons] if np.any(np.ravel(getattr(j, what))[1:])]
         if names:
-            out.append(f"not used: the higher terms of {what} of joints {', '.join(names)}")
+            out.append(f"not used: the higher terms of {what} of {', '.join(names)}")
     floating = [b.name for b in spec.bodies if b.gravcomp]
     return out + ([f"not used: gravcomp of links {', '.join(floating)}"] if floating else [])

@@ -16,6 +16,7 @@ from dexsim.import_hand.tree import Tree
 PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
 SPEED = 6.0  # rad/s, of a small geared motor, where no file says it
 MESH = 12.0  # times the size of the hand, or a twelve-hundredth of it: no mesh of a hand is so large, or so small
+ANY_MESH = (3e-4, 1.0)  # m, of any hand
 BODY = 3.0  # m within which a hand's joints lie
 REACH = (0.015, 0.6)  # m from a finger's root to its tip
 LINK_MASS = (1e-4, 3.0)  # kg
@@ -161,7 +162,7 @@ def mesh_sizes(source: Source, tree: Tree) -> None:
         if m.geom_bodyid[g] not in bodies or m.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
             continue
         size = float(np.ptp(geometry.geom_surface(m, g)[0], axis=0).max())
-        if hand / (100 * MESH) < size < hand * MESH:
+        if max(hand / (100 * MESH), ANY_MESH[0]) < size < min(hand * MESH, ANY_MESH[1]):
             continue
         units = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
         unit, factor = min(units, key=lambda u: abs(np.log(max(size, 1e-9) * u[1] / (0.5 * hand))))
@@ -184,7 +185,7 @@ def _limits(m: mujoco.MjModel, j: int, where: str, stated: tuple[float, float] |
         state = f"limits {low:g} to {high:g} {unit}" if stated or m.jnt_limited[j] else "no limits"
         raise UserError(
             f"{where}: joint '{name}' has {state}; give it two, low < high"
-            " (URDF: <limit lower= upper=>, MJCF: range=), or make it fixed"
+            ' (URDF: type="revolute" with <limit lower= upper=>, MJCF: range=), or make it fixed'
         )
     if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and max(abs(low), abs(high)) > 2 * np.pi + 0.01:
         raise UserError(

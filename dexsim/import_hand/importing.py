@@ -17,6 +17,7 @@ from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import (
     build,
     corrections,
+    drives,
     figures,
     folder,
     frame,
@@ -26,6 +27,7 @@ from dexsim.import_hand import (
     shapes,
     source,
     taxels,
+    ties,
     tree,
 )
 from dexsim.import_hand import skin as links
@@ -95,7 +97,7 @@ def import_hand(
     found.passive = {j for j in found.every if m.joint(j).name in robot.passive}
     figures.mesh_sizes(robot, found)
     mended = figures.mended(robot, found, settings.inertia)
-    pulls = [p for p in robot.drives.pulls if set(p.arms) <= {m.joint(j).name for j in found.every}]
+    pulls = drives.within(robot.drives.pulls, m, {m.joint(j).name for j in found.every})
     fixes = _corrections(out, note, found, m, settings, _driven(m, found, pulls))
     guessed: list[str] = []
 
@@ -112,6 +114,10 @@ def import_hand(
              f"taken apart: {text}: each of these joints has a motor of its own here")  # fmt: skip
     if found.left:
         tell(f"fixed: {', '.join(found.left)} (before the palm '{m.body(found.palm).name}')")
+
+    undriven = [m.joint(j).name for j in found.joints if m.joint(j).name not in robot.drives.moved]
+    if robot.drives.moved and undriven and settings.coupled == "keep":
+        tell(f"check:   no actuator of the file moves {', '.join(undriven)}: each has a motor of its own here")
 
     motions, doubts = _motions(m, found.fingers, fixes, pick, pulls)
     said = fixes.pick("opposing", None)
@@ -156,16 +162,20 @@ def import_hand(
     for text in known.warnings:
         tell(f"check:   {text}")
 
+    reach = ties.reach(m, found.joints, where)
+    for j, (low, high, follower) in reach.items():
+        tell(f"check:   joint '{m.joint(j).name}' goes from {low:.3g} to {high:.3g} only: there '{follower}', which"
+             " follows it, is at its limit")  # fmt: skip
     made = shapes.make(m, found, motions, palm)
     name = settings.name or _word(fixes.pick("name", robot.name))
     text = f"{name}: written by dexsim import-hand from {model.name}"
     apart = poses.near_the_palm(m, found)
     own = build.build(name, m, found, made, known, apart, text, pulls)
-    search = _search(own, m, found, motions, thumbs, palm, pulls)
+    search = _search(own, m, found, motions, thumbs, palm, pulls, reach)
     drawn = poses.always_overlapping(search)
     if drawn:
         own = build.build(name, m, found, made, known, apart + drawn, text, pulls)
-        search = _search(own, m, found, motions, thumbs, palm, pulls)
+        search = _search(own, m, found, motions, thumbs, palm, pulls, reach)
     never, meet = poses.meetings(search)
     tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
          f" corners at most; {1e3 * made.error[0]:.1f} mm off the links; {meet} pairs of links can meet")  # fmt: skip
@@ -312,9 +322,13 @@ def _search(
     thumbs: list[int],
     palm: frame.Palm,
     pulls: list[Pull],
+    reach: dict[int, tuple[float, float, str]],
 ) -> poses.Search:
-    """The search over the hand's own model, whose ids differ from the source's."""
+    """Return the search over the hand's own model, whose ids differ from the source's. reach: by id of a joint, where
+    its followers let it go."""
     new = own.compile()
+    for j, (low, high, _) in reach.items():
+        new.jnt_range[new.joint(m.joint(j).name).id] = low, high
     moved = []
     for x in motions:
         finger = tree.Finger(x.finger.name, [new.joint(m.joint(j).name).id for j in x.finger.joints],
@@ -436,6 +450,7 @@ def _hand(
     for x in motions:
         n = x.finger.name
         own, flexion, closes = _of_drives(m, found, x, pulls)
+        pulls = [p for p in pulls if p.name not in own]  # one that pulls several fingers is the first one's
         pad = None
         if n in pads:
             pad = {"taxels": f"taxels_{n}.csv", "kind": fixes.pick(f"fingers.{n}.pad.kind", "finger"),
@@ -475,9 +490,9 @@ def _of_drives(
     bends = {m.joint(j).name: int(c) for j, c in zip(x.flexion, x.closes, strict=True)}
     flexion = {n: bends[n] for n in own if n in bends}
     for pull in mine:
-        votes = sum(np.sign(c) * bends[j] for j, c in pull.arms.items() if j in bends)
+        votes = [c * bends[j] for j, c in pull.arms.items() if j in bends]
         if votes:
-            flexion[pull.name] = int(np.sign(votes))
+            flexion[pull.name] = int(np.sign(sum(votes) or votes[0]))
     return own + [p.name for p in mine], list(flexion), list(flexion.values())
 
 

@@ -24,6 +24,7 @@ both its limits; with film=true also check.mp4 (seconds: of each joint's move). 
 dexsim (xhand; then with out=); hand_mirror=true checks its mirror image.
 """
 STEPS = 25  # poses each way
+STEP = (0.1, 0.25)  # of its range, that a joint closes: a tip near the others may go past them
 RATE = 12  # pictures a second
 
 
@@ -83,14 +84,16 @@ def moves(hand: Hand) -> list[Move]:
             sign = hand.fingers[finger].closes[hand.fingers[finger].flexion.index(j)]
             role = f"bends, closes to {'+' if sign > 0 else '-'}"
             goal = hand.others if finger in hand.opposing else hand.opposing
-            q = start.copy()
-            step = 0.25 * (hand.limits[j, 1] - hand.limits[j, 0])
-            q[j] = np.clip(start[j] + sign * step, *hand.limits[j])
-            before, after = tips(start), tips(q)[finger]
+            now, after = tips(start), []
+            for share in STEP:
+                q = start.copy()
+                q[j] = np.clip(start[j] + sign * share * np.ptp(hand.limits[j]), *hand.limits[j])
+                after.append(tips(q)[finger])
             # a claw's finger closes on the middle of the others, which may lead off the one that opposes it
             others = [list(goal), [k for k in range(len(hand.fingers)) if k != finger]]
-            middles = [before[group].mean(0) for group in others]
-            closer = max(float(np.linalg.norm(before[finger] - x) - np.linalg.norm(after - x)) for x in middles)
+            middles = [now[group].mean(0) for group in others]
+            far = [[float(np.linalg.norm(tip - x)) for tip in (now[finger], *after)] for x in middles]
+            closer = max(d[0] - min(d[1:]) for d in far)
         out.append(Move(name, finger, role, travel, closer, first))
     return out
 

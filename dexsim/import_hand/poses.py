@@ -151,6 +151,10 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
         if np.sqrt(2 * cost / len(s.motions)) < GOOD:
             break
     assert best is not None  # the first start is better than none
+    for share in np.linspace(1.0, 0.3, 15):  # less far, where links would overlap
+        q = s.complete(np.clip(pose(s.rest + share * (best - s.rest)), m.jnt_range[:, 0], m.jnt_range[:, 1]))
+        if max((d for _, _, d in s.overlaps(q)), default=0.0) <= 2 * TOUCH:
+            return q, float(np.sqrt(2 * cost / len(s.motions)))
     return s.complete(np.clip(best, m.jnt_range[:, 0], m.jnt_range[:, 1])), float(np.sqrt(2 * cost / len(s.motions)))
 
 

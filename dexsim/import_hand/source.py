@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim import files, guard, model_file
 from dexsim.errors import UserError
-from dexsim.import_hand import drives, inertias, urdf
+from dexsim.import_hand import drives, inertias, ties, urdf
 from dexsim.import_hand.drives import Drives
 from dexsim.import_hand.inertias import Moments
 
@@ -92,31 +92,34 @@ def _source(
     _one_tree(spec, path, notes)
     _not_in_force(spec, notes)
     said = drives.read(spec)
-    ties, passive = _coupled(spec, path, coupled, said.moved)
+    tied, passive = ties.read(spec, path, coupled, said.moved)
     if coupled == "independent":
         said.pulls.clear()
     read = {s.objname for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_JOINTPOS}
-    notes += said.notes + drives.contacts(spec) + drives.joints(spec)
+    notes += said.notes + drives.contacts(spec) + drives.unused(spec)
     _strip(spec, path, notes)
+    mended = inertias.balanced(spec)
     if bare and density is None:
         first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
+        no = [f"'{b.name}'" for b in spec.bodies if b.name in mended and b.joints]
+        also = f"; and inertia=shapes or =balance, for the moments of {', '.join(no)} are no body's" if no else ""
         raise UserError(
-            f"model {path}: link{'s' if len(bare) > 1 else ''} {first}"
-            " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
+            f"model {path}: link{'s' if len(bare) > 1 else ''} {first} without <inertial>: give mass and inertia, or"
+            f" density=1000 (kg/m3) to take those of the shapes{also if inertia is None else ''}"
         )
     for body in spec.bodies:
         if body.name in bare and density is not None:
             inertias.fill(body, density)
-    mended = inertias.balanced(spec)
     if inertia == "shapes":
         inertias.from_shapes(spec, mended, path)
     model = _compiled(spec, path, notes)
+    ties.give_limits(model)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             name, most = model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max())
             said.effort[name] = min(said.effort.get(name, most), most)
     sensed = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name in passive & read]
-    return Source(path, model, said, speeds, bare, notes, ties, limits, mended, passive, sensed)
+    return Source(path, model, said, speeds, bare, notes, tied, limits, mended, passive, sensed)
 
 
 def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
@@ -195,73 +198,6 @@ def _body_of(spec: mujoco.MjSpec, name: str) -> Any:
     """Return the body of this name, or that a site of this name is on; None: there is none."""
     site = spec.site(name) if name else None
     return site.parent if site is not None else spec.body(name) if name else None
-
-
-def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> tuple[list[str], set[str]]:
-    """Return what ties joints together, a line each, and the joints that follow others. Taken out where coupled is
-    "independent". moved: joints that an actuator of the file moves."""
-    found, things, passive = [], [], set()
-    closed: list[str] = []
-    for tendon in spec.tendons:
-        things.append(tendon)
-        arms = drives.fixed_arms(tendon)
-        if not arms:
-            closed.append(f"tendon '{tendon.name}' is routed over sites or geoms")
-        elif len(arms) > 1:  # one over a single joint is a spring or a limit of that joint
-            found.append(f"tendon '{tendon.name}' ({', '.join(sorted(arms))})")
-            still = [j for j in arms if j not in moved]
-            pulled = any(a.trntype == mujoco.mjtTrn.mjTRN_TENDON and a.target == tendon.name for a in spec.actuators)
-            pulled |= any(e.type == mujoco.mjtEq.mjEQ_TENDON and e.name1 == tendon.name and e.name2 for e in
-                          spec.equalities)  # fmt: skip
-            if len(still) == len(arms) and not pulled:
-                closed.append(f"no actuator moves any of the joints of tendon '{tendon.name}' ({', '.join(arms)})")
-            passive |= set(still)
-    for equality in spec.equalities:
-        things.append(equality)
-        both = ", ".join(n for n in (equality.name1, equality.name2) if n)
-        if equality.type == mujoco.mjtEq.mjEQ_JOINT:
-            found.append(f"mimic or joint equality ({both})")
-            passive.add(equality.name1)
-            if equality.name1 in moved:
-                closed.append(f"joint '{equality.name1}' has an actuator, and follows '{equality.name2}'")
-        elif equality.type == mujoco.mjtEq.mjEQ_TENDON:
-            if not equality.name2:
-                continue  # a length of its own: the tendon's joints are among those above
-            found.append(f"tendon equality ({both})")
-            led = set(drives.fixed_arms(spec.tendon(equality.name1)))
-            if np.any(np.array(equality.data)[2:5]):
-                closed.append(f"tendon '{equality.name1}' follows '{equality.name2}' by a polynomial")
-            passive |= led - moved
-            if not led - moved:
-                closed.append(f"every joint of tendon '{equality.name1}' has an actuator, and follows"
-                              f" '{equality.name2}'")  # fmt: skip
-        else:
-            kind = {mujoco.mjtEq.mjEQ_CONNECT: "a closed loop (connect", mujoco.mjtEq.mjEQ_WELD: "a weld ("}
-            closed.append(f"{kind.get(equality.type, 'an equality (')} {both})")
-    if coupled == "independent":
-        for thing in things:
-            spec.delete(thing)
-        return found + closed, set()
-    tied = {e.name1: e.name2 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT}
-    for start in tied:
-        at, seen = start, [start]
-        while (at := tied.get(at, "")) and at not in seen:
-            seen.append(at)
-        if at == start:
-            raise UserError(
-                f"model {path}: joints {', '.join(seen)} follow each other in a ring: take one equality out"
-            )
-    if closed:
-        balls = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]
-        instead = "or coupled=independent drives each joint by a motor of its own (another hand than the real one)"
-        if balls:
-            instead = f"and hinges in that of its {len(balls)} ball joints ({', '.join(balls[:3])} ...)"
-        raise UserError(
-            f"model {path}: what ties its joints is not simulated: {'; '.join(closed[:6])}"
-            f"{f'; {len(closed) - 6} more' if len(closed) > 6 else ''}: put joint equalities or tendons of fixed"
-            f" coefficients in its place, {instead}"
-        )
-    return found, passive
 
 
 def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:

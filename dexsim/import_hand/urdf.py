@@ -86,21 +86,23 @@ def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
         for texture in material.findall("texture"):
             material.remove(texture)
     moved = set()
+    moves = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type", "")
         child, limit = joint.find("child"), joint.find("limit")
         if kind != "fixed" and child is not None:
             moved.add(child.get("link", ""))
-        if kind == "continuous":
-            raise UserError(
-                f"model {path}: joint '{name}' is continuous: it turns without end; a hand's joints have limits:"
-                ' type="revolute" and <limit lower= upper=>'
-            )
+        for mimic in joint.findall("mimic"):
+            if moves.get(other := mimic.get("joint", "")) in (None, "fixed"):
+                why = "does not move" if other in moves else "is no joint of the file"
+                raise UserError(f"model {path}: joint '{name}' mimics '{other}', which {why}: name one that moves, or"
+                                f" make '{name}' type=\"fixed\"")  # fmt: skip
         if limit is not None:
             where = f"model {path}: joint '{name}': <limit"
             most = "a number above 0; 0, or nothing, where it is not known"
             low, high = (_number(f"{where} {k}=", limit.get(k)) for k in ("lower", "upper"))
-            out.limits[name] = low, high
+            if kind != "continuous":
+                out.limits[name] = low, high
             _number(f"{where} effort=", limit.get("effort"), f"{most} (N m, of a slide N)", 0.0)
             speed = _number(f"{where} velocity=", limit.get("velocity"), f"{most} (rad/s, of a slide m/s)", 0.0)
             if speed > 0:
