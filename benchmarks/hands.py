@@ -119,14 +119,13 @@ def one(model: Path, s: dict[str, Any]) -> dict[str, Any]:
 def hidden(place: Path, hand: Path, s: dict[str, Any]) -> dict[str, Any]:
     """Return the end of a diagnosis of a large effect that is hidden in a drive of the hand."""
     rng = np.random.default_rng([s["seed"], *place.name.encode()])
-    kind = str(rng.choice(list(hidden_drives.KINDS)))
     try:
-        truth = hidden_drives.make(place / "hidden", hand, kind, rng)
+        truth = hidden_drives.make(place / "hidden", hand, rng)
     except UserError as error:
         return {"diagnose": f"error: {error}"}
     got = hidden_drives.diagnosed(place / "hidden", truth, s["limit"])
     end = "ok" if got["right"] else f"not named: {'; '.join(got['said']) or got['verdict']}"
-    return {"diagnose": end, "hidden": f"{kind} of {truth['joint']}", "said_of_it": got["said"]}
+    return {"diagnose": end, "hidden": f"{truth['kind']} of {truth['joint']}", "said_of_it": got["said"]}
 
 
 def short(text: str, most: int = 240) -> str:

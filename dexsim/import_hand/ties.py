@@ -124,7 +124,7 @@ def give_limits(m: mujoco.MjModel) -> None:
             one, other, (offset, slope, *rest) = law
             bounded = [bool(m.jnt_limited[j]) for j in (one, other)]
             if bounded == [False, True]:
-                ends = _follows(m, law, np.linspace(*m.jnt_range[other], GRID))
+                ends = _follows(m, law, np.linspace(m.jnt_range[other, 0], m.jnt_range[other, 1], GRID))
                 j = one
             elif bounded == [True, False] and slope and not any(rest):
                 zero = [m.qpos0[m.jnt_qposadr[j]] for j in (one, other)]
@@ -143,7 +143,7 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
     """
     laws, out = _laws(m), {}
     for leader in leaders:
-        q = np.linspace(*m.jnt_range[leader], GRID)
+        q = np.linspace(m.jnt_range[leader, 0], m.jnt_range[leader, 1], GRID)
         places, most = {leader: q}, (0.0, leader)
         free = np.ones(GRID, bool)
         for _ in laws:
