@@ -279,7 +279,7 @@ def test_ends_of_all_recordings_where_there_are_few():
 
 
 def test_a_part_that_stands_still_proves_nothing():
-    """One stroke at the start of a log: its last quarter cannot be held out, and what is found is a hint."""
+    """One stroke at the start of a log: its last quarter cannot be held out, and what is found is doubted."""
     t = np.arange(0, 4, 0.01)
     for last, proven in ((0.5, False), (3.6, True)):
         q = np.clip((t - last + 0.3) / 0.3, 0, 1)[:, None] + (0.0 if last < 1 else 0.3 * np.sin(t)[:, None])

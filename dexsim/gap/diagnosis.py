@@ -169,7 +169,7 @@ class Drives(Steps):
     def kept(self) -> Kept:
         """What every joint is judged by."""
         p = self.parts
-        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test, p.apart)
+        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test, p.apart, p.proven)
 
     # -- read
     # ------------------------------------------------------------------------------------------------------------------
@@ -598,9 +598,6 @@ class Drives(Steps):
         if self.ranges:
             d.model_spec = w.m.spec if d.model_spec is None else d.model_spec
             w.notes += self.ranges
-        for e in d.evidence if not p.proven else ():
-            e.reasons.append("nothing that moves is left to try it on: record the motion twice")
-            e.confidence = min(e.confidence, JUDGE.hinted)
         w.notes += [x.note(d.data["nuisance"]) for x in self.told]
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:

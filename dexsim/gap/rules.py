@@ -265,9 +265,11 @@ class SignalRules:
     # smallest steps of an encoder: a reading that stood and changes by as many at once has been read anew
     leap: float = 3.0
     leaps: float = 0.25  # of all changes that must be leaps
-    seldom: float = 4.0  # samples, at least, from one new reading to the next
+    seldom: float = 2.5  # samples, at least, from one new reading to the next
     between: float = 0.1  # of all changes that may come early in the rhythm, before the next reading is due
-    rhythm: float = 0.85  # mean length of the turns of new readings round their period: 1 all in step, 0 none
+    # mean length of the turns of new readings round their period: 1 all in step, 0 none; of that of readings which are
+    # seen with the next sample of the log
+    rhythm: float = 0.85
     anew: int = 10  # new readings that make a rhythm
     # of a joint's whole motion: as near to its outermost position as a stop lets it; an error of three times as much
     near: float = 0.012

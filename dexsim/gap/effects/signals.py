@@ -109,6 +109,7 @@ class SetpointProfile(Effect):
     experiment = "steps of several sizes, and a slow motion: small ones are followed at once, large ones take longer"
     classes = ("limits at speed",)
     motions = ("steps", "ladder")
+    demo = {"profile_speed": 2.0, "profile_acceleration": 30.0}
 
     def variants(self, s: Scales) -> list[Variant]:
         peak = s.peak_speed

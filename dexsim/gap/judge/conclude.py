@@ -741,14 +741,13 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     if data["verdict"] == "none":
         return (
             prefix
-            + "Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to "
-              f"{before:.2g} {unit}; {limit}."
+            + "Nothing in the catalogue is missing: the simulator follows "
+              f"{_where_judged(h)} to {before:.2g} {unit}; {limit}."
         )
     if data["verdict"] == "explained" and not named and bad:
         return (
             prefix
-            + f"Beside that nothing is missing: the simulator follows recordings not used for the fit to {before:.2g} "
-              f"{unit}; {limit}."
+            + f"Beside that nothing is missing: the simulator follows {_where_judged(h)} to {before:.2g} {unit}; {limit}."
         )
     if not named:
         depends = (
@@ -778,9 +777,16 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     it = "it" if len(named) == 1 else "them"
     tail = (
         f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on "
-        "recordings not used for the fit"
+        + _where_judged(h)
     )
     return said + tail + (f"; {limit}." if limit else ".")
+
+
+def _where_judged(h: dict) -> str:
+    """Return which recordings an error is of."""
+    if str(h.get("how", "")).startswith(held_out.NOTHING):
+        return "the recordings that were fitted (nothing that moves could be held out)"
+    return "recordings not used for the fit"
 
 
 def _unit(metric: str) -> str:

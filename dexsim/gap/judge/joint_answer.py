@@ -33,7 +33,7 @@ MUTE = "moments of what was held out are followed neither with it nor without; t
 @dataclass
 class Kept:
     """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept
-    out; apart: `held_out.Split.apart`."""
+    out; apart, proven: `held_out.Split`."""
 
     runs: list[Run]
     train: list[int]
@@ -41,6 +41,7 @@ class Kept:
     span_train: dict[int, tuple[float, float]] | None
     span_test: dict[int, tuple[float, float]] | None
     apart: dict[str, np.ndarray] = field(default_factory=dict)
+    proven: bool = True
 
 
 class JointAnswer:
@@ -354,6 +355,8 @@ class JointAnswer:
             evidence.reasons.append(unlike)
         if (nothing and as_reported) or small or (blurred and not borne_out) or stopped or unlike:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
+        if not self.kept.proven:
+            evidence.doubt("nothing that moves is left to try it on: record the motion twice")
         return evidence
 
     def _by_fold(self, mm: Member) -> np.ndarray:

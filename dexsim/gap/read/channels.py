@@ -642,14 +642,16 @@ def rhythm(t: np.ndarray, q: np.ndarray) -> float:
         return float("nan")
     size, since = np.abs(q[change] - q[change - 1]), np.diff(t[change])
     leap, usual = t[change[size > SIGNAL.leap * size.min()]], float(np.median(since))
-    if len(leap) < SIGNAL.leaps * len(change) or usual < SIGNAL.seldom * float(np.median(np.diff(t))):
+    logged = float(np.median(np.diff(t)))
+    if len(leap) < SIGNAL.leaps * len(change) or usual < SIGNAL.seldom * logged:
         return 0.0
     if np.mean(since < 0.7 * usual) > SIGNAL.between:  # it moves between its leaps
         return 0.0
     if len(leap) < SIGNAL.anew:
         return float("nan")
     period, turn = _beat(leap, usual, 0.1)
-    return period if np.abs(turn) > SIGNAL.rhythm else 0.0
+    # a reading is seen up to a sample after it was made: evenly spread, such turns have a mean as long as a sinc
+    return period if np.abs(turn) > SIGNAL.rhythm * np.sinc(logged / period) else 0.0
 
 
 def between_readings(t: np.ndarray, q: np.ndarray, period: float) -> np.ndarray:
