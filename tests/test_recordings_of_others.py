@@ -154,6 +154,7 @@ def test_values_without_names_are_said_and_found_where_another_joint_follows_the
     assert "taken in the order a, b, c" in said["joint_names"].text and said["joint_names"].severity == "warning"
     found = [f for f in r.findings if f.kind == "joint_order"]
     assert {f.joint for f in found} == {"b", "c"} and all(f.severity == "error" for f in found)
+    assert all(f.text.endswith("meta.joint_names=a,c,b") for f in found)
     right = read(made, meta={"joint_names": "a,c,b"})
     assert not [f for f in right.findings if f.kind == "joint_order" or f.severity == "warning" and "order" in f.text]
     k = right.joints.index("c")

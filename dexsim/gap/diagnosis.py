@@ -86,6 +86,12 @@ def _diagnosed(w: Inquiry) -> Diagnosis:
     return d
 
 
+def _first_few(reasons: Sequence[str], most: int = 3) -> str:
+    """Return the first reasons in words, and how many more there are."""
+    more = len(reasons) - most
+    return "; ".join(reasons[:most]) + (f"; and {more} more like these" if more > 0 else "")
+
+
 def _next(d: Diagnosis, w: Inquiry, searched: Sequence[SearchedJoint]) -> None:
     """What to record next, where that was asked for and there is time for it."""
     if not w.settings.next_recording:
@@ -177,7 +183,7 @@ class Drives(Steps):
         """The stretches in which every joint moves by its own drive alone."""
         w = self.w
         if w.nothing_left():
-            raise NothingToJudge("No recording can be used: " + "; ".join(w.failures))
+            raise NothingToJudge("No recording can be used: " + _first_few(w.failures))
         touched = inputs.merged_spans(self.felt.contact, inputs.self_touch(w.runs, w.m.spec.compile()))
         w.clock.lap("contacts along the motion")
         if touched:

@@ -89,10 +89,15 @@ def order(r: Recording) -> Iterator[Finding]:
     if len(wrong) < 2:
         return
     nameless = any(f.kind == "joint_names" and f.topic == COMMANDS and "carry no" in f.text for f in r.findings)
+    names = list(r.joints)  # in the order of the values
+    for j in wrong:
+        names[whose[j]] = r.joints[j]
+    exchanged = {whose[j] for j in wrong} == set(wrong)
     for j in wrong:
         k = whose[j]
         cure = (
-            f"the values are in another order: meta.joint_names=... with {r.joints[j]} where {r.joints[k]} is now"
+            "the values are in another order: meta.joint_names="
+            + (",".join(names) if exchanged else f"... with {r.joints[j]} where {r.joints[k]} is now")
             if nameless
             else f"whose commands are these? remap.{r.joints[j]}=... or, of columns, remap.command.{r.joints[j]}=COLUMN"
         )

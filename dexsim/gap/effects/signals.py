@@ -117,7 +117,7 @@ class SetpointProfile(Effect):
         speed = param("speed", "profile_speed", "set", 0.2 * peak, 30 * peak, fast, "rad/s")
         # from rest to the peak speed in 0.3 ms to 2 s
         bend = param("acceleration", "profile_acceleration", "set", 0.5 * peak, 3000 * peak, steep, "rad/s2")
-        speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.04, 0.1, 0.25, 0.6)
+        speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.012, 0.05, 0.2, 0.7)
         both = tuple((x * peak, x * peak / t) for x in (0.8, 1.0, 1.3) for t in rises)
         return [
             Variant((speed,), tuple((x * peak,) for x in speeds), "speed"),

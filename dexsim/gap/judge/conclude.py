@@ -747,7 +747,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     if data["verdict"] == "explained" and not named and bad:
         return (
             prefix
-            + f"Beside that nothing is missing: the simulator follows {_where_judged(h)} to {before:.2g} {unit}; {limit}."
+            + f"Beside that nothing is missing: the simulator follows {_where_judged(h)} to {before:.2g} {unit}; "
+              f"{limit}."
         )
     if not named:
         depends = (

@@ -97,7 +97,7 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
         how = f"the last {100 * JUDGE.kept_end:.0f} % of each recording's time"
         if not any(_goes_on(r, cut[i]) for i, r in enumerate(runs)):
             whole = {i: (0.0, r.duration) for i, r in enumerate(runs)}
-            how = f"{NOTHING}, for all stands still in {how}; what is found is not sure until a motion is recorded twice"
+            how = f"{NOTHING}, for all stands still in {how}; what is found is doubted until a motion is recorded twice"
             return Split(every, every, whole, whole, how, proven=False)
         return Split(every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every},
                      how)  # fmt: skip
