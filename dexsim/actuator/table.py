@@ -177,7 +177,10 @@ class ServoTable:
                 where = f"{source}: joints.{joint}.{name}"
                 if name not in INDEX:
                     hint = did_you_mean(name, NAMES)
-                    raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
+                    raise UserError(
+                        f"{where}: no such servo column (of a law of your own: install its package).{hint} Valid"
+                        f" columns: {', '.join(NAMES)}"
+                    )
                 entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
             if top.loop == "velocity" and "kd" in columns:
                 entries[str(joint)].setdefault("speed_feedforward", entries[str(joint)]["kd"])

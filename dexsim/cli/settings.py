@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import difflib
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -214,33 +215,24 @@ def _of_term(cfg: DictConfig, key: str) -> Any:
 
 
 def typed(request: Request) -> frozenset[tuple[str, Any]]:
-    """The value overrides as (dotted name, value), those inside a typed mapping one by one."""
-    found: set[tuple[str, Any]] = set()
-
-    def add(key: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                add(f"{key}.{name}", inner)
-        elif isinstance(value, str):
-            found.add((key, value))
-
-    for item in request.values:
-        if item.type != OverrideType.DEL:
-            add(item.key_or_group, item.value())
-    return frozenset(found)
+    """The words that were typed as values, (dotted name, word), those inside a typed mapping one by one."""
+    return frozenset((key, value) for key, value in _leaves(request) if isinstance(value, str))
 
 
 def given(request: Request) -> tuple[str, ...]:
     """Names of the settings that were given a value, those inside a typed mapping one by one."""
+    return tuple(key for key, _ in _leaves(request))
 
-    def names(key: str, value: Any) -> list[str]:
+
+def _leaves(request: Request) -> Iterator[tuple[str, Any]]:
+    """Dotted names and values; a range ({log: [low, high]}) is a value."""
+    left = [(i.key_or_group, i.value()) for i in reversed(request.values) if i.type != OverrideType.DEL]
+    while left:
+        key, value = left.pop()
         if isinstance(value, dict) and "log" not in value:
-            return [x for name, inner in value.items() for x in names(f"{key}.{name}", inner)]
-        return [key]
-
-    return tuple(
-        x for item in request.values if item.type != OverrideType.DEL for x in names(item.key_or_group, item.value())
-    )
+            left += [(f"{key}.{name}", inner) for name, inner in reversed(value.items())]
+        else:
+            yield key, value
 
 
 def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfig:
