@@ -19,9 +19,8 @@ import numpy as np
 
 from dexsim.console.tables import table as columns_of
 from dexsim.errors import UserError
-from dexsim.gap.plant.case import build, noise
-from dexsim.gap.plant.information import advice, informed
 from dexsim.gap.read import Run, agreement, channels, inputs, same_commands
+from dexsim.gap.read.noise import noise
 from dexsim.hand import load_hand
 from dexsim.recording.arguments import read_arguments
 from dexsim.recording.audit import KINDS, summary, table
@@ -29,7 +28,6 @@ from dexsim.recording.audit_time import command_lead
 from dexsim.recording.mechanism import Mechanism, mechanism
 from dexsim.recording.reader import read
 from dexsim.recording.schema import STATES, Finding, Recording
-from dexsim.sim.quiet import quiet_warp
 
 HELP = """usage: dexsim audit FILE ... [model=FILE] [servo=FILE] [out=FOLDER] [units.QUANTITY=UNIT ...]
                     [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]
@@ -207,6 +205,11 @@ def delays(runs: Sequence[Run]) -> str:
 def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
     """How well a fit could tell each figure of the believed drives from recordings, a row a joint, and what to record
     for those that it could not."""
+    from dexsim.gap.plant.case import build
+    from dexsim.gap.plant.information import advice, informed
+    from dexsim.sim.quiet import quiet_warp
+
+    quiet_warp("cpu")
     joints = [j for j in known.joints if all(j in r.joints for r in runs)]
     if not joints:
         return "figures that could be told: not known, for the recordings have no joint in common"
@@ -348,7 +351,6 @@ def main(argv: Sequence[str]) -> int:
     own = {k: v for k, _, v in (a.partition("=") for a in argv) if k in ("model", "servo", "out")}
     rest = [a for a in argv if a.partition("=")[0] not in own]
     given, remap, meta = read_arguments(rest)
-    quiet_warp("cpu")
     known = mechanism(own["model"], own.get("servo") or {}) if own.get("model") else None
     recordings, worst = [], 0
     for path in inputs.files(given, "audit"):

@@ -66,6 +66,19 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 }
 """Quantity -> the names that columns may give it."""
 _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=lambda x: -len(x[0]))
+
+
+def _patterns(word: str) -> tuple[re.Pattern[str], ...]:
+    """A column that is a word alone, that begins with it, and that ends with it, the joint beside it."""
+    inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
+    # one letter is a quantity only beside a mark no word has inside
+    between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"
+    forms = rf"[_\W]*{inner}[_\W]*", rf"\W*{inner}{between}(.+?)[\])}}]*", rf"\W*(.+?){between}{inner}[\])}}]*"
+    return tuple(re.compile(form, re.I) for form in forms)
+
+
+_PATTERNS = {(w, q): _patterns(w) for w, q in _WORDS}
+_TIME_FIRST = dict(sorted(_PATTERNS.items(), key=lambda x: x[0][1] != "time"))
 _CURRENT = ("current", "present_current", "motor_current")
 _CLOCKS = ("elapsed", "epoch", "timestamp", "time", "stamp", "datetime", "date")
 """Words in the name of a column that may be a time where none is called so."""
@@ -352,17 +365,11 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
         whose = next((q for q, words in QUANTITIES.items() if q != "time" and plain in words), None)
         if whose or plain == "state":
             return "time", whose or "position", unit, "t"
-    for word, quantity in _WORDS:
-        inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
-        if re.fullmatch(rf"[_\W]*{inner}[_\W]*", name, re.I):
+    for (word, quantity), (alone, *_) in _PATTERNS.items():
+        if alone.fullmatch(name):
             return quantity, "", unit, word
-    for word, quantity in sorted(_WORDS, key=lambda x: x[1] != "time"):
-        inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
-        # one letter is a quantity only beside a mark no word has inside
-        between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"
-        found = re.fullmatch(rf"\W*{inner}{between}(.+?)[\])}}]*", name, re.I) or re.fullmatch(
-            rf"\W*(.+?){between}{inner}[\])}}]*", name, re.I
-        )
+    for (word, quantity), (_, first, last) in _TIME_FIRST.items():
+        found = first.fullmatch(name) or last.fullmatch(name)
         if found is None:
             continue
         joint = found.group(1)

@@ -14,13 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-import torch
 import yaml
-from scipy.interpolate import CubicHermiteSpline
 
 from dexsim import model_file, yaml_text
 from dexsim.actuator.columns import COLUMNS
-from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
@@ -28,9 +25,9 @@ from dexsim.hand.couplings import Couplings
 from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, DEFAULTS, STATES, Recording, Series, States
 from dexsim.recording.smooth import local_polynomial
-from dexsim.sim import ContactPair, make_engine
 
 if TYPE_CHECKING:
+    from dexsim.sim import ContactPair
     from dexsim.tactile.sensors import Sensors
 
 XHAND = "xhand"  # the hand where no model is given
@@ -293,6 +290,11 @@ def drive(
     measure. follow: (name of a free joint, poses [T, 7]): a body that is led along a recorded path. columns_of: servo
     columns that change, by name [T, J]. led: joints that follow a path. Deterministic. Engine: C MuJoCo.
     """
+    import torch
+
+    from dexsim.actuator.servo import FIELDS, Servo
+    from dexsim.sim import make_engine
+
     spec = m.spec.copy()
     for joint in led.joints if led is not None else ():
         spec.joint(joint).armature = HEAVY
@@ -550,6 +552,8 @@ class Led:
     def at(self, t: np.ndarray, offset: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return position, speed and acceleration [T, J] of the joints at times t [T] s; offset, scale [J]: of their
         encoders. Position and speed belong together: a cubic between readings; beyond them a joint rests."""
+        from scipy.interpolate import CubicHermiteSpline
+
         out = []
         for times, q, v, a in self.paths.values():
             at = np.clip(t, times[0], times[-1])

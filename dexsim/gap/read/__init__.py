@@ -90,7 +90,7 @@ class Run:
     as_: np.ndarray = None  # type: ignore[assignment]
     # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
-    # filled by `gap.plant.case.noise_of`: the positions that it is of, of each joint, and what these miss by sample
+    # filled by `gap.read.noise.noise_of`: the positions that it is of, of each joint, and what these miss by sample
     noises: tuple[np.ndarray, list[tuple[float, float]], list[np.ndarray]] | None = None
     # filled by `local`: the times that it is of, its width
     smoother: tuple[np.ndarray, float, LocalPolynomial] | None = None

@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
@@ -120,6 +119,8 @@ def _positions(
         if missing:
             notes.append(f"{name}: {joints[j]}: {missing} positions are missing; nothing is measured there")
         if not finite.all():
+            from scipy.interpolate import PchipInterpolator
+
             q[:, j] = PchipInterpolator(t[finite], q[finite, j], extrapolate=False)(t)
             q[:, j] = np.where(np.isfinite(q[:, j]), q[:, j], np.interp(t, t[finite], q[finite, j]))
         good.append(j)

@@ -15,8 +15,8 @@ import numpy as np
 from dexsim import yaml_text
 from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
-from dexsim.gap.plant.case import noise
 from dexsim.gap.read import spans
+from dexsim.gap.read.noise import noise
 from dexsim.gap.rules import TOUCH
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording

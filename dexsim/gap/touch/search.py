@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 from dexsim import intervals
 from dexsim.gap.effects import TouchEffect
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
-from dexsim.gap.plant.case import noise
 from dexsim.gap.read import BLOCK
+from dexsim.gap.read.noise import noise
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
