@@ -215,22 +215,22 @@ def _of_term(cfg: DictConfig, key: str) -> Any:
 
 
 def typed(request: Request) -> frozenset[tuple[str, Any]]:
-    """The words that were typed as values, (dotted name, word), those inside a typed mapping one by one."""
+    """Return the words that were typed as values, (dotted name, word), those inside a typed mapping one by one."""
     return frozenset((key, value) for key, value in _leaves(request) if isinstance(value, str))
 
 
 def given(request: Request) -> tuple[str, ...]:
-    """Names of the settings that were given a value, those inside a typed mapping one by one."""
+    """Return the names of the settings that were given a value, those inside a typed mapping one by one."""
     return tuple(key for key, _ in _leaves(request))
 
 
 def _leaves(request: Request) -> Iterator[tuple[str, Any]]:
-    """Dotted names and values; a range ({log: [low, high]}) is a value."""
-    left = [(i.key_or_group, i.value()) for i in reversed(request.values) if i.type != OverrideType.DEL]
-    while left:
-        key, value = left.pop()
+    """Give dotted names and values; a range ({log: [low, high]}) is a value."""
+    todo = [(i.key_or_group, i.value()) for i in reversed(request.values) if i.type != OverrideType.DEL]
+    while todo:
+        key, value = todo.pop()
         if isinstance(value, dict) and "log" not in value:
-            left += [(f"{key}.{name}", inner) for name, inner in reversed(value.items())]
+            todo += [(f"{key}.{name}", inner) for name, inner in reversed(value.items())]
         else:
             yield key, value
 

@@ -50,8 +50,8 @@ def calibrate_stiffness(
     contact: float = CONTACT_STIFFNESS,
     rubber: Mapping = RUBBER,
 ) -> tuple[float, dict[float, np.ndarray]]:
-    """Stiffness at which the medians of (spring sum / (contact * depth)) at the depths over 0.5 mm average to 1, and
-    the 5, 25, 50, 75 and 95 % points of that ratio by depth [m]."""
+    """Return the stiffness at which the medians of (spring sum / (contact * depth)) at depths over 0.5 mm average to 1,
+    and the 5, 25, 50, 75 and 95 % points of that ratio by depth [m]."""
     area = layout.area[pad, : layout.count[pad]]
     ratio: dict[float, list[float]] = {}
     for p in pressed:

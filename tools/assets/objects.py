@@ -17,7 +17,7 @@ LIBRARY = Path(__file__).resolve().parents[2] / "dexsim" / "assets" / "objects" 
 
 
 def bake_all() -> dict[str, Shape]:
-    """Every shape of `SHAPES`, baked."""
+    """Return every shape of `SHAPES`, baked."""
     return {name: shape_from_hulls(name, hulls_of(name), held_out) for name, (_, held_out) in SHAPES.items()}
 
 
@@ -45,8 +45,8 @@ def contact_sheet(path: str | Path, shapes: dict[str, Shape] | None = None) -> N
         axes.set_box_aspect((1, 1, 1))
         axes.view_init(elev=28, azim=-60)
         axes.tick_params(labelsize=6)
-        kept = ", kept for evaluation" if shape.held_out else ""
-        axes.set_title(f"{shape.name}: {len(shape.hulls)} hull(s), {1e6 * shape.volume:.0f} cm³{kept}", fontsize=8)
+        judged = ", for evaluation" if shape.held_out else ""
+        axes.set_title(f"{shape.name}: {len(shape.hulls)} hull(s), {1e6 * shape.volume:.0f} cm³{judged}", fontsize=8)
     figure.tight_layout()
     files.picture(figure, Path(path))
 

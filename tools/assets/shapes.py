@@ -19,7 +19,7 @@ Hulls = list[np.ndarray]
 
 
 def _box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], chamfer: float = 0.0) -> np.ndarray:
-    """A box between the given bounds; with `chamfer` its twelve edges are cut (24 corners)."""
+    """Return a box between the given bounds; with `chamfer` its twelve edges are cut (24 corners)."""
     low, high = np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
     centre, half = (low + high) / 2, (high - low) / 2
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -34,7 +34,7 @@ def _ring(n: int, radius: float, z: float, phase: float = 0.0) -> np.ndarray:
 
 
 def _sphere_points(n: int) -> np.ndarray:
-    """`n` directions spread evenly over the sphere (Fibonacci lattice)."""
+    """Return `n` directions spread evenly over the sphere (Fibonacci lattice)."""
     k = np.arange(n) + 0.5
     z = 1 - 2 * k / n
     angle = np.pi * (1 + 5**0.5) * k
@@ -42,13 +42,13 @@ def _sphere_points(n: int) -> np.ndarray:
 
 
 def rock() -> Hulls:
-    """A stone: 30 directions, radius uneven by +-15 %, axes 30 : 25 : 21."""
+    """Return a stone: 30 directions, radius uneven by +-15 %, axes 30 : 25 : 21."""
     radius = 1 + 0.15 * (2 * np.random.default_rng(11).random(30) - 1)
     return [_sphere_points(30) * radius[:, None] * [30, 25, 21]]
 
 
 def pebble() -> Hulls:
-    """A flat stone, thicker on one side: 28 directions, axes 30 : 23 : 13."""
+    """Return a flat stone, thicker on one side: 28 directions, axes 30 : 23 : 13."""
     radius = 1 + 0.10 * (2 * np.random.default_rng(5).random(28) - 1)
     points = _sphere_points(28)[:, [2, 0, 1]] * radius[:, None] * [30, 23, 13]
     points[:, 2] *= 1 + points[:, 0] / 80
@@ -56,14 +56,14 @@ def pebble() -> Hulls:
 
 
 def wedge() -> Hulls:
-    """A ramp: a five-sided profile, narrower at the top."""
+    """Return a ramp: a five-sided profile, narrower at the top."""
     profile = np.array([(-30, -16), (30, -16), (30, -6), (-14, 18), (-30, 18)], float)
     width = np.where(profile[:, 1] > 0, 15.0, 19.0)
     return [np.array([(x, s * w, z) for (x, z), w in zip(profile, width, strict=True) for s in (-1, 1)])]
 
 
 def egg() -> Hulls:
-    """An egg, blunt below: five rings of six and two poles on r(u) = 21.5 sqrt(1 - u^2) (1 - 0.18 u), z = 30 u."""
+    """Return an egg, blunt below: five rings of six, two poles on r(u) = 21.5 sqrt(1 - u^2) (1 - 0.18 u), z = 30 u."""
     rings = []
     for k, u in enumerate((-0.86, -0.48, 0.0, 0.46, 0.85)):
         rings.append(_ring(6, 21.5 * np.sqrt(1 - u**2) * (1 - 0.18 * u), 30 * u, phase=0.5 * (k % 2)))
@@ -71,12 +71,12 @@ def egg() -> Hulls:
 
 
 def hexprism() -> Hulls:
-    """A hexagonal prism with chamfered ends."""
+    """Return a hexagonal prism with chamfered ends."""
     return [np.concatenate([_ring(6, r, z) for r, z in ((17, -30), (21, -26), (21, 26), (17, 30))])]
 
 
 def tetra() -> Hulls:
-    """An uneven tetrahedron with its corners cut off, one of them less than the others."""
+    """Return an uneven tetrahedron with its corners cut off, one of them less than the others."""
     corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) * [30.0, 24.0, 27.0]
     points = []
     for i, a in enumerate(corners):
@@ -86,7 +86,7 @@ def tetra() -> Hulls:
 
 
 def bracket() -> Hulls:
-    """An L of two chamfered bars, 23 and 21 mm thick, 30 mm deep."""
+    """Return an L of two chamfered bars, 23 and 21 mm thick, 30 mm deep."""
     return [
         _box((-12, 46), (-12, 11), (-15, 15), chamfer=2.5),
         _box((-12, 9), (-12, 40), (-15, 15), chamfer=2.5),
@@ -94,7 +94,7 @@ def bracket() -> Hulls:
 
 
 def peanut() -> Hulls:
-    """Two unequal knobs on a waist."""
+    """Return two unequal knobs on a waist."""
     big = _sphere_points(26)[:, [2, 0, 1]] * 19 + [-17, 0, 0]
     small = _sphere_points(24)[:, [2, 0, 1]] * 15.5 + [19, 0, 0]
     waist = np.concatenate([_ring(8, r, z) for r, z in ((13.5, -17), (11, 1), (11.5, 19))])[:, [2, 0, 1]]
@@ -102,7 +102,7 @@ def peanut() -> Hulls:
 
 
 def tee() -> Hulls:
-    """A T: a bar 60 mm wide on a stem."""
+    """Return a T: a bar 60 mm wide on a stem."""
     return [
         _box((-30, 30), (0, 21), (-14, 14), chamfer=2.5),
         _box((-10.5, 10.5), (-32, 16), (-12, 12), chamfer=2.5),
@@ -110,14 +110,14 @@ def tee() -> Hulls:
 
 
 def bolt() -> Hulls:
-    """A thick hexagonal head on an eight-sided shank."""
+    """Return a thick hexagonal head on an eight-sided shank."""
     head = np.concatenate([_ring(6, r, z) for r, z in ((19, 10), (23, 13), (23, 27), (19, 30))])
     shank = np.concatenate([_ring(8, r, z) for r, z in ((10, -30), (12.5, -27), (12.5, 20))])
     return [head, shank]
 
 
 def crescent() -> Hulls:
-    """A banana: three bars along an arc of 150 degrees, tapering to the ends."""
+    """Return a banana: three bars along an arc of 150 degrees, tapering to the ends."""
     hulls = []
     nodes = np.radians([15, 65, 115, 165])
     section = np.array([(-1, -0.5), (-0.5, -1), (0.5, -1), (1, -0.5), (1, 0.5), (0.5, 1), (-0.5, 1), (-1, 0.5)])
@@ -133,7 +133,7 @@ def crescent() -> Hulls:
 
 
 def cross() -> Hulls:
-    """Three unequal bars crossing at right angles, off each other's middle."""
+    """Return three unequal bars crossing at right angles, off each other's middle."""
     return [
         _box((-32, 28), (-11, 11), (-11.5, 11.5), chamfer=2.5),
         _box((-10, 12), (-24, 30), (-10.5, 10.5), chamfer=2.5),
@@ -142,7 +142,7 @@ def cross() -> Hulls:
 
 
 def cylinder() -> Hulls:
-    """A prism of 16 sides, 44 mm across and 60 mm high, of the same volume as the round cylinder it stands for."""
+    """Return a prism of 16 sides, 44 mm across and 60 mm high, of the volume of the round cylinder it stands for."""
     sides = 16
     radius = 22 * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
     return [np.concatenate([_ring(sides, radius, z, phase=0.5) for z in (-30, 30)])]
@@ -167,7 +167,7 @@ SHAPES: dict[str, tuple[Callable[[], Hulls], bool]] = {
 
 
 def hulls_of(name: str) -> Hulls:
-    """Hulls (m, list of [V, 3], float64) of a shape: centre of mass at the origin, principal axes along x, y, z,
+    """Return hulls (m, list of [V, 3], float64) of a shape: centre of mass at the origin, principal axes along x, y, z,
     largest extent 60 mm."""
     hulls = [hull_vertices(points) * 1e-3 for points in SHAPES[name][0]()]
     _, centre, inertia = mass_properties(union_boundary(hulls))

@@ -25,20 +25,20 @@ def _ball(radius: float, around: int = 20, levels: int = 7) -> np.ndarray:
 
 
 def rounded(corners: Iterable[Iterable[float]], radius: float) -> Mesh:
-    """Convex hull of balls at the corners, whose surface therefore lies `radius` outside the corners."""
+    """Return the hull of balls at the corners, whose surface therefore lies `radius` outside the corners."""
     corners = np.asarray(list(corners), dtype=float)
     return hull_mesh((corners[:, None, :] + _ball(radius)[None]).reshape(-1, 3))
 
 
 def rounded_box(low: Iterable[float], high: Iterable[float], radius: float) -> Mesh:
-    """Box between two corners with its edges rounded."""
+    """Return a box between two corners with its edges rounded."""
     low, high = np.asarray(list(low)) + radius, np.asarray(list(high)) - radius
     grid = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     return rounded(grid, radius)
 
 
 def slab(outline: Iterable[Iterable[float]], low: float, high: float, radius: float) -> Mesh:
-    """Convex outline [(y, z), ...] (outer dimensions) extruded along x from low to high, edges rounded."""
+    """Return a convex outline [(y, z), ...] (outer dimensions) extruded along x from low to high, edges rounded."""
     outline = np.asarray(list(outline), dtype=float)
     middle = outline.mean(axis=0)
     away = outline - middle
@@ -48,14 +48,14 @@ def slab(outline: Iterable[Iterable[float]], low: float, high: float, radius: fl
 
 def ear(circle: tuple[float, float], radius: float, root: Iterable[Iterable[float]], low: float, high: float,
         axis: int) -> Mesh:
-    """Hinge plate: a disc around `circle` joined to root points, both in the plane across `axis`, low..high thick."""
+    """Return a hinge plate: a disc around `circle` joined to root points, both across `axis`, low..high thick."""
     t = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     flat = np.concatenate([np.array(circle) + radius * np.stack([np.cos(t), np.sin(t)], axis=1), np.array(list(root))])
     return hull_mesh(np.concatenate([np.insert(flat, axis, value, axis=1) for value in (low, high)]))
 
 
 def loft(outer: np.ndarray, normal: np.ndarray, thickness: float) -> Mesh:
-    """Closed sheet between a grid of surface points [nu, nv, 3] and the same grid moved in along the normals."""
+    """Return a closed sheet between a grid of surface points [nu, nv, 3] and the same moved in along the normals."""
     nu, nv = outer.shape[:2]
     vertices = np.concatenate([outer.reshape(-1, 3), (outer - thickness * normal).reshape(-1, 3)])
     index = np.arange(nu * nv).reshape(nu, nv)
@@ -69,7 +69,7 @@ def loft(outer: np.ndarray, normal: np.ndarray, thickness: float) -> Mesh:
 
 
 def write_obj(path: Path, mesh: Mesh, note: str) -> None:
-    """Wavefront OBJ, metres, 1 micrometre grid."""
+    """Write Wavefront OBJ, metres, 1 micrometre grid."""
     vertices, faces = mesh
     with open(path, "w", encoding="ascii") as f:
         f.write(f"# {note}\n")

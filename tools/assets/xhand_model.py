@@ -96,7 +96,7 @@ def write_taxels(pad_name: str) -> Lattice:
 
 
 def tip_meshes(pad_name: str, lattice: Lattice) -> dict[str, shells.Mesh]:
-    """Collision hull, skin and dark core of a fingertip, in link axes."""
+    """Return the collision hull, skin and dark core of a fingertip, in link axes."""
     pad = PADS[pad_name]
     u, v = lattice.grid(28, 34)
     outer, normal = lattice.position(u, v), lattice.normal(u, v)
@@ -109,7 +109,7 @@ def tip_meshes(pad_name: str, lattice: Lattice) -> dict[str, shells.Mesh]:
 
 
 def write_skin(pad_name: str) -> None:
-    """The surface that carries a pad's taxels, to the last bit, for hand.yaml."""
+    """Return the surface that carries a pad's taxels, to the last bit, for hand.yaml."""
     finger = next(f for f in xhand.FINGERS if xhand.pad_of(f) == pad_name)
     vertices, faces = xhand.tip_skin_mesh(finger)
     lines = ["# dexsim, drawn by tools/assets/xhand_model.py; metres: the surface that carries the taxels"]
@@ -119,7 +119,7 @@ def write_skin(pad_name: str) -> None:
 
 
 def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
-    """Visual shells: name -> (body, material, mesh); the fingers' are listed once, for the middle finger."""
+    """Return the visual shells: name -> (body, material, mesh); the fingers' are listed once, for the middle finger."""
     mm = lambda *p: [[0.001 * x for x in q] for q in p]  # noqa: E731
     box = shells.rounded_box
     palm, thumb1, thumb2 = "right_hand_link", "right_hand_thumb_rota_link1", "right_hand_thumb_rota_link2"
@@ -316,7 +316,7 @@ def _visual(body: str, visuals: dict) -> list[str]:
 
 
 def tangents(normals: np.ndarray) -> np.ndarray:
-    """Sensor x direction on the skin [..., 3] (sensor axes): across the pad, following its curve.
+    """Return the sensor's x direction on the skin [..., 3] (sensor axes): across the pad, following its curve.
 
     It is y' x n with y' the sensor's y axis (along the finger) projected on the tangent plane. On the flat of the
     pad that is the sensor's x axis projected on the tangent plane; on the flanks, where the sensor's x axis is
@@ -328,7 +328,7 @@ def tangents(normals: np.ndarray) -> np.ndarray:
 
 
 def hull_distance(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
-    """Signed distance [n] to the planes of a convex hull: positive outside (a lower bound there), exact inside."""
+    """Return the signed distance [n] to a hull's planes: positive outside (a lower bound there), exact inside."""
     return (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
 
 
@@ -339,8 +339,8 @@ distance query, several times cheaper than a penetration query, and the edges of
 
 
 def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: float = 1.5e-4) -> np.ndarray:
-    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the
-    points at least TIP_MARGIN inside the tip.
+    """Return the vertices [<= vertices, 3] (sensor axes) of the fingertip's convex core, mirror symmetric about a = 0:
+    the points at least TIP_MARGIN inside the tip.
 
     Greedy: add the dense point farthest outside the present hull, and its mirror image. Skin points are raised by
     `raise_by` along the normal first, so that the facets' sagging is spread to both sides of the skin; points
