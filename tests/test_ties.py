@@ -7,6 +7,7 @@ import re
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
@@ -202,3 +203,48 @@ def test_all_that_links_lack_is_said_at_once(tmp_path):
     )  # fmt: skip
     with pytest.raises(UserError, match="link index_far without <inertial>.*density=.*inertia=shapes.*'ring_far'"):
         source.read(path)
+
+
+def test_a_link_with_neither_mass_nor_shape_between_two_joints_is_a_speck(tmp_path):
+    before, last = '<link name="index_far">', '<parent link="index_near"/><child link="{}"/>'
+    joint = (
+        '<joint name="index_3" type="revolute"><parent link="virtual"/><child link="index_far"/><axis xyz="0 0 1"/>'
+        '<limit lower="-0.3" upper="0.3" effort="1" velocity="1"/></joint></robot>'
+    )
+
+    def virtual(text):
+        text = text.replace(before, '<link name="virtual"/>' + before).replace("</robot>", joint)
+        return text.replace(last.format("index_far"), last.format("virtual"))
+
+    read = source.read(robot(tmp_path, virtual))
+    assert read.bare == [] and 0 < read.model.body("virtual").mass[0] < 1e-4
+    assert "link 'virtual' has neither mass nor shape: 0.01 g taken" in read.notes
+
+
+def test_a_mass_of_zero_is_none_and_figures_that_are_no_numbers_are_named(tmp_path):
+    text = lambda old, new: lambda t: re.sub(rf'(name="index_far".*?){old}', rf"\1{new}", t, count=1, flags=re.S)  # noqa: E731
+    zero = robot(tmp_path, text('<mass value="[^"]*"', '<mass value="0"'))
+    with pytest.raises(UserError, match="link index_far without <inertial>, or without mass in it"):
+        source.read(zero)
+    assert source.read(zero, density=1000.0).model.body("index_far").mass[0] > 1e-3
+    with pytest.raises(UserError, match="link 'index_far': <inertia ixx=\"nan\">: must be a finite number"):
+        source.read(robot(tmp_path / "nan", text('ixx="[^"]*"', 'ixx="nan"')))
+
+
+def test_what_an_mjcf_says_of_impossible_inertias_is_done(tmp_path):
+    path = tmp_path / "jaws.xml"
+    text = jaws(head='<compiler angle="radian" {}/>').replace("2e-5 2e-5 5e-6", "2e-6 3e-6 1e-5", 1)
+    for word in ('balanceinertia="true"', 'inertiafromgeom="true"', 'boundinertia="1e-5"'):
+        path.write_text(text.replace("{}", word))
+        assert source.read(path).mended == {}
+    path.write_text(text.replace("{}", ""))
+    assert list(source.read(path).mended) == ["near0"]
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100.0, "centimetres or inches"), (1 / 0.0254, "inches")])
+def test_one_small_mesh_in_another_unit_is_named(tmp_path, factor, unit):
+    path = robot(tmp_path, lambda t: t.replace('<box size="0.040 0.015 0.015"/>', '<mesh filename="meshes/box.stl"/>'))
+    box = trimesh.creation.box(extents=np.array([0.04, 0.015, 0.015]) * factor)
+    box.export(path.parent / "meshes" / "box.stl")
+    with pytest.raises(UserError, match=f"mesh 'box' of 'index_near' is .* m across .in {unit}"):
+        import_hand(path, tmp_path / "hand", settings(), picture=False)

@@ -16,6 +16,7 @@ from dexsim.import_hand.tree import Tree
 PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
 SPEED = 6.0  # rad/s, of a small geared motor, where no file says it
 MESH = 12.0  # times the size of the hand, or a twelve-hundredth of it: no mesh of a hand is so large, or so small
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}  # m
 ANY_MESH = (3e-4, 1.0)  # m, of any hand
 BODY = 3.0  # m within which a hand's joints lie
 REACH = (0.015, 0.6)  # m from a finger's root to its tip
@@ -140,7 +141,7 @@ def _size(motions: list[Motion], where: str) -> None:
     if REACH[0] <= reach <= REACH[1]:
         return
     fix = "state lengths in metres"
-    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
+    for unit, factor in UNITS.items():
         if REACH[0] <= reach * factor <= REACH[1]:
             fix = f'the file is probably in {unit}: a mesh has scale="0.001 0.001 0.001" and every origin is in metres'
             break
@@ -157,20 +158,19 @@ def mesh_sizes(source: Source, tree: Tree) -> None:
     hand = max(float(np.linalg.norm(np.ptp(d.xpos[bodies], axis=0))), 0.01)
     if hand > BODY:  # all of it is in another unit
         return
-    said = {}
+    said: dict[str, str] = {}
     for g in range(m.ngeom):
         if m.geom_bodyid[g] not in bodies or m.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
             continue
         size = float(np.ptp(geometry.geom_surface(m, g)[0], axis=0).max())
         if max(hand / (100 * MESH), ANY_MESH[0]) < size < min(hand * MESH, ANY_MESH[1]):
             continue
-        units = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
-        unit, factor = min(units, key=lambda u: abs(np.log(max(size, 1e-9) * u[1] / (0.5 * hand))))
-        why = (
-            f'in {unit}? scale="{factor:g} {factor:g} {factor:g}"' if size > hand else "scaled twice? leave scale= out"
-        )
+        units = {u: f for u, f in UNITS.items() if 0.1 * hand < size * f < 1.2 * hand} or UNITS
+        why = f"in {' or '.join(units)}? scale=" + " or ".join(f'"{f:g} {f:g} {f:g}"' for f in units.values())
+        if size < hand:
+            why = "scaled twice? leave scale= out"
         name = m.mesh(m.geom_dataid[g]).name
-        said[name] = f"'{name}' of '{m.body(m.geom_bodyid[g]).name}' is {size:.3g} m across ({why})"
+        said.setdefault(name, f"'{name}' of '{m.body(m.geom_bodyid[g]).name}' is {size:.3g} m across ({why})")
     if said:
         raise UserError(
             f"model {source.path}: mesh {'; '.join(said.values())}: the hand's joints lie within {hand:.2g} m"

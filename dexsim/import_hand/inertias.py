@@ -12,6 +12,7 @@ from dexsim.errors import UserError
 from dexsim.import_hand.geometry import solid_geoms
 
 ROUNDING = 1e-5  # of the largest moment: what printing a flat body's figures may add to it
+SPECK = 1e-5  # kg of a link that has neither mass nor shape, between two joints
 Moments = tuple[float, float, float]
 """Principal moments of inertia [kg m2], the smallest first."""
 
@@ -23,13 +24,15 @@ def balanced(spec: mujoco.MjSpec) -> dict[str, Moments]:
     the sum of the other two.
     """
     out: dict[str, Moments] = {}
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return out
     for body in spec.bodies:
         if not body.explicitinertial or not body.mass > 0:
             continue
         moments = _moments(body)
         if not np.isfinite(moments).all():
             continue  # named elsewhere, with all that is no number
-        low, middle, high = moments
+        low, middle, high = np.maximum(moments, spec.compiler.boundinertia) if moments[0] >= 0 else moments
         if high == 0 and not body.joints:  # a point of mass on the link that carries it
             continue
         if low > 0 and high <= low + middle:
@@ -40,6 +43,12 @@ def balanced(spec: mujoco.MjSpec) -> dict[str, Moments]:
         body.fullinertia = np.full(6, np.nan)
         body.inertia = np.full(3, mean)
     return out
+
+
+def speck(body: Any) -> None:
+    """Give a body next to no mass, about where it stands."""
+    body.explicitinertial, body.mass, body.ipos = True, SPECK, np.zeros(3)
+    body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, 1e-4 * SPECK)
 
 
 def from_shapes(spec: mujoco.MjSpec, names: Iterable[str], path: object) -> None:

@@ -98,14 +98,22 @@ def _source(
     read = {s.objname for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_JOINTPOS}
     notes += said.notes + drives.contacts(spec) + drives.unused(spec)
     _strip(spec, path, notes)
+    for body in spec.bodies:
+        if body.name in bare and body.joints and not _shaped(body):
+            bare.remove(body.name)
+            notes.append(f"link '{body.name}' has neither mass nor shape: {1e3 * inertias.SPECK:g} g taken")
+            inertias.speck(body)
     mended = inertias.balanced(spec)
+    if spec.compiler.balanceinertia:
+        notes += [f"inertia of '{name}' is no body's: the mean of the three taken, as the file says" for name in mended]
+        mended = {}
     if bare and density is None:
         first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
         no = [f"'{b.name}'" for b in spec.bodies if b.name in mended and b.joints]
         also = f"; and inertia=shapes or =balance, for the moments of {', '.join(no)} are no body's" if no else ""
         raise UserError(
-            f"model {path}: link{'s' if len(bare) > 1 else ''} {first} without <inertial>: give mass and inertia, or"
-            f" density=1000 (kg/m3) to take those of the shapes{also if inertia is None else ''}"
+            f"model {path}: link{'s' if len(bare) > 1 else ''} {first} without <inertial>, or without mass in it: give"
+            f" mass and inertia, or density=1000 (kg/m3) to take those of the shapes{also if inertia is None else ''}"
         )
     for body in spec.bodies:
         if body.name in bare and density is not None:
@@ -246,6 +254,11 @@ def _ends(body: Any) -> int:
     """Return bodies on joints, behind which nothing moves."""
     behind = sum(_ends(b) for b in body.bodies)
     return behind or int(any(j.type in ONE_DOF for j in body.joints))
+
+
+def _shaped(body: Any) -> bool:
+    """Return whether a body, or what is fixed to it, has a shape or a mass."""
+    return bool(body.geoms) or body.mass > 0 or any(_shaped(b) for b in body.bodies if not b.joints)
 
 
 def _hinges(body: Any) -> int:

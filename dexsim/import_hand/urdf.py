@@ -108,15 +108,18 @@ def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
             if speed > 0:
                 out.speeds[name] = speed
     for link in root.findall("link"):
-        mass = link.find("inertial/mass")
-        if mass is not None:
-            where = f"model {path}: link '{link.get('name', '')}': <mass value="
-            _number(where, mass.get("value"), "a number of kg, above 0 of a link that moves", 0.0)
-    out.bare = [
-        link.get("name", "")
-        for link in root.findall("link")
-        if link.get("name") in moved and link.find("inertial") is None
-    ]
+        name, inertial, mass = link.get("name", ""), link.find("inertial"), 0.0
+        where = f"model {path}: link '{name}': <"
+        for moments in link.iterfind("inertial/inertia"):
+            for key, text in moments.items():
+                _number(f"{where}inertia {key}=", text)
+        for element in link.iterfind("inertial/mass"):
+            allowed = "a number of kg, above 0 of a link that moves"
+            mass = _number(f"{where}mass value=", element.get("value"), allowed, 0.0)
+        if name in moved and not mass:
+            out.bare.append(name)
+            if inertial is not None:
+                link.remove(inertial)
     out.text = ET.tostring(root, encoding="unicode")
     return out
 
