@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,14 +16,13 @@ from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.judge import conclude, confidence, handed_on, held_out, joint_answer
-from dexsim.gap.judge.joint_answer import JointAnswer, stretched
+from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import coupled
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import ringing
-from dexsim.gap.search import search as selecting
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, thin
 from dexsim.gap.search.search import JointSearch, SearchedJoint
@@ -119,9 +117,6 @@ class Selecting(Made):
         self.deadline, self.other_start, self.costs = Deadline(), {}, {}
         self.case = SimpleNamespace(joint="j", plant=SimpleNamespace(device="cpu"))
 
-    def _apart(self):
-        return self
-
     def _left(self, trial):
         return trial.left_out
 
@@ -168,46 +163,6 @@ def test_what_looked_like_an_effect_is_let_go_for_it(alone, found):
     search._nothing_of = lambda m, trial: m.id == "lag" and trial.ids == ("lag", "deadband")
     search._shrunk = lambda trial: any(search._nothing_of(m, trial) for m in trial.members)
     assert search.run().best.ids == found
-
-
-class Plainly(Selecting):
-    """A selection whose scan offers nothing, beside a plain model that differs from what is believed by friction of
-    both kinds; `fits` are the hypotheses that were tried, with the sizes they began at."""
-
-    def __init__(self, losses, values):
-        super().__init__(losses)
-        nominal = {"coulomb_friction": 0.1, "viscous_friction": 0.0, "delay": 0.01}
-        self.case.scales, self.wide, self.allowed, self.fits = SimpleNamespace(nominal=nominal), set(), None, []
-        unit = SimpleNamespace(loss=lambda r: np.array([self.losses(())[1]]), evaluate=lambda params, x: np.zeros(3))
-        self.scan_fitter, self._fix = unit, lambda members: nullcontext()
-        self.values = [(param(c, c, "set", 0.0, 1.0), x) for c, x in zip(nominal, values, strict=True)]
-
-    def plain(self):
-        return [p for p, _ in self.values], np.array([x for _, x in self.values])
-
-    def _narrow(self, effect, variant):
-        mode = "add" if variant.params[0].columns == ("delay",) else "set"
-        return Variant((param("size", variant.params[0].columns[0], mode, -0.5, 1.0),), ((0.0,),))
-
-    def draft(self, members, x, like):
-        self.fits.append((tuple(m.id for m in members), tuple(np.round(x, 6))))
-        return super().draft(members, x, like)
-
-
-@pytest.mark.parametrize("left, found", [(0.5, True), (0.95, False)])
-def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
-    def effect(name, column):
-        variant = SimpleNamespace(refines=False, approximate=False, params=[SimpleNamespace(columns=(column,))])
-        return SimpleNamespace(id=name, plain=(column,), nests=(), variants=lambda scales: [variant])
-
-    fitted = [effect(e.id, e.plain[0]) for e in selecting.CATALOGUE if e.plain]
-    assert {e.id for e in fitted} >= {"coulomb_friction", "viscous_friction", "command_delay", "torque_limit"}
-    monkeypatch.setattr(selecting, "CATALOGUE", fitted)
-    monkeypatch.setattr(selecting, "fits_beside", lambda a, b: True)
-    search = Plainly(lambda ids: (10 * left,) * 2 if len(ids) > 1 else (10.0,) * 2, (0.3, 0.2, 0.01))
-    best = search.run().best
-    assert search.fits == [(("coulomb_friction", "viscous_friction"), (0.3, 0.2))]  # the delay is as believed
-    assert best.ids == (("coulomb_friction", "viscous_friction") if found else ())
 
 
 def test_what_saves_much_in_hindsight_is_tried_whatever_its_price():
@@ -427,21 +382,6 @@ def test_a_stand_in_must_take_a_least_share_off():
             ) is offered, after
 
 
-def test_what_the_rest_depends_on_is_said_where_much_is_left():
-    for left, said in ((1.25, False), (1.35, True)):  # x the noise
-        windows = SimpleNamespace(n=30, sample_row=np.arange(30))
-        fitter = SimpleNamespace(use_torque=False, evaluate=lambda *_, left=left: np.full(30, left))
-        search = SimpleNamespace(long=windows, fitter=fitter, blocks=np.arange(30), _fix=lambda _: nullcontext())
-        trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]), members=())
-        answer = SimpleNamespace(search=search, none=trial, best=trial,
-                                 case=SimpleNamespace(joint="j", sigma=1.0, regimes={}))  # fmt: skip
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(locate, "spots", lambda *_: [SimpleNamespace(text="while it moves fast")])
-            patch.setattr(locate, "control", lambda spots: spots)
-            JointAnswer.locate(answer, None, 0)
-        assert (answer.depends_on == ["while it moves fast (j)"]) is said, left
-
-
 def test_a_stand_in_is_offered_where_much_is_left():
     for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
         d = SimpleNamespace(joints={"j": {"after": left}}, data={"findings": []}, standins=[], notes=[])
@@ -503,30 +443,6 @@ def test_a_joint_must_shake_in_some_windows():
         ringing.Ringing = made
 
 
-def test_an_effect_must_plainly_tell_how_a_joint_rings():
-    made, catalogue = ringing.Ringing, ringing.CATALOGUE
-    p = param("softness", "softness", "set", 0.0, 1.0)
-    gives = SimpleNamespace(id="gives", rings=True, variants=lambda _: [Variant((p,), ((0.1,),))])
-    fit = SimpleNamespace(loss=100.0)
-    search = SimpleNamespace(
-        deadline=Deadline(), allowed=None, rng=np.random.default_rng(0),
-        case=SimpleNamespace(scales=SimpleNamespace(stiffness=1.0, span=1.0, tau=1.0)),
-        _narrow=lambda _, v: v, _fix=lambda _: nullcontext(), fitter=SimpleNamespace(fit=lambda *_, **__: fit),
-    )  # fmt: skip
-    nothing = SimpleNamespace(joint="j", none=Trial((), fit), best=Trial((), fit), scanned=[])
-    try:
-        ringing.CATALOGUE = [gives]
-        for left, named in ((0.7, True), (0.8, False)):  # of what is missed without it
-            ringing.Ringing = lambda *_, left=left: SimpleNamespace(
-                loud=np.ones(10, bool),
-                of=lambda t: np.full(10, left if t.members else 1.0),
-                best=lambda *_: (10 * left, [], np.zeros(0)),
-            )
-            assert (ringing.answered(search, nothing).best.ids == ("gives",)) is named, left
-    finally:
-        ringing.Ringing, ringing.CATALOGUE = made, catalogue
-
-
 def test_joints_are_searched_again_that_feel_each_others_motion():
     def felt(share: float) -> bool:
         series = np.zeros((100, len(SERIES_INDEX)))
@@ -575,29 +491,6 @@ def test_a_motion_that_settles_it_is_planned_alone():
 
 
 # -- what is looked for, and what counts as a rival
-
-
-def takes_part(here: float, now: float, draft: float | None = None) -> bool:
-    """Return whether a rival counts that leaves `now` where it was fitted, the hypothesis leaving `here`; draft:
-    what its draft leaves on short windows, where it has not been fitted yet."""
-    search = Made()
-    mine, other = (SimpleNamespace(id=n, variant=SimpleNamespace(params=())) for n in ("lag", "backlash"))
-    current, rival = (SimpleNamespace(loss=np.ones(40), fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)),
-                                      members=(m,), ids=(m.id,), left_out=None)
-                      for loss, m in ((here, mine), (now, other)))  # fmt: skip
-    search.none_loss, search.fitted = np.full(40, 50.0), {} if draft is not None else {frozenset(("backlash",)): rival}
-    search._fix, search._on, search._price_factor = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
-    search.cross, search._by_condition, search.deadline = lambda _: None, lambda *_: [], Deadline()
-    search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.array(here))
-    search.draft = lambda *_: (None, None, SimpleNamespace(loss=draft))
-    search.finish = lambda *_, **__: rival
-    return bool(search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"][0])
-
-
-def test_what_cannot_follow_is_no_rival():
-    for here, least in ((2.0, 5.0), (0.1, 2.5)):  # what is left, and the least that no rival leaves
-        assert takes_part(here, 0.95 * least) and not takes_part(here, 1.05 * least)
-        assert takes_part(here, here, draft=0.95 * least) and not takes_part(here, here, draft=1.05 * least)
 
 
 def test_the_short_list_asks_a_promise():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -197,46 +196,6 @@ def test_a_friction_that_differs_by_direction_is_a_spring_without_stiffness():
     uneven = moved(case, friction_asymmetry=UNEVEN)
     assert np.abs(uneven - moved(case, spring_preload=0.5 * UNEVEN * LEVEL)).max() < 1e-9
     assert np.abs(uneven - moved(case)).max() > 1e-2
-
-
-def as_pull(times: float, *, level_known: bool = False, stiff: bool = False) -> tuple:
-    """Return (what an answer with uneven friction becomes, where a spring was begun from): with fits by hand, the
-    spring's loss being `times` the other's."""
-    case = build(mujoco.MjModel.from_xml_string(model_text()), [driven(0)])[0]
-    if stiff:
-        case = replace(case, scales=replace(case.scales, stiffness=2.0 * case.scales.tau / case.scales.span))
-    whole = EFFECTS["coulomb_friction"].variants(case.scales)[0]
-    variant = whole if level_known else replace(whole, params=whole.params[1:], starts=((0.8,),))
-    member = Member(EFFECTS["coulomb_friction"], variant)
-    names = [f"{member.id}.{p.key}" for p in variant.params] + ["coulomb_friction"] * (not level_known)
-    x = np.array([LEVEL, UNEVEN] if level_known else [UNEVEN, LEVEL])
-    params = [SimpleNamespace(key=n, nuisance="." not in n) for n in names]
-    current = Trial((member,), SimpleNamespace(params=params, x=x, loss=2.0))
-    search, begun = object.__new__(JointSelection), []
-    search.case, search.allowed, search.deadline, search.fitted = case, None, Deadline(), {}
-
-    def fit(params, x0, iterations):
-        assert [p.key for p in params] == ["joint_spring.stiffness", "joint_spring.preload", "coulomb_friction"]
-        begun.append(x0)
-        return SimpleNamespace(params=params, x=x0, loss=2.0 * times)
-
-    search.fitter, search._fix, search.thorough = SimpleNamespace(fit=fit), lambda members: nullcontext(), lambda t: t
-    search._left = lambda t: np.full(4, t.fit.loss)
-    search._price_factor, search._shrunk = (lambda t: 1.0), lambda t: False
-    return search._more_general(current).ids, begun
-
-
-def test_a_joint_that_no_loop_holds_has_a_spring_rather_than_uneven_friction():
-    """They are one torque where the spring has no stiffness, so that fit begins from there. A friction that removes
-    what an effect must of what the spring leaves, one whose level was found too, and a joint that a loop holds keep
-    their name."""
-    became, begun = as_pull(1.0)
-    assert became == ("joint_spring",)
-    assert begun[0] == pytest.approx([0.0, 0.5 * UNEVEN * LEVEL, LEVEL]) and all(x[0] > 0 for x in begun[1:])
-    assert as_pull(0.98 / (1 - SEARCH.least))[0] == ("joint_spring",)
-    assert as_pull(1.02 / (1 - SEARCH.least))[0] == ("coulomb_friction",)
-    assert as_pull(1.0, level_known=True) == (("coulomb_friction",), [])
-    assert as_pull(1.0, stiff=True) == (("coulomb_friction",), [])
 
 
 def test_it_is_not_looked_for_where_a_loop_holds_the_joint_stiffer():

@@ -1,14 +1,12 @@
 """The verdict follows the error on what was held out; what is held out leaves every regime to be fitted; limits of
 time."""
 
-import contextlib
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap import diagnosis
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import Judged, TouchResult, empty
@@ -356,23 +354,6 @@ def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypat
     clock[0] = 60.0  # of 150 s, 120 for searches, 60 are left: 30 a joint, two at a time
     drives._search_again(answers)
     assert [x for _, x in answers] == [f"{'second' if again and k < 3 else 'first'} {k}" for k in range(4)]
-
-
-def test_what_follows_better_is_kept():
-    """An answer is held against a later one of the same joint on the later one's recordings, as it is."""
-    answer = lambda name: SimpleNamespace(members=(name,), fit=SimpleNamespace(params=[], x=np.zeros(1)))  # noqa: E731
-    for before, kept in ((0.5, True), (0.97, False), (3.0, False)):
-        loss = {"old": before, "new": 1.0}
-        search = SimpleNamespace(
-            _fix=lambda members: contextlib.nullcontext(),
-            fitter=SimpleNamespace(fit=lambda params, x0, iterations: iterations),
-            _here=lambda t, loss=loss: loss[t.members[0]],
-        )
-        old, new = (SimpleNamespace(best=answer(n)) for n in ("old", "new"))
-        assert diagnosis._follows_better(old, search, new) is kept
-        assert not diagnosis._follows_better(None, search, new) and not diagnosis._follows_better(old, search, None)
-    old.best.members = ()
-    assert not diagnosis._follows_better(old, search, new)
 
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():

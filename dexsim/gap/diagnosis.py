@@ -719,8 +719,7 @@ def _follows_better(old: Outcome | None, search: JointSearch, found: Outcome | N
     """Whether what was found before follows the recordings of `search` better, as it is, than what it found."""
     if old is None or found is None or not old.best.members:
         return False
-    with search._fix(old.best.members):
-        fit = search.fitter.fit(old.best.fit.params, x0=old.best.fit.x, iterations=0)
+    fit = search.fitter.given(old.best.members).fit(old.best.fit.params, x0=old.best.fit.x, iterations=0)
     before = search._here(Trial(old.best.members, fit))
     return bool(before < (1 - SEARCH.least) * search._here(found.best))
 
@@ -734,8 +733,8 @@ def _other(search: JointSearch, found: Outcome) -> bool:
     """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was
     thought."""
     for trial in (found.none, found.best):
-        with search._fix(trial.members):
-            loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
+        fitter = search.fitter.given(trial.members)
+        loss = float(fitter.loss(fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
         if abs(loss - trial.fit.loss) > SEARCH.least * trial.fit.loss:
             return True
     return False

@@ -389,8 +389,7 @@ class JointAnswer:
                 np.random.default_rng(seed + 1),
                 "effort",
             )
-        with search._fix(self.best.members):
-            left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
+        left = search.fitter.given(self.best.members).evaluate(self.best.fit.params, self.best.fit.x)[:n]
         spots = locate.control(locate.spots(case.joint, left * case.sigma, blocks, regimes, rng))
         self.spots, self.depends_on = (
             found,
@@ -525,7 +524,7 @@ def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.nda
     plant = search.case.plant
     keep = np.zeros(len(search.short.window), bool)
     keep[np.unique(np.linspace(0, len(keep) - 1, min(WINDOWS, len(keep))).astype(int))] = True
-    fitter = Fitter(plant, subset(search.short, keep), search.r)
+    fitter = Fitter(plant, subset(search.short, keep), search.r).given(trial.members)
     use = slice(0, fitter.w.n)  # positions only: a logged effort follows the same commands, but its noise is another
     gaps = np.concatenate([np.diff(t) for t in plant.command_times])
     gaps = gaps[gaps > 1e-6]
@@ -533,13 +532,12 @@ def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.nda
         return []
     spacing = float(np.median(gaps))
     late, group = min(LATE, 0.2 * spacing), max(1, int(np.ceil(SPAN / spacing / LATE_GROUPS)))
-    with search._fix(trial.members):
-        residual, s = fitter.init_directions(trial.fit.params, trial.fit.x)
-        guess = np.repeat(expand(plant, trial.fit.params, trial.fit.x[None]), LATE_GROUPS, 0)
-        guess[:, :, INDEX["late_by"]], guess[:, :, INDEX["late_group"]] = late, group
-        guess[:, :, INDEX["late_at"]] = np.arange(LATE_GROUPS)[:, None]
-        q, tau = plant.simulate(guess, fitter.w)
-        moved = (fitter.compare(q, tau, guess) - residual) / late
+    residual, s = fitter.init_directions(trial.fit.params, trial.fit.x)
+    guess = np.repeat(expand(plant, trial.fit.params, trial.fit.x[None], fitter.fixed), LATE_GROUPS, 0)
+    guess[:, :, INDEX["late_by"]], guess[:, :, INDEX["late_group"]] = late, group
+    guess[:, :, INDEX["late_at"]] = np.arange(LATE_GROUPS)[:, None]
+    q, tau = plant.simulate(guess, fitter.w)
+    moved = (fitter.compare(q, tau, guess) - residual) / late
     moved, residual = (fitter.eliminated(x, s)[:, use] for x in (moved, residual[None]))
     t = plant.t[fitter.w.sample_row]
     apart = np.abs(np.arange(LATE_GROUPS)[:, None] - np.arange(LATE_GROUPS)[None])

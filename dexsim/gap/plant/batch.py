@@ -192,8 +192,6 @@ class JointPlant:
         self._grid, self._cmds = [0], [0]
         self._rows = [0]
         self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
-        self.open_stage = 0  # 0 whole loop; 1 recorded motor torque; 2 recorded duty drives the joint
-        self._ready = False
 
     def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
             cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None,
@@ -234,10 +232,8 @@ class JointPlant:
         stiff = 30.0 * kp + c.inertia * (2 * np.pi * 40.0) ** 2
         self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
                            c.low, c.high, stiff, c.slide, 0)
-        self.contact_stiffness = stiff
         self._d: dict[Any, Any] = {}
         self._version = next(_VERSIONS)
-        self._ready = True
 
     def _fill(self, run: int) -> None:
         """What was added of a run, on its stretch of the grid."""

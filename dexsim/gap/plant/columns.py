@@ -224,9 +224,14 @@ class Param:
                 params[:, :, c] = x[:, None]
 
 
-def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
-    """[H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after."""
+def expand(
+    plant: JointPlant, params: list[Param], x: np.ndarray, fixed: Sequence[tuple[str, float]] = ()
+) -> np.ndarray:
+    """[H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after; fixed:
+    constants (column, value) that stand in the place of what is believed."""
     base = plant.base()
+    for name, value in fixed:
+        base[:, INDEX[name]] = value
     out = np.repeat(base[None], len(x), 0)
     for modes in (("set", "inverse"), ("factor", "add")):
         for i, p in enumerate(params):

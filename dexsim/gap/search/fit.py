@@ -3,8 +3,10 @@ differences, several damped steps tried at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -13,6 +15,9 @@ from scipy.sparse import csr_array
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.rules import BELIEF
+
+if TYPE_CHECKING:
+    from dexsim.gap.search.hypotheses import Member
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
@@ -60,7 +65,6 @@ class Residuals:
     sigma_q0: float = 0.0
     sigma_v0: float = 0.0
     huber: float = 0.0  # threshold in sigmas from which a residual counts linearly (Huber 1964); 0: plain squares
-    current_factor: float = 1.0
 
 
 @dataclass
@@ -107,10 +111,20 @@ class Fitter:
         self._signals = 2 if self.use_torque else 1
         self._sizes = np.tile(np.bincount(windows.sample_window, minlength=self.count), self._signals)
         self._sparse: dict[int, csr_array] = {}
+        self.fixed: tuple[tuple[str, float], ...] = ()  # constants of a hypothesis (`given`)
+
+    def given(self, members: Sequence[Member]) -> Self:
+        """This fitter with the constants of a hypothesis' variants."""
+        fixed = tuple(f for m in members for f in m.variant.fixed)
+        if fixed == self.fixed:
+            return self
+        twin = copy.copy(self)
+        twin.fixed = fixed
+        return twin
 
     def residuals(self, params: list[Param], x: np.ndarray, inits: np.ndarray | None = None) -> np.ndarray:
         """[H, m] measured minus simulated, in sigmas."""
-        plants = expand(self.plant, params, x)
+        plants = expand(self.plant, params, x, self.fixed)
         q, tau = self.plant.simulate(plants, self.w, inits)
         return self.compare(q, tau, plants)
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Self
 
 import numpy as np
 
@@ -15,7 +13,7 @@ from dexsim.gap.compute import Deadline
 from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, compatible
 from dexsim.gap.effects.friction import give
-from dexsim.gap.plant.batch import JointPlant, Windows
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read import BLOCK
@@ -69,24 +67,6 @@ class Outcome:
         default_factory=dict
     )  # by effect: relative cost of dropping it, by condition left out
     note: str = ""
-
-
-class Fixed:
-    """Constants set on a plant's nominal inside a `with`."""
-
-    def __init__(self, plant: JointPlant, pairs: Sequence[tuple[str, float]]):
-        self.plant, self.pairs = plant, pairs
-
-    def __enter__(self) -> None:
-        self.saved = self.plant.nominal
-        if self.pairs:
-            self.plant.nominal = [row.copy() for row in self.saved]
-            for name, value in self.pairs:
-                for row in self.plant.nominal:
-                    row[INDEX[name]] = value
-
-    def __exit__(self, *exc: object) -> None:
-        self.plant.nominal = self.saved
 
 
 def named(member: Member) -> list[Param]:
@@ -375,19 +355,6 @@ class JointHypotheses:
         others = self.all_nuisances if any(m.effect.parts_motor for m in members) else self.nuisances
         return mine + [p for p in others if not taken & set(p.columns)]
 
-    def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None) -> Fixed:
-        """Constants of the variants, written to the plant's nominal for the time of a fit."""
-        return Fixed(plant or self.case.plant, [f for m in members for f in m.variant.fixed])
-
-    def _apart(self) -> Self:
-        """This search on a plant of its own, for a thread beside others: the constants that a hypothesis writes to it
-        (`_fix`) are no other's."""
-        twin, plant = copy.copy(self), copy.copy(self.case.plant)
-        twin.case = replace(self.case, plant=plant)
-        twin.scan_fitter, twin.fitter = copy.copy(self.scan_fitter), copy.copy(self.fitter)
-        twin.scan_fitter.plant = twin.fitter.plant = plant
-        return twin
-
     def start(self) -> Trial:
         """No effect: the nuisances alone. Those without a trace are left out from here on."""
         params = self.all_nuisances
@@ -408,7 +375,7 @@ class JointHypotheses:
         # large residuals are effects still to be named: the threshold follows them down
         self.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8, lazy=True)
-        return Trial((), self.fitter.toward_prior(self.nuisances, self._restarted(self.nuisances, fit)))
+        return Trial((), self.fitter.toward_prior(self.nuisances, self._restarted(self.fitter, self.nuisances, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
         """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the
@@ -423,21 +390,14 @@ class JointHypotheses:
             if found is not None and len(found[1]) > 1:
                 tries = np.repeat(x[None], len(found[1]), 0)
                 tries[:, i] = np.clip(found[1], p.low, p.high)
-                s = self.scan_fitter.init_directions(params, x)[1] if self.scan_fitter.eliminate else None
-                x = tries[
-                    int(
-                        np.argmin(
-                            self.scan_fitter.loss(
-                                self.scan_fitter.eliminated(self.scan_fitter.residuals(params, tries), s)
-                            )
-                        )
-                    )
-                ]
+                f = self.scan_fitter
+                s = f.init_directions(params, x)[1] if f.eliminate else None
+                x = tries[int(np.argmin(f.loss(f.eliminated(f.residuals(params, tries), s))))]
         return x
 
-    def _restarted(self, params: list[Param], fit: Fitted) -> Fitted:
+    def _restarted(self, fitter: Fitter, params: list[Param], fit: Fitted) -> Fitted:
         """The fit, looked for nearby too, where it does not follow the data yet."""
-        return self.fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
+        return fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
 
     def _simulate(self, fitter: Fitter, plants: np.ndarray, s: np.ndarray | None) -> np.ndarray:
         q, tau = self.case.plant.simulate(plants, fitter.w)
@@ -463,14 +423,9 @@ class JointHypotheses:
         inside = np.clip(x0, low + 0.02 * (high - low), high - 0.02 * (high - low))
         free = np.array([p.mode == "add" for p in params[:n]], bool)
         x0[:n] = np.where(free, x0[:n], inside[:n])
-        with self._fix(members):
-            return (
-                members,
-                x0,
-                self.scan_fitter.fit(
-                    params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False
-                ),
-            )
+        fitter = self.scan_fitter.given(members)
+        fit = fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False)
+        return members, x0, fit
 
     def finish(
         self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
@@ -479,11 +434,11 @@ class JointHypotheses:
         added, at = self._newly_identifiable(members, short)
         params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
         x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
-        with self._fix(members):
-            a = self.fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
-            if like is not None and not quick and a.loss > like.fit.loss:
-                b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
-                a = b if b.loss < a.loss else a
+        fitter = self.fitter.given(members)
+        a = fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
+        if like is not None and not quick and a.loss > like.fit.loss:
+            b = fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
+            a = b if b.loss < a.loss else a
         return Trial(members, a)
 
     def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
@@ -500,18 +455,15 @@ class JointHypotheses:
         x = np.repeat(np.concatenate([short.x, at])[None], len(without_trace) + 1, 0)
         for i, p in enumerate(without_trace):
             x[i + 1, n + i] += PROBE * p.span * (1.0 if at[i] < 0.5 * (p.low + p.high) else -1.0)
-        with self._fix(members):
-            r = self.scan_fitter.residuals(params, x)
+        r = self.scan_fitter.given(members).residuals(params, x)
         trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / PROBE
         awake = trace > BELIEF.trace
         return [p for p, on in zip(without_trace, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:
         """The trial fitted again from perturbed starts, and with its beliefs drawn back to their prior."""
-        with self._fix(trial.members):
-            return Trial(
-                trial.members, self.fitter.toward_prior(trial.fit.params, self._restarted(trial.fit.params, trial.fit))
-            )
+        fitter, params = self.fitter.given(trial.members), trial.fit.params
+        return Trial(trial.members, fitter.toward_prior(params, self._restarted(fitter, params, trial.fit)))
 
     def fit(
         self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False

@@ -123,15 +123,15 @@ class Ringing:
         self, members: tuple[Member, ...], params: list[Param], x: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         parts = []
-        with self.search._fix(members):
-            for i in range(0, len(x), CHUNK):
-                rows = expand(self.plant, params, x[i : i + CHUNK])
-                q = np.empty((len(rows), self.w.n))
-                for on, speed in ((~self.rung, 0.0), (self.rung, self.speed)):
-                    if on.any():
-                        inits = np.tile([0.0, speed], (len(rows), 1))
-                        q[:, on[self.w.sample_window]] = self.plant.simulate(rows, self._part(on), inits)[0]
-                parts.append(self._of(np.clip(np.nan_to_num(q, nan=1e4), -1e4, 1e4)))
+        fixed = [f for m in members for f in m.variant.fixed]
+        for i in range(0, len(x), CHUNK):
+            rows = expand(self.plant, params, x[i : i + CHUNK], fixed)
+            q = np.empty((len(rows), self.w.n))
+            for on, speed in ((~self.rung, 0.0), (self.rung, self.speed)):
+                if on.any():
+                    inits = np.tile([0.0, speed], (len(rows), 1))
+                    q[:, on[self.w.sample_window]] = self.plant.simulate(rows, self._part(on), inits)[0]
+            parts.append(self._of(np.clip(np.nan_to_num(q, nan=1e4), -1e4, 1e4)))
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
     def _part(self, on: np.ndarray) -> Windows:
@@ -231,8 +231,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
                 member = Member(effect, law)
                 lost, params, x = swings.best(member, search.rng)
                 if effect.id not in tries or lost < tries[effect.id][0]:
-                    with search._fix((member,)):
-                        fit = search.fitter.fit(params, x0=x, iterations=0)
+                    fit = search.fitter.given((member,)).fit(params, x0=x, iterations=0)
                     tries[effect.id] = lost, Trial((member,), fit)
     if not tries:
         return found

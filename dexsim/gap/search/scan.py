@@ -89,9 +89,9 @@ class JointLosses(JointHypotheses):
                 step[i] = np.linalg.solve(M, b[i])
             step = np.clip(step, -0.3, 0.3)
             guesses += [np.clip(f.x + length * step * span, low, high) for length in lengths]
-        with self._fix(trial.members):
-            _, s = fitter.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
-            res = fitter.eliminated(fitter.residuals(f.params, np.array(guesses)), s)
+        mine = fitter.given(trial.members)
+        _, s = mine.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
+        res = mine.eliminated(mine.residuals(f.params, np.array(guesses)), s)
         a = huber_square(res, k)
         for n, number in enumerate(folds):
             test = fold == number
@@ -111,17 +111,18 @@ class JointLosses(JointHypotheses):
         folds, parts = np.unique(self.fold_of), []
         if len(folds) < 2 or not len(f.params):
             return trial
-        with self._fix(trial.members):
-            for number in folds:
-                on = self.fold_of != number
-                fitter = Fitter(self.case.plant, subset(self.long, on), self.r, self.deadline.passed)
-                rows = on[self.fitter.window]
-                known = {key: v[rows] for key, v in slopes_of(f).items()}
-                x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
-                a = huber_square(self.fitter.evaluate(f.params, x), self.r.huber)
-                test = ~on[self.fitter.window]
-                out += np.bincount(self.blocks[test], a[test], len(out))
-                parts.append(x)
+        whole = self.fitter.given(trial.members)
+        for number in folds:
+            on = self.fold_of != number
+            part = Fitter(self.case.plant, subset(self.long, on), self.r, self.deadline.passed)
+            rows = on[whole.window]
+            known = {key: v[rows] for key, v in slopes_of(f).items()}
+            x = part.given(trial.members).fit(
+                f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False
+            ).x
+            a = huber_square(whole.evaluate(f.params, x), self.r.huber)
+            out += np.bincount(self.blocks[~rows], a[~rows], len(out))
+            parts.append(x)
         return replace(trial, left_out=out, folds=parts, refitted=True)
 
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
@@ -177,14 +178,13 @@ class JointLosses(JointHypotheses):
             r = Residuals(self.r.sigma_q, self.r.sigma_torque)
             fitter = Fitter(plant, plant.windows(None, rest, span=self.span), r, self.deadline.passed)
             judge = Fitter(plant, plant.windows(None, left, span=self.span), Residuals(self.r.sigma_q))
-            with self._fix(trial.members):
-                starts = np.stack([trial.fit.x, parts.get(k, trial.fit.x)])
-                tried = np.abs(fitter.residuals(params, starts))
-                best = int(np.argmin(tried.mean(1)))
-                r.huber = max(1.0, float(np.median(tried[best])))
-                x = fitter.fit(params, x0=starts[best], iterations=FREE_STEPS, tolerance=1e-2, exact=False).x
-                error = np.abs(judge.residuals(params, x[None])[0])
-            out.append(float(error.mean()))
+            fitter, judge = fitter.given(trial.members), judge.given(trial.members)
+            starts = np.stack([trial.fit.x, parts.get(k, trial.fit.x)])
+            tried = np.abs(fitter.residuals(params, starts))
+            best = int(np.argmin(tried.mean(1)))
+            r.huber = max(1.0, float(np.median(tried[best])))
+            x = fitter.fit(params, x0=starts[best], iterations=FREE_STEPS, tolerance=1e-2, exact=False).x
+            out.append(float(np.abs(judge.residuals(params, x[None])[0]).mean()))
         self._run_free[id(trial)] = trial, np.array(out)
         return self._run_free[id(trial)][1]
 
@@ -249,13 +249,12 @@ class JointScan(JointLosses):
         """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
         case = self.case
         params = current.fit.params
-        fitter = self.scan_fitter
-        with self._fix(current.members):
-            here = fitter.fit(params, x0=current.fit.x, iterations=0)
-            self.short_slopes = slopes_of(here)
-            x = current.fit.x
-            raw, s = fitter.init_directions(params, x)
-            r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
+        fitter = self.scan_fitter.given(current.members)
+        here = fitter.fit(params, x0=current.fit.x, iterations=0)
+        self.short_slopes = slopes_of(here)
+        x = current.fit.x
+        raw, s = fitter.init_directions(params, x)
+        r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
         guesses, owners = self._guesses(current, expand_one(case, params, x))
         rows, dots, squares, cross = [], [], [], []
         J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
@@ -277,8 +276,7 @@ class JointScan(JointLosses):
         null = np.zeros(BOOTSTRAPS)
         size = max(1, int(2e7 // max(len(r0), 1)))
         for a in range(0, len(guesses), size):
-            with self._fix(()):
-                q = self._simulate(fitter, np.stack(guesses[a : a + size]), s)
+            q = self._simulate(fitter, np.stack(guesses[a : a + size]), s)
             changes = np.subtract(r0, q, out=q)
             changes *= sw
             for b in range(0, len(changes), PROJECTED):

@@ -158,8 +158,8 @@ class JointSelection(JointScan):
                 fits = []
                 for start in starts:  # from what is known to follow, in steps of slopes of its own
                     fitted |= {p.key: x for p, x in zip(named(wider), start, strict=True)}
-                    with self._fix(members):
-                        fits.append(self.fitter.fit(params, x0=np.array([fitted[p.key] for p in params]), iterations=8))
+                    x0 = np.array([fitted[p.key] for p in params])
+                    fits.append(self.fitter.given(members).fit(params, x0=x0, iterations=8))
                 new = self.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
                 mine, theirs = (self._left(t).sum() * self._price_factor(t) for t in (current, new))
                 if (1 - SEARCH.least) * theirs < mine and not self._shrunk(new):
@@ -184,10 +184,9 @@ class JointSelection(JointScan):
             _, _, member, start = listed[k]
             if k and self.deadline.over():
                 return None
-            mine = self._apart()
-            tries = [mine.draft((*current.members, member), begin(start), current)]
+            tries = [self.draft((*current.members, member), begin(start), current)]
             if k < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
-                tries.append(mine.draft((*current.members, member), begin(self.other_start[member.id]), current))
+                tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
             return min(tries, key=lambda d: d[2].loss)
 
         each = compute.side_by_side([partial(drafted, k) for k in range(len(listed))], self.case.plant.device)
@@ -213,7 +212,7 @@ class JointSelection(JointScan):
         """The drafts fitted on long windows, and judged on what was left out."""
 
         def finished(k: int) -> Trial | None:
-            return self._apart().finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
+            return self.finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
 
         each = compute.side_by_side([partial(finished, k) for k in range(len(drafts))], self.case.plant.device)
         trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
@@ -286,14 +285,11 @@ class JointSelection(JointScan):
                 else a
                 for p, a, b in zip(params, at, believed, strict=True)
             ]
-            with self._fix(current.members):
-                new = Trial(
-                    current.members,
-                    self.fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit)),
-                )
+            fitter = self.fitter.given(current.members)
+            fit = fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit))
+            new = Trial(current.members, fit)
             if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best):
-                with self._fix(current.members):
-                    new = Trial(current.members, self.fitter.toward_prior(params, new.fit))
+                new = Trial(current.members, fitter.toward_prior(params, new.fit))
             if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best) and not self._shrunk(new):
                 best = new
         return best
@@ -330,8 +326,7 @@ class JointSelection(JointScan):
             starts.append(np.array(values))
         if len(members) < 2:
             return current
-        with self._fix(current.members):
-            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
+        short = self._short_loss(current)
         like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
         draft = self.draft(tuple(members), np.concatenate(starts), like)
         if draft[2].loss > (1 - SEARCH.least) * short:
@@ -355,6 +350,10 @@ class JointSelection(JointScan):
         if best is not None and self._earns(best, current):
             return best
         return None
+
+    def _short_loss(self, trial: Trial) -> float:
+        """Mean Huber square over short windows."""
+        return _loss(self.scan_fitter, trial)
 
     def _swap(
         self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]], level: list[Trial]
@@ -530,8 +529,7 @@ class JointSelection(JointScan):
         mine = self._left(current)
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
-        with self._fix(current.members):
-            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
+        short = self._short_loss(current)
         for i, member in enumerate(current.members):
             rest = tuple(m for k, m in enumerate(current.members) if k != i)
             kept = [v for k, v in enumerate(values) if k != i]
@@ -581,6 +579,12 @@ class JointSelection(JointScan):
         none = self.start()
         self.none_loss = self._left(none)
         return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
+
+
+def _loss(fitter: Fitter, trial: Trial) -> float:
+    """Mean Huber square of a fitted hypothesis over the fitter's windows."""
+    mine = fitter.given(trial.members)
+    return float(mine.loss(mine.evaluate(trial.fit.params, trial.fit.x)[None])[0])
 
 
 def _value(p: Param, plain: Param, x: float, case: Case) -> float:
@@ -647,9 +651,7 @@ class JointSearch(JointSelection):
                 replace(p, low=MAYBE[p.key] - PIN, high=MAYBE[p.key] + PIN, start=MAYBE[p.key]) if p.key in back else p
                 for p in params
             ]
-            with self._fix(trial.members):
-                f = self.fitter.fit(pinned, x0=trial.fit.x, iterations=6)
-            new = Trial(trial.members, f)
+            new = Trial(trial.members, self.fitter.given(trial.members).fit(pinned, x0=trial.fit.x, iterations=6))
             if self._here(new) < (1 + 2 * SEARCH.tie) * self._here(trial):  # the more of them go back, the better
                 best = new
         if best is not trial:
@@ -670,18 +672,17 @@ class JointSearch(JointSelection):
         coarse = self.fitted_whole  # in the steps of the windows' fit
         whole = coarse if plant is self.case.plant else plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, huber=max(self.r.huber, 3.0))
-        fitter = Fitter(plant, whole, r, self.deadline.passed)
+        fitter = Fitter(plant, whole, r, self.deadline.passed).given(trial.members)
         params = trial.fit.params
-        with self._fix(trial.members, plant):
-            here = fitter.residuals(params, trial.fit.x[None])[0]
-            fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
-            # slopes in the windows' own steps serve for shorter ones
-            slopes = slopes_of(Fitter(self.case.plant, coarse, r).fit(params, x0=trial.fit.x, iterations=0))
-            f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
+        here = fitter.residuals(params, trial.fit.x[None])[0]
+        fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
+        # slopes in the windows' own steps serve for shorter ones
+        windows = Fitter(self.case.plant, coarse, r).given(() if plant is not self.case.plant else trial.members)
+        slopes = slopes_of(windows.fit(params, x0=trial.fit.x, iterations=0))
+        f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
         # a fit that is no better than rounding, or that long windows speak against, is left as it was
         if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
-            with self._fix(trial.members):
-                again = self.fitter.fit(params, x0=f.x, iterations=0)
+            again = self.fitter.given(trial.members).fit(params, x0=f.x, iterations=0)
             polished = Trial(trial.members, again, trial.left_out, trial.folds)
             if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
                 return polished
@@ -689,8 +690,7 @@ class JointSearch(JointSelection):
 
     def by_run(self, trial: Trial) -> np.ndarray:
         """[R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
-        with self._fix(trial.members):
-            a = huber_square(self.fitter.evaluate(trial.fit.params, trial.fit.x), self.r.huber)
+        a = huber_square(self.fitter.given(trial.members).evaluate(trial.fit.params, trial.fit.x), self.r.huber)
         run, count = self.long.run[self.fitter.window], self.case.plant.runs
         return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
@@ -699,9 +699,7 @@ class JointSearch(JointSelection):
         windows = self.case.plant.windows(LONG, runs, span=span)
         if not len(windows.window):
             return np.nan
-        fitter = Fitter(self.case.plant, windows, self.r)
-        with self._fix(trial.members):
-            return float(fitter.loss(fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
+        return _loss(Fitter(self.case.plant, windows, self.r), trial)
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
         """Intervals that also hold what the residuals do not show, added in squares: the disagreement of the fits
