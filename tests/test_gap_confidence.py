@@ -9,6 +9,7 @@ import pytest
 
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.confidence import Evidence
 from dexsim.gap.plant.columns import INDEX, Param, at_bound
@@ -95,11 +96,11 @@ def test_what_the_encoder_does_not_resolve_is_doubted():
 
 
 def test_touch_is_doubted_alike():
-    findings = [{"effect": "tactile_hysteresis", "confidence": 0.99, "held_out": {"before": 215.0, "after": 40.0}},
+    given = [{"effect": "tactile_hysteresis", "confidence": 0.99, "held_out": {"before": 215.0, "after": 40.0}},
                 {"effect": "tactile_crosstalk", "confidence": 0.99, "held_out": {"before": 54.5, "after": 40.0}},
                 {"effect": "tactile_gain", "confidence": 0.95, "held_out": None}]  # fmt: skip
-    said = confidence.of_touch(findings, 215.0, 35.0)
-    assert [f["confidence"] for f in findings] == [0.99, DOUBTED, 0.95] and len(said) == 1
+    findings, said = confidence.of_touch([*map(Finding.from_json, given)], 215.0, 35.0)
+    assert [f.confidence for f in findings] == [0.99, DOUBTED, 0.95] and len(said) == 1
 
 
 def test_weigh_takes_every_doubt_into_account():

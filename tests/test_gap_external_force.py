@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_gap_torque_route import ARM, arm, run
 
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Judged
 from dexsim.gap.judge import conclude
 from dexsim.gap.search import logged_torque
@@ -34,9 +35,9 @@ def test_pushes_are_told_with_when_and_how_hard():
     told, true = inside(push.spans["run0.mcap"]), np.abs(shove(t)) > 0.25 * 6.0
     assert (told & true).sum() / (told | true).sum() > 0.8
     finding = push.finding()
-    assert finding["effect"] == "external_force" and finding["confidence"] >= 0.8 and len(finding["when"]) == 3
-    assert finding["parameters"]["torque"]["low"] < 6.0 < finding["parameters"]["torque"]["high"] * 1.05
-    assert "in 3 stretches of time, forwards" in finding["regime"]
+    assert finding.effect == "external_force" and finding.confidence >= 0.8 and len(finding.when) == 3
+    assert finding.parameters["torque"]["low"] < 6.0 < finding.parameters["torque"]["high"] * 1.05
+    assert "in 3 stretches of time, forwards" in finding.regime
 
 
 @pytest.mark.parametrize("size", [3.0, 6.0])
@@ -83,35 +84,28 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     r = run(model, 0)
     r.torque[:, 1] = np.random.default_rng(0).standard_normal(len(r.t) // 20 + 1).repeat(20)[: len(r.t)]
     (push,) = logged_torque.find_pushes(model, [r], [0])
-    assert not push.clear and push.finding()["confidence"] < 0.5
+    assert not push.clear and push.finding().confidence < 0.5
     size = {"torque": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}}
     held = {"before": 0.02, "after": 0.01}
-    of = lambda effect, joint: {  # noqa: E731
-        "effect": effect,
-        "where": {"joints": [joint]},
-        "confidence": 0.7,
-        "held_out": held,
-        "parameters": size,
-        "indistinguishable": [],
-    }
+    of = lambda effect, joint: Finding(effect, 0.7, "", [joint], held_out=held, parameters=size)  # noqa: E731
     data = {
-        "findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")],
         "noise_floor": {"position_rad": 0.01},
         "held_out": {},
         "baseline": {},
         "unexplained": {"depends_on": []},
     }
     d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[], touch=None)
+    d.findings = [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")]
     d.ringing, d.judged = frozenset(), Judged(held | {"before_low": 0.02, "error": "position_rmse_rad"})
     conclude.claim_push(d, [push])
-    assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
+    assert [f.effect for f in d.findings] == ["external_force", "coulomb_friction"]
     assert len(d.notes) == 1
     conclude.decide(d)
     assert d.data["verdict"] == "partly_explained"  # the friction is not sure
     assert d.sentence.startswith("Joint shoulder") and "elbow" not in d.sentence  # what is known of that is a hint
     assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
     push.clear = True
-    data["findings"] = [push.finding()]
+    d.findings = [push.finding()]
     conclude.decide(d)
     assert d.sentence.startswith("Joint elbow is pushed by something outside") and d.data["verdict"] == "unknown"
 

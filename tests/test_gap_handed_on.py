@@ -17,6 +17,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import handed_on
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
@@ -120,13 +121,12 @@ def test_what_reproduces_what_was_held_out_is_handed_on_as_fitted_whatever_its_n
 
     from dexsim.gap.judge.handed_on import earned, widen
 
-    found = lambda after, *others: {  # noqa: E731
-        "held_out": {"before": 1.0, "after": after},
-        "alternatives": [{"effect": "lag", "confidence": c} for c in others],
-    }
+    rivals = lambda others: [{"effect": "lag", "confidence": c} for c in others]  # noqa: E731
+    held = lambda after: {"before": 1.0, "after": after}  # noqa: E731
+    found = lambda after, *others: Finding("", 1.0, "", held_out=held(after), alternatives=rivals(others))  # noqa: E731
     assert [earned(found(x)) for x in (1.2, 1.0, 0.95, 0.9, 0.2)] == pytest.approx(
         [0.0, 0.0, 0.5, 1.0, 1.0]
-    ) and earned({"held_out": None}) == 0.0
+    ) and earned(Finding("", 1.0, "")) == 0.0
     assert earned(found(0.95, 0.3, 0.1)) == pytest.approx(0.3)
     case = SimpleNamespace(joint=JOINT, scales=SimpleNamespace(nominal={"torque_limit": 1.09}))
     member = SimpleNamespace(variant=SimpleNamespace(params=[SimpleNamespace(columns=("torque_limit",))]))

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence, joint_answer
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.rules import JUDGE
@@ -47,7 +48,7 @@ class Judged(JointAnswer):
         return ""
 
 
-def judged(answer: Judged) -> dict:
+def judged(answer: Judged) -> Finding:
     """Return the finding of an answer."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(joint_answer, "free_run", lambda *_: (answer.without, None))
@@ -60,7 +61,7 @@ def judged(answer: Judged) -> dict:
 def test_an_effect_must_remove_a_part_of_what_was_held_out(share, hint):
     """share: of the squared error on what was held out."""
     answer = Judged(1.0, np.sqrt(1 - share))
-    assert (judged(answer)["confidence"] <= JUDGE.hinted) is hint
+    assert (judged(answer).confidence <= JUDGE.hinted) is hint
     reasons = answer.evidence[0].reasons
     assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)
 
@@ -74,7 +75,7 @@ def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
     answer.before = answer.without**2
     assert answer.told == pytest.approx((1.0, np.sqrt(1 - share)))
     f = judged(answer)
-    assert f["confidence"] == JUDGE.hinted and f["held_out"]["after"] > 30
+    assert f.confidence == JUDGE.hinted and f.held_out["after"] > 30
     reasons = answer.evidence[0].reasons
     assert reasons[-1] == joint_answer.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
 
@@ -83,7 +84,7 @@ def test_what_removes_much_of_all_that_was_held_out_needs_no_moments_left_out():
     answer = Judged(100.0, 1.0)
     answer.without[:50], answer.after[:50] = 1e3, 1e6  # alike there, and hardly more than all the rest
     answer.without[50:] = 3e3
-    assert judged(answer)["confidence"] == 0.95 and answer.evidence[0].reasons == []
+    assert judged(answer).confidence == 0.95 and answer.evidence[0].reasons == []
 
 
 def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=False) -> confidence.Evidence:

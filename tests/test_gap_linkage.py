@@ -9,6 +9,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.case import build, dragged_by
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run
@@ -95,13 +96,8 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
 
     from dexsim.gap.judge import conclude
 
-    def end(joint: str, other: str, sure: float) -> dict:
-        return {
-            "effect": "joint_coupling",
-            "confidence": sure,
-            "where": {"joints": [joint], "taxels": [], "topics": []},
-            "parameters": {"from_joint": {"value": other}},
-        }
+    def end(joint: str, other: str, sure: float) -> Finding:
+        return Finding("joint_coupling", sure, "", [joint], parameters={"from_joint": {"value": other}})
 
     def answer(joint: str, column: str):
         member = SimpleNamespace(
@@ -111,11 +107,11 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
             case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member]))
         )
 
-    lag = {"effect": "lag", "confidence": 0.9, "where": {"joints": ["b"], "taxels": [], "topics": []}, "parameters": {}}
+    lag = Finding("lag", 0.9, "", ["b"])
     found = conclude._linkages(
         [end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")]
     )
-    assert [(f["effect"], f["where"]["joints"], f["confidence"]) for f in found] == [
+    assert [(f.effect, f.joints, f.confidence) for f in found] == [
         ("joint_coupling", ["b", "a"], 0.99),
         ("lag", ["b"], 0.9),
     ]

@@ -11,7 +11,7 @@ from browser import CHROMIUM, Page
 from benchmarks import press_rig
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.read import gathered
+from dexsim.gap.finding import Finding, gathered
 from dexsim.gap.report.files import grouped
 
 PROBE = """(() => {
@@ -130,30 +130,20 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     from dexsim.gap.judge.conclude import sentence
     from dexsim.gap.report.files import Findings, render
 
-    def found(effect: str, confidence: float, key: str) -> dict:
-        return {
-            "effect": effect,
-            "confidence": confidence,
-            "where": {"joints": ["knee"], "taxels": [], "topics": []},
-            "regime": "somewhere",
-            "when": [],
-            "alternatives": [],
-            "indistinguishable": [],
-            "separating_experiment": None,
-            "held_out": {"before": 0.02, "after": 0.01},
-            "parameters": {key: {"value": 0.01, "low": 0.005, "high": 0.02, "unit": "s"}},
-        } | ({"hint": True} if confidence < 0.5 else {})
+    def found(effect: str, confidence: float, key: str) -> Finding:
+        held, size = {"before": 0.02, "after": 0.01}, {"value": 0.01, "low": 0.005, "high": 0.02, "unit": "s"}
+        hint = confidence < 0.5
+        return Finding(effect, confidence, "somewhere", ["knee"], held_out=held, parameters={key: size}, hint=hint)
 
     data = empty("partly_explained")
     data["held_out"] |= {"before": 0.02, "after": 0.01}
-    data["findings"] = [found("command_delay", 0.9, "delay"), found("lag", 0.3, "time_constant")]
-    d = Diagnosis(data, "", [])
+    d = Diagnosis(data, "", [], [found("command_delay", 0.9, "delay"), found("lag", 0.3, "time_constant")])
     html = render(Findings(d))
     missing, hints = html.split("<h2>Hints</h2>")
     assert "delay" in missing and "lag" not in missing.lower().replace("lagg", "") and "lag" in hints.lower()
     said = sentence(data, d, 0.001)
     assert "later than believed" in said and "more" not in said
-    data["findings"] = data["findings"][1:]
+    d.findings = d.findings[1:]
     data["verdict"] = "unknown"
     assert "What is missing" not in render(Findings(d)) and "no effect of the catalogue explains" in sentence(
         data, d, 0.001
@@ -170,12 +160,11 @@ def test_what_recordings_say_is_text_and_no_markup():
 
 def test_one_fault_of_many_signals_is_one_card():
     def one(j, kind):
-        where = {"joints": [j], "taxels": [], "topics": []}
-        return {"effect": "bad_channel", "confidence": 0.9, "when": [], "regime": f"{kind}: {j} is", "where": where}
+        return Finding("bad_channel", 0.9, f"{kind}: {j} is", [j])
 
-    lag = {"effect": "lag", "confidence": 0.9, "regime": "", "when": [], "where": {"joints": ["a"]}}
+    lag = Finding("lag", 0.9, "", ["a"])
     given = [one("a", "sign"), lag, one("b", "sign"), one("a", "stale"), *(one(j, "sign") for j in "cde")]
     out = gathered(given)
-    assert [f["effect"] for f in out] == ["bad_channel", "lag", "bad_channel"]
-    assert out[0]["regime"] == "sign: a is (the same in 5 signals, of a, b, c and 2 more)"
-    assert out[2]["regime"] == "stale: a is" and given[0]["regime"] == "sign: a is"
+    assert [f.effect for f in out] == ["bad_channel", "lag", "bad_channel"]
+    assert out[0].regime == "sign: a is (the same in 5 signals, of a, b, c and 2 more)"
+    assert out[2].regime == "stale: a is"

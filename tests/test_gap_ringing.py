@@ -12,6 +12,7 @@ import pytest
 from test_gap import model, plant_run
 from test_gap_torque_route import arm, run
 
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude, confidence
 from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
 from dexsim.gap.plant.case import build
@@ -159,18 +160,10 @@ def test_nobody_pushes_a_joint_that_rings():
 
 def test_what_is_followed_to_the_noise_is_not_pushed():
     push = logged_torque.Push("elbow", 1.0, (0.9, 1.1), 0.5, False, False)
-    finding = {
-        "effect": "torque_ripple",
-        "where": {"joints": ["elbow"]},
-        "confidence": 0.9,
-        "held_out": {"before": 0.02, "after": 0.001},
-        "parameters": {"amplitude": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}},
-        "indistinguishable": [],
-    }
+    finding = Finding("torque_ripple", 0.9, "", ["elbow"], held_out={"before": 0.02, "after": 0.001})
 
     def claimed(after: float, loss: float, ringing: frozenset[str] = frozenset()) -> list[str]:
         data = {
-            "findings": [finding],
             "verdict": "explained",
             "noise_floor": {"position_rad": 0.001},
             "held_out": {"before": 0.02, "after": after, "error": "position_rmse_rad"},
@@ -179,10 +172,10 @@ def test_what_is_followed_to_the_noise_is_not_pushed():
         outcome = SimpleNamespace(joint="elbow", best=SimpleNamespace(fit=SimpleNamespace(loss=loss)))
         joints = {"elbow": {"after": after, "sigma": 0.001}}
         d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints=joints, outcomes=[outcome])
-        d.ringing = ringing
+        d.ringing, d.findings = ringing, [finding]
         conclude.claim_push(d, [push])
         assert len(d.notes) == 1
-        return [f["effect"] for f in d.data["findings"]]
+        return [f.effect for f in d.findings]
 
     assert claimed(0.0011, 1.1) == ["torque_ripple"]
     assert claimed(0.005, 1.1) == ["external_force"]  # what was held out is not followed

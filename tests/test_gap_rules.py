@@ -15,6 +15,7 @@ from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude, confidence, handed_on, held_out, joint_answer
 from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.batch import Windows
@@ -217,12 +218,7 @@ def test_what_a_torque_changes_by_from_sample_to_sample_is_noise():
 
 
 def named(**changes):
-    return {
-        "effect": "lag",
-        "where": {"joints": ["j"]},
-        "held_out": {"before": 1.0, "after": 0.5},
-        "confidence": 0.9,
-    } | changes
+    return replace(Finding("lag", 0.9, "", ["j"], held_out={"before": 1.0, "after": 0.5}), **changes)
 
 
 def test_an_error_within_the_noise_asks_for_nothing():
@@ -243,15 +239,12 @@ def test_what_counts_as_a_part_of_the_answer():
 
 def test_names_below_firm_are_hints():
     found = [named(confidence=0.51), named(confidence=0.49)]
-    held_out.settle(found)
-    assert [f.get("hint", False) for f in found] == [False, True]
+    assert [f.hint for f in held_out.settle(found)] == [False, True]
 
 
 def test_what_is_not_borne_out_keeps_little():
-    found = [named()]
-    held_out.unneeded(found, {"j"})
-    held_out.settle(found)
-    assert 0.4 < found[0]["confidence"] < 0.5 and found[0]["hint"]
+    (found,) = held_out.settle([held_out.unneeded(named(), {"j"})])
+    assert 0.4 < found.confidence < 0.5 and found.hint
 
 
 def doubtful(**changes):
@@ -289,7 +282,7 @@ def test_what_removes_nothing_keeps_nothing():
 
 
 def test_a_name_earns_its_confidence_by_what_it_removes():
-    less = lambda after: handed_on.earned({"held_out": {"before": 1.0, "after": after}})  # noqa: E731
+    less = lambda after: handed_on.earned(named(held_out={"before": 1.0, "after": after}))  # noqa: E731
     assert less(0.89) == 1.0 and 0.85 < less(0.91) < 0.95
 
 
@@ -322,7 +315,7 @@ def test_a_rival_of_the_same_class_makes_a_set():
 
 def test_an_effect_must_remove_a_part_of_what_was_held_out():
     for share, hint in ((0.19, True), (0.21, False)):
-        assert (judged(Judged(1.0, np.sqrt(1 - share)))["confidence"] < 0.5) is hint
+        assert (judged(Judged(1.0, np.sqrt(1 - share))).confidence < 0.5) is hint
 
 
 def test_an_effect_may_lose_little_where_it_does_not_act():
@@ -331,7 +324,7 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
     for lost, hint in ((0.015, False), (0.025, True)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(held_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
-            assert (judged(Judged(1.0, 0.1))["confidence"] < 0.5) is hint, lost
+            assert (judged(Judged(1.0, 0.1)).confidence < 0.5) is hint, lost
 
 
 def test_moments_that_nothing_follows_do_not_speak():

@@ -9,6 +9,7 @@ import pytest
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.effects.friction import LoadFriction, ViscousFriction
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Judged, empty
 from dexsim.gap.judge import conclude
 from dexsim.gap.read import inputs
@@ -113,7 +114,7 @@ def test_a_joint_is_judged_without_pushes_where_enough_is_left():
 
 
 def push(clear: bool) -> float:
-    return logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
+    return logged_torque.Push("j", 1.0, (0.9, 1.1), 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding().confidence
 
 
 def test_a_push_is_named_surely_where_the_rest_fits():
@@ -188,7 +189,7 @@ def told(after: float) -> float:
         patch.setattr(logged_torque, "intervals_of", lambda *_: [])
         given = [IdentifiedJoint(case, SimpleNamespace(named=[n], full={}), ["a"])]
         (finding,) = logged_torque.findings(given, ["j"], [], [])
-    return finding["confidence"]
+    return finding.confidence
 
 
 def test_what_the_torque_names_is_never_certain():
@@ -203,8 +204,8 @@ def test_what_the_torque_names_is_a_part_of_the_answer():
     for left, word in ((0.65, "partly_explained"), (0.75, "unknown")):
         named_ = [SimpleNamespace(effect="load_friction", before=1.0, after=left)]
         held = {"before": 1.0, "after": left, "removed_low": 0.1, "error": "effort_rmse_Nm"}
-        finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": held, "confidence": 0.9}
-        d = SimpleNamespace(data=empty(), touch=None, judged=Judged({}))
+        finding = Finding("load_friction", 0.9, "", ["j"], held_out=held)
+        d = SimpleNamespace(data=empty(), touch=None, judged=Judged({}), findings=[])
         by_torque = [IdentifiedJoint(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
         conclude.add_behind(d, [finding], by_torque)
         with pytest.MonkeyPatch.context() as patch:

@@ -224,13 +224,13 @@ class Recorded:
 
 
 def test_taxels_that_never_change_are_named_surely():
-    assert judge.pressed({3: 0.0}, 1)["confidence"] == JUDGE.surest
+    assert judge.pressed({3: 0.0}, 1).confidence == JUDGE.surest
     force = np.zeros((30, 1, 4, 3))
     force[:, 0, 1:, 2] = np.arange(30.0)[:, None]
     sensors = SimpleNamespace(layout=SimpleNamespace(pads=1),
                               beside=lambda f: [[j for j in range(4) if j != k] for k in range(4)])  # fmt: skip
     (found,) = judge.constant_taxels([SimpleNamespace(tactile=Recorded(force))], sensors)
-    assert found["where"]["taxels"] == ["0:0"] and found["confidence"] == JUDGE.sure
+    assert found.taxels == ["0:0"] and found.confidence == JUDGE.sure
 
 
 def test_what_is_left_of_a_pad_goes_with_something():

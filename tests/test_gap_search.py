@@ -11,6 +11,7 @@ from scipy.optimize import lsq_linear
 
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.case import REFERENCE, build
@@ -110,12 +111,12 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
 
 
 def test_what_only_the_recording_held_out_shows_is_said():
-    def alone(before: float, fitted: float, *found: dict) -> list[str]:
+    def alone(before: float, fitted: float, *found: Finding) -> list[str]:
         return conclude._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
 
     assert alone(16.0, 1.0) == ["a"]
     assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing
-    assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}})
+    assert not alone(16.0, 1.0, Finding("lag", 0.9, "", ["a"]))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,8 @@ def test_what_only_the_recording_held_out_shows_is_said():
     [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")],
 )
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
-    finding = {"held_out": {"before": 0.01, "after": 0.001}, "confidence": confidence, "indistinguishable": group}
+    held = {"before": 0.01, "after": 0.001}
+    finding = Finding("lag", confidence, "", held_out=held, indistinguishable=group)
     assert held_out.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 

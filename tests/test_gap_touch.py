@@ -11,6 +11,7 @@ import pytest
 from benchmarks import press_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence
 from dexsim.gap.read import Run, inputs
 from dexsim.gap.rules import JUDGE
@@ -132,14 +133,14 @@ MORE = [
 def check(folder, effect, planted, values, allowed=None):
     # a drift with temperature needs time to show
     out = found(folder, 7.0 if effect == "thermal" else 4.0, allowed, **planted)
-    assert [f["effect"] for f in out.findings] == [effect], out.findings
+    assert [f.effect for f in out.findings] == [effect], out.findings
     f = out.findings[0]
-    assert f["confidence"] > 0.8 and not f["indistinguishable"] and f["where"]["taxels"] and f["when"]
+    assert f.confidence > 0.8 and not f.indistinguishable and f.taxels and f.when
     for key, value in values.items():
-        p = f["parameters"][key]
+        p = f.parameters[key]
         assert p["value"] == pytest.approx(value, rel=0.15) and p["low"] < p["value"] < p["high"]
     # a wider contact, which is refitted with and without it, follows most of what a crosstalk makes
-    assert f["held_out"]["after"] < (0.9 if effect == "tactile_crosstalk" else 0.6) * f["held_out"]["before"]
+    assert f.held_out["after"] < (0.9 if effect == "tactile_crosstalk" else 0.6) * f.held_out["before"]
 
 
 @pytest.mark.parametrize(("effect", "planted", "values"), QUICK, ids=[q[0] for q in QUICK])
@@ -163,7 +164,7 @@ def test_nothing_planted_nothing_found(plain):
 @pytest.mark.slow
 def test_two_effects_at_once(tmp_path):
     out = found(tmp_path, sensor={"hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 0.03})
-    assert {f["effect"] for f in out.findings} == {"tactile_delay", "tactile_hysteresis"}
+    assert {f.effect for f in out.findings} == {"tactile_delay", "tactile_hysteresis"}
 
 
 @pytest.mark.parametrize(
@@ -177,26 +178,26 @@ def test_gains_dead_stuck_and_exchanged_taxels(allowed, tmp_path):
     # long enough for presses on every one of them
     out = found(tmp_path, 7.0, allowed, gains={54: 0.5, 66: 1.5, 67: 0.0}, stuck={80: 2.0}, swapped=[(55, 65)])
     (f,) = out.findings
-    assert f["effect"] == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(
-        f["where"]["taxels"]
+    assert f.effect == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(
+        f.taxels
     )
-    gain = dict(zip(f["where"]["taxels"], f["parameters"]["gain"]["value"], strict=True))
+    gain = dict(zip(f.taxels, f.parameters["gain"]["value"], strict=True))
     assert (
         gain["1:54"] == pytest.approx(0.5, abs=0.1)
         and gain["1:66"] == pytest.approx(1.5, abs=0.2)
         and gain["1:67"] < 0.05
         and gain["1:80"] == 0
     )
-    assert f["parameters"]["taxels"]["swapped"] == [["1:55", "1:65"]]
+    assert f.parameters["taxels"]["swapped"] == [["1:55", "1:65"]]
 
 
 @pytest.mark.slow
 def test_without_a_load_cell_gain_and_stiffness_are_a_set(tmp_path):
     (f,) = found(tmp_path, load_cell=False, stiffness=4500.0).findings
     assert (
-        set(f["indistinguishable"]) == {"tactile_gain", "contact_stiffness"}
-        and "load cell" in f["separating_experiment"]
-        and f["confidence"] < 0.8
+        set(f.indistinguishable) == {"tactile_gain", "contact_stiffness"}
+        and "load cell" in f.separating_experiment
+        and f.confidence < 0.8
     )
 
 
@@ -245,7 +246,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
     finally:
         td.KINDS = kinds
     assert out.before is None and any("not what was touched" in n for n in out.notes)
-    assert [f["where"]["taxels"] for f in out.findings] == [["1:66"]]
+    assert [f.taxels for f in out.findings] == [["1:66"]]
 
 
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
@@ -272,14 +273,9 @@ def test_joints_are_judged_in_free_air_alone():
 
 def test_a_little_crosstalk_may_be_the_law_of_the_contact():
     def said(low: float) -> float:
-        f = {
-            "effect": "tactile_crosstalk",
-            "confidence": 0.99,
-            "parameters": {"fraction": {"value": low + 0.05, "low": low, "high": low + 0.1}},
-            "held_out": {"before": 0.06, "after": 0.03},
-        }
-        confidence.of_touch([f], 0.06, 0.03)
-        return f["confidence"]
+        size = {"fraction": {"value": low + 0.05, "low": low, "high": low + 0.1}}
+        f = Finding("tactile_crosstalk", 0.99, "", parameters=size, held_out={"before": 0.06, "after": 0.03})
+        return confidence.of_touch([f], 0.06, 0.03)[0][0].confidence
 
     assert said(0.08) == JUDGE.doubted and said(0.2) == 0.99
 

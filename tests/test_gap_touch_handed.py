@@ -3,6 +3,8 @@ checkpoint; bad files."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +20,7 @@ from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects import PadFacts
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
+from dexsim.gap.finding import Finding
 from dexsim.gap.touch import diagnosis
 from dexsim.gap.touch.diagnosis import HEAD
 from dexsim.gap.touch.diagnosis import save_tactile as write
@@ -94,7 +97,7 @@ def test_the_sensor_that_trains_reads_what_was_recorded(late, tmp_path):
 
 def test_what_is_doubted_holds_what_was_believed(late, tmp_path):
     felt, path = late[0].touch, tmp_path / "tactile.yaml"
-    f = felt.findings[0] | {"confidence": 0.6}
+    f = replace(felt.findings[0], confidence=0.6)
     h = handed([f], felt.facts)
     assert (
         write(h, path)
@@ -102,7 +105,7 @@ def test_what_is_doubted_holds_what_was_believed(late, tmp_path):
         and "tactile_delay on the index's pad is not sure" in h.doubts[0]
     )
     p = load(path)["tactile"]["pads"]["index"]["delay"]
-    assert p["low"] == 0.0 and p["high"] == pytest.approx(f["parameters"]["delay"]["high"], rel=1e-5)
+    assert p["low"] == 0.0 and p["high"] == pytest.approx(f.parameters["delay"]["high"], rel=1e-5)
     drawn = grasp_env(f"tactile_file={path}", worlds=64).touch.by_pad.column("delay")[:, INDEX]
     assert within(drawn, p) and float(drawn.min()) < 0.01
 
@@ -174,13 +177,8 @@ def finding(effect, pad=INDEX, confidence=0.95, also=(), on=None, **parameters):
         k: v if isinstance(v, dict) else {"value": v[0], "low": v[1], "high": v[2], "unit": ""}
         for k, v in parameters.items()
     }
-    return {
-        "effect": effect,
-        "confidence": confidence,
-        "indistinguishable": [effect, *also] if also else [],
-        "parameters": named,
-        "where": {"joints": [], "taxels": on or [f"{pad}:66"], "topics": ["/tactile"]},
-    }
+    alike = [effect, *also] if also else []
+    return Finding(effect, confidence, "", taxels=on or [f"{pad}:66"], indistinguishable=alike, parameters=named)
 
 
 EVERY = {
@@ -272,7 +270,7 @@ def test_each_finding_is_a_setting_with_its_interval(effect, tmp_path):
     assert all(cfg["randomize"][k.split(".")[0]][k.split(".")[1]] == [v[1], v[2]] for k, v in shared.items())
     if effect == "contact_friction":
         assert cfg["tactile"]["friction"] == [0.35, 0.45]
-    f = f | {"confidence": 0.5}
+    f = replace(f, confidence=0.5)
     doubt = handed([f], {"index": fact})
     assert "is not sure" in doubt.doubts[0]
     wide = ranges(doubt.tactile.get("pads", {}).get("index", {})) | ranges(doubt.randomize)
@@ -292,12 +290,12 @@ def test_single_taxels():
             "high": [0.05, 1.1, 1.2, 0.6, 0.05],
         },
     )
-    f["parameters"]["taxels"] = {"value": "", "swapped": [["1:14", "1:15"]]}
+    f.parameters["taxels"] = {"value": "", "swapped": [["1:14", "1:15"]]}
     facts = {"index": PadFacts({3: 0.0, 33: 0.4})}
     pad = handed([f], facts).tactile["pads"]["index"]
     assert pad["dead"] == [3] and pad["stuck"] == {33: 0.4} and pad["swapped"] == [[14, 15]]
     assert ranges(pad["taxels"]) == {14: (1.0, 0.9, 1.1), 15: (1.1, 1.0, 1.2), 17: (0.5, 0.4, 0.6)}
-    h = handed([f | {"confidence": 0.5}], facts)
+    h = handed([replace(f, confidence=0.5)], facts)
     pad = h.tactile["pads"]["index"]
     assert (
         set(pad) == {"taxels"}

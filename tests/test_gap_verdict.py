@@ -1,6 +1,7 @@
 """The verdict follows the error on what was held out; what is held out leaves every regime to be fitted; limits of
 time."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Judged, TouchResult, empty
 from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import JointAnswer
@@ -18,42 +20,28 @@ from dexsim.gap.search.hypotheses import Outcome
 from dexsim.gap.search.search import SearchedJoint
 
 
-def finding(confidence: float, joint: str = "a") -> dict:
-    return {
-        "effect": "backlash",
-        "where": {"joints": [joint]},
-        "held_out": {"before": 2.0, "after": 1.0},
-        "confidence": confidence,
-    }
+def finding(confidence: float, joint: str = "a", effect: str = "backlash") -> Finding:
+    return Finding(effect, confidence, "", [joint], held_out={"before": 2.0, "after": 1.0})
 
 
 def test_names_on_joints_that_need_no_effect_are_hints():
     found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
-    held_out.unneeded(found, quiet={"a"})
-    held_out.settle(found)
-    assert [f.get("hint", False) for f in found] == [True, False, True]
-    assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
+    found = held_out.settle([held_out.unneeded(f, quiet={"a"}) for f in found])
+    assert [f.hint for f in found] == [True, False, True]
+    assert found[0].confidence < JUDGE.firm and found[1].confidence == 0.9
     assert held_out.firm(found) == [found[1]]
 
 
-def told(effect: str, confidence: float, joint: str = "a", **held) -> dict:
-    """Return a finding as the page has it."""
-    return {
-        "effect": effect,
-        "where": {"joints": [joint], "taxels": [], "topics": []},
-        "held_out": {"before": 2.0, "after": 1.0, "removed_low": 0.5} | held,
-        "confidence": confidence,
-        "regime": "now and then",
-        "indistinguishable": [],
-        "parameters": {},
-    }
+def told(effect: str, confidence: float, joint: str = "a", **held) -> Finding:
+    shown = {"before": 2.0, "after": 1.0, "removed_low": 0.5} | held
+    return Finding(effect, confidence, "now and then", [joint], held_out=shown)
 
 
-def decided(*found: dict, before=4.0, after=1.0, floor=1.0, touch=None, **judged) -> SimpleNamespace:
+def decided(*found: Finding, before=4.0, after=1.0, floor=1.0, touch=None, **judged) -> SimpleNamespace:
     """Return a diagnosis of these findings, decided; errors in rad."""
     position = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after}
     d = SimpleNamespace(
-        data=empty() | {"findings": list(found), "noise_floor": {"position_rad": floor}},
+        data=empty() | {"noise_floor": {"position_rad": floor}}, findings=list(found),
         judged=Judged(position, **judged), touch=touch, sentence="", mechanism=None, joints={},
     )  # fmt: skip
     conclude.decide(d)
@@ -68,22 +56,22 @@ EFFORT = {"error": "effort_rmse_Nm", "before": 2.0, "before_low": 2.0, "after": 
 @pytest.mark.parametrize("other", [{}, PUSH, BAD, {"effect": "current_sensor"}])
 def test_whatever_is_named_below_a_half_is_a_hint_and_not_in_the_sentence(other):
     """A name of a joint, a push, a signal or an effort: after what is sure, unknown to the verdict."""
-    d = decided(told("lag", 0.45) | other, told("backlash", 0.9, "b"), effort=EFFORT)
+    d = decided(replace(told("lag", 0.45), **other), told("backlash", 0.9, "b"), effort=EFFORT)
     assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
     assert d.data["verdict"] == "explained" and "Joint b" in d.sentence and "Joint a" not in d.sentence
-    alone = decided(told("lag", 0.45) | other, effort=EFFORT)
+    alone = decided(replace(told("lag", 0.45), **other), effort=EFFORT)
     assert alone.data["verdict"] == "unknown" and alone.sentence.startswith("Something is missing that no effect")
-    assert decided(told("lag", 0.45) | other, before=1.1, effort=EFFORT).data["verdict"] == "none"
+    assert decided(replace(told("lag", 0.45), **other), before=1.1, effort=EFFORT).data["verdict"] == "none"
 
 
 def test_what_the_torque_whispers_decides_nothing():
     """The torque route is added after the joints: its error is the verdict's only where it names surely."""
     behind = {"error": "effort_rmse_Nm", "before": 0.5, "before_low": None, "after": 0.2}
-    d = SimpleNamespace(data={"findings": []}, judged=Judged({}))
+    d = SimpleNamespace(data={}, findings=[], judged=Judged({}))
     named = [SimpleNamespace(effect="stribeck_friction", before=0.5, after=0.2)]
     by_torque = [(SimpleNamespace(joint="a"), SimpleNamespace(named=named), ["r"])]
     conclude.add_behind(d, [told("stribeck_friction", 0.45, error="effort_rmse_Nm")], by_torque)
-    assert d.judged.torque is None and len(d.data["findings"]) == 1
+    assert d.judged.torque is None and len(d.findings) == 1
     sure = told("stribeck_friction", 0.9, error="effort_rmse_Nm")
     assert decided(sure, torque=behind).data["verdict"] == "partly_explained"
     whispered = decided(told("stribeck_friction", 0.45, error="effort_rmse_Nm"))
@@ -119,15 +107,14 @@ def test_what_was_not_judged_is_kept_whatever_the_verdict_goes_by():
 
 
 def test_touch_beside_joints_is_one_verdict():
-    touched = {"effect": "tactile_gain", "where": {"joints": [], "taxels": ["0:1"], "topics": []}}
     for confidence, alone, beside in ((0.9, "explained", "explained"), (0.3, "unknown", "partly_explained")):
-        gain = told("tactile_gain", confidence) | touched | {"parameters": {}}
+        gain = replace(told("tactile_gain", confidence), joints=(), taxels=["0:1"])
         felt = TouchResult([gain], before=(0.3, 0.2, 0.4), after=(0.03, 0.03, 0.03), floor=0.03)
-        d = decided(gain, before=1.1, touch=felt)
+        d = decided(before=1.1, touch=felt)
         assert d.data["verdict"] == alone and d.data["held_out"]["error"] == "tactile_rmse_N"
-        d = decided(gain, told("backlash", 0.9), touch=felt)
+        d = decided(told("backlash", 0.9), touch=felt)
         assert d.data["verdict"] == beside and d.data["held_out"]["error"] == "position_rmse_rad"
-        assert ("hint" in gain) is (confidence < 0.5)
+        assert felt.findings[0].hint is (confidence < 0.5)
 
 
 def test_the_sentence_says_what_the_plain_model_leaves_where_that_is_handed_on():
@@ -143,9 +130,8 @@ def test_the_sentence_says_what_the_plain_model_leaves_where_that_is_handed_on()
 
 def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half():
     """The motion of such a joint needs no effect, and that says nothing of its sensor; a whisper stays one."""
-    found = [finding(c) | {"effect": "current_sensor"} for c in (0.9, 0.45)]
-    held_out.settle(found)
-    assert [f.get("hint", False) for f in found] == [False, True]
+    found = held_out.settle([finding(c, effect="current_sensor") for c in (0.9, 0.45)])
+    assert [f.hint for f in found] == [False, True]
     assert held_out.verdict(found[1:], 1.0, 1.15, 1.1, 1.14, True) == "none"
 
 
@@ -162,8 +148,7 @@ def test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half():
     ],
 )
 def test_no_verdict_by_a_whisper(before, after, confidence, word):
-    found = [finding(confidence)]
-    held_out.settle(found)
+    found = held_out.settle([finding(confidence)])
     assert held_out.verdict(found, 1.0, before, 0.9 * before, after, True) == word
 
 
@@ -172,7 +157,7 @@ def test_no_verdict_by_a_whisper(before, after, confidence, word):
 )
 def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):
     """`none` would say that nothing was amiss; where the rest is not followed either the signal does not explain it."""
-    bad = finding(confidence) | {"effect": "bad_channel", "held_out": None}
+    bad = Finding("bad_channel", confidence, "", ["a"])
     assert held_out.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
 
 
@@ -261,7 +246,7 @@ def test_what_no_fitted_recording_shows_makes_no_verdict_unknown(before, after, 
     near = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after, "how": "near"}
     given = empty()["held_out"] | {"not_judged": ["saturation of a"]}
     d = SimpleNamespace(
-        data=empty() | {"findings": names, "noise_floor": {"position_rad": 1.0}, "held_out": given},
+        data=empty() | {"noise_floor": {"position_rad": 1.0}, "held_out": given}, findings=names,
         judged=Judged({**near, "before": 90.0, "before_low": 80.0, "after": 88.0, "how": "all"}, shown=(near, False)),
         touch=None, sentence="", mechanism=None, joints={},
     )  # fmt: skip
@@ -357,11 +342,10 @@ def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypat
 
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():
-    felt = TouchResult(
-        [{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03
-    )
-    held_out.settle(felt.findings)
-    assert conclude._of_touch(felt) == "none" and felt.findings[0]["hint"]
+    error = (0.03, 0.03, 0.03)
+    felt = TouchResult([Finding("tactile_gain", 0.3, "", taxels=["0:1"])], before=error, after=error, floor=0.03)
+    d = decided(before=0.9, touch=felt)
+    assert d.data["verdict"] == "none" and felt.findings[0].hint
 
 
 @pytest.mark.parametrize(
@@ -414,14 +398,14 @@ def test_what_is_left_is_believed_as_with_or_without_what_was_taken_back(alone, 
 
         def _finding(self, mm, m):
             self.evidence.append(SimpleNamespace(effect=mm.id, confidence=self.sure))
-            return {"confidence": self.sure}
+            return Finding("lag", self.sure, "")
 
         def _without_id(self, effect):
             return np.full(100, alone)
 
     answer = Answer(now, Answer(before))
     answer.judge(None)
-    assert answer.found[0]["confidence"] == answer.evidence[0].confidence == said
+    assert answer.found[0].confidence == answer.evidence[0].confidence == said
 
 
 def test_what_is_taken_back_does_not_reach_a_search():

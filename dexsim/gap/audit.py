@@ -110,13 +110,13 @@ def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], 
     known = channels.spoiled(list(recordings), channels.driven_openly(runs))
     found, _, _ = channels.inspect([copy.copy(r) for r in runs], m.spec.compile(), known)  # which takes samples out
     for f in found:
-        kind, _, text = f["regime"].partition(": ")
+        kind, _, text = f.regime.partition(": ")
         kind = {"sign": "sign_mismatch"}.get(kind, kind)
-        severity = "warning" if kind == "stale" or f["confidence"] < 0.5 else "error"
-        for name in dict.fromkeys(w["recording"] for w in f["when"]):
-            when = [w for w in f["when"] if w["recording"] == name]
-            joint = (f["where"]["joints"] or [""])[0]
-            topic = (f["where"]["topics"] or [""])[0]
+        severity = "warning" if kind == "stale" or f.confidence < 0.5 else "error"
+        for name in dict.fromkeys(w["recording"] for w in f.when):
+            when = [w for w in f.when if w["recording"] == name]
+            joint = (f.joints or [""])[0]
+            topic = (f.topics or [""])[0]
             out[name].append(Finding(kind, topic, when[0]["start"], len(when), text, severity, joint, when[-1]["end"]))
     for joint in dict.fromkeys(j for r in runs for j in r.joints):
         for name, kind, text in agreement.contradictions(runs, joint):

@@ -337,27 +337,27 @@ class Progress:
 def verdict(d: Diagnosis) -> str:
     """The verdict in at most ten lines."""
     from dexsim.console.tables import number
+    from dexsim.gap.finding import gathered
     from dexsim.gap.judge.conclude import place
-    from dexsim.gap.read import gathered
     from dexsim.gap.search import baseline
 
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]
     if plain := baseline.text(data["baseline"], "mm" if data["held_out"]["error"].endswith("_m") else "mrad"):
         lines.append(f"  {plain}")
-    for f in gathered(data["findings"])[: 4 - bool(plain)]:
+    for f in gathered(d.findings)[: 4 - bool(plain)]:
         where = place(f, d.mechanism)
         sizes = ", ".join(
             f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}"
-            for k, p in f["parameters"].items()
+            for k, p in f.parameters.items()
             if isinstance(p["value"], float)
         )
-        hint = " (a hint)" if f.get("hint") else ""
-        lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}{hint}: {sizes or f['regime']}")
-        if f["indistinguishable"]:
+        hint = " (a hint)" if f.hint else ""
+        lines.append(f"  {f.effect} @ {where}, confidence {f.confidence:.2f}{hint}: {sizes or f.regime}")
+        if f.indistinguishable:
             lines.append(
-                f"    cannot be told from {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}: "
-                f"{f['separating_experiment']}"
+                f"    cannot be told from {', '.join(x for x in f.indistinguishable if x != f.effect)}: "
+                f"{f.separating_experiment}"
             )
     if data["next_recording"]:
         lines.append(f"  record next: {data['next_recording']['why']}")

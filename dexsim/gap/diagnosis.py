@@ -107,7 +107,7 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
     """What is left when no joint can be judged: touch, or the reason why nothing can be said."""
     felt = touch.result
     d = Diagnosis(empty(), f"{reason.rstrip('.')}.", w.notes, mechanism=w.m)
-    d.data["findings"] = w.channel
+    d.findings = w.channel
     if felt.before is None and not felt.findings:
         d.data["reason"] = reason
         conclude.decide(d)
@@ -628,7 +628,7 @@ class Drives(Steps):
                 late.append(case.joint)
                 continue
             begun = time.monotonic()
-            claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
+            claimed = any(case.joint in f.joints and modelled(f) for f in d.findings)
             trial = search.polish(outcome.best if claimed else outcome.none)
             found = handed_on.fit_stand_in(
                 case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed

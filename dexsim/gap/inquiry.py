@@ -19,6 +19,7 @@ from dexsim.gap import locate
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import PadFacts
 from dexsim.gap.effects.catalogue import CATALOGUE
+from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence, full_model, handed_on
 from dexsim.gap.read import Run, agreement, channels, inputs
 from dexsim.gap.search.search import Outcome
@@ -43,12 +44,12 @@ class PadCurve:
 
 @dataclass
 class TouchResult:
-    """findings as `diagnosis.json` has them; before, after: [N] held-out rms of the taxels' readings (of all judged
+    """before, after: [N] held-out rms of the taxels' readings (of all judged
     pads) with 90 % intervals (value, low, high), None where no force could be predicted; floor [N]; error [F, K] N rms
     of each taxel before; structured: whether something is left that no effect explains; pads: by name (before, after,
     noise); names: of all pads [F]."""
 
-    findings: list[dict[str, Any]] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     before: tuple[float, float, float] | None = None
     after: tuple[float, float, float] | None = None
@@ -130,11 +131,12 @@ class Judged:
 
 @dataclass
 class Diagnosis:
-    """Everything the page shows; `data` is what diagnosis.json holds."""
+    """Everything the page shows; `data` is what diagnosis.json holds (its findings from `conclude.decide` on)."""
 
     data: dict[str, Any]
     sentence: str
     notes: list[str]
+    findings: list[Finding] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     spots: list[locate.Spot] = field(default_factory=list)
     # by joint: before, after, sigma; as_fitted: after, where it was taken back
@@ -210,7 +212,7 @@ class Inquiry:
     lengths: dict[str, float] = field(default_factory=dict)
     runs: list[Run] = field(default_factory=list)
     held: list[int] = field(default_factory=list)
-    channel: list[dict[str, Any]] = field(default_factory=list)
+    channel: list[Finding] = field(default_factory=list)
 
     @property
     def readable(self) -> list[Recording]:

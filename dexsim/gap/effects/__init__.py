@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.columns import Param, Scales
 from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.read import FRICTION, STIFFNESS
@@ -294,7 +295,7 @@ class Effect:
         """Servo columns in the place of those `approximated`. row: the plant's, as fitted."""
         return {}
 
-    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+    def said(self, finding: Finding, believed: dict[str, float]) -> str:
         """What it does, in words, with its direction where its size tells that. believed: columns of the joint,
         its model's friction included."""
         return self.words
@@ -370,15 +371,15 @@ class TouchEffect:
             return np.interp(run.t, run.grid, np.abs(contact(run, t.values)[0] - contact(run, neutral)[0]))
         return np.abs(readings(run, t.values, t.gains, t.order) - readings(run, neutral, t.gains, t.order)).max(1)
 
-    def doubt(self, finding: dict[str, Any]) -> str:
+    def doubt(self, finding: Finding) -> str:
         """A reason of its own to doubt a finding; empty for none."""
         return ""
 
-    def drift(self, finding: dict[str, Any], fact: PadFacts) -> Fit | None:
+    def drift(self, finding: Finding, fact: PadFacts) -> Fit | None:
         """Factor on all gains of the pad over the recordings; None where it is none."""
         return None
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
         """Writes a finding into the settings of its pad; returns what of it is left out, in words.
 
         doubt: whether its ranges are to hold what was believed."""

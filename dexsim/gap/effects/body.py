@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.gap.effects import Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.effects.signals import PositionOffset
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
@@ -44,9 +45,9 @@ class Inertia(Effect):
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"armature": fit.entry("armature", "kg" if fit.case.scales.slide else "kg.m2")}
 
-    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+    def said(self, finding: Finding, believed: dict[str, float]) -> str:
         return self.words.replace(
-            "more (or less)", "more" if finding["parameters"]["armature"]["value"] > 0 else "less"
+            "more (or less)", "more" if finding.parameters["armature"]["value"] > 0 else "less"
         )
 
     def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
@@ -144,8 +145,8 @@ class Payload(Effect):
             }
         }
 
-    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
-        p = finding["parameters"]
+    def said(self, finding: Finding, believed: dict[str, float]) -> str:
+        p = finding.parameters
         if "mass" in p:
             return f"carries {'more' if p['mass']['value'] > 0 else 'less'} mass than the model"
         return "hangs in another direction of gravity than the model"

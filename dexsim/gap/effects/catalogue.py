@@ -18,6 +18,7 @@ from dexsim.gap.effects import Effect, TouchEffect, Variant, body, drive, fricti
 from dexsim.gap.rules import JUDGE
 
 if TYPE_CHECKING:
+    from dexsim.gap.finding import Finding
     from dexsim.gap.plant.case import Case
 
 FIRST = (
@@ -196,14 +197,14 @@ def model_columns() -> frozenset[str]:
     return frozenset(c for e in CATALOGUE for c in e.model_columns)
 
 
-def modelled(finding: dict) -> bool:
+def modelled(finding: Finding) -> bool:
     """Whether a finding is of an effect that the plant has a law of: not a bad channel, nor a push from outside."""
     e = entry(finding)
     return e is not None and e.simulated
 
 
-def entry(finding: dict) -> Effect | TouchEffect | None:
+def entry(finding: Finding) -> Effect | TouchEffect | None:
     """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
-    if finding["where"]["joints"]:
-        return EFFECTS.get(finding["effect"])
-    return TOUCH_EFFECTS.get(finding["effect"])
+    if finding.joints:
+        return EFFECTS.get(finding.effect)
+    return TOUCH_EFFECTS.get(finding.effect)

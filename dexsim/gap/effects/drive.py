@@ -10,6 +10,7 @@ import numpy as np
 from dexsim.actuator.columns import DRY_FRICTION
 from dexsim.actuator.reference import torque_along
 from dexsim.gap.effects import Effect, FittedEffect, Variant, param, word
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
 from dexsim.gap.rules import JUDGE, SEARCH
@@ -51,8 +52,8 @@ class TorqueLimit(Effect):
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"torque": fit.entry("torque", fit.force)}
 
-    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
-        limit = finding["parameters"].get("torque", {"value": 0.0})["value"]
+    def said(self, finding: Finding, believed: dict[str, float]) -> str:
+        limit = finding.parameters.get("torque", {"value": 0.0})["value"]
         more = limit > believed.get("torque_limit", np.inf)
         return self.words.replace("less (or more)", "more" if more else "less")
 

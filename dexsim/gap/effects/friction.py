@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects import ByTorque, Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.rules import BELIEF, JUDGE
@@ -50,8 +51,8 @@ class CoulombFriction(Effect):
         out = {"torque": fit.entry("torque", fit.force, add=fit.case.scales.base_friction)}
         return out | {"asymmetry": fit.entry("asymmetry", "1")}
 
-    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
-        more = finding["parameters"]["torque"]["value"] > believed["coulomb_friction"] if believed else None
+    def said(self, finding: Finding, believed: dict[str, float]) -> str:
+        more = finding.parameters["torque"]["value"] > believed["coulomb_friction"] if believed else None
         return self.words if more is None else self.words.replace("more (or less)", "more" if more else "less")
 
 

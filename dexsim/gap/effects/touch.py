@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dexsim.gap.effects import Fit, PadFacts, PadSettings, TouchEffect, absent, fitted, ranged, times, wide
+from dexsim.gap.finding import Finding
 from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import THICKNESS, readings, shear
 from dexsim.tactile.pads import PAD_COLUMNS
@@ -36,22 +37,22 @@ class TactileGain(TouchEffect):
             return super().changes(run, t, base)
         return np.abs(readings(run, t.values, t.gains, t.order) - readings(run, t.values)).max(1)
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
         lost = gains(finding, pad, doubt)
         fact = pad.fact
         # without a load cell gain and stiffness are one factor
-        if set(finding["indistinguishable"]) - {self.id} and fact.common is not None:
+        if set(finding.indistinguishable) - {self.id} and fact.common is not None:
             pad.shared["contact.stiffness"] = absent(times((fact.stiffness,) * 3, fact.common), fact.stiffness)
         return lost
 
 
-def gains(finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
+def gains(finding: Finding, pad: PadSettings, doubt: bool) -> str:
     """Gains into a pad's settings; returns what is left out, in words."""
-    p, taxels, fact = finding["parameters"]["gain"], finding["parameters"].get("taxels", {}), pad.fact
+    p, taxels, fact = finding.parameters["gain"], finding.parameters.get("taxels", {}), pad.fact
     whole = fact.common or fact.rest
     if whole is not None:
         pad.values["gain"] = times(pad.values.get("gain"), wide(whole, 1.0 if doubt else None))
-    numbers = [int(t.split(":")[1]) for t in finding["where"]["taxels"]]
+    numbers = [int(t.split(":")[1]) for t in finding.taxels]
     lists = {k: np.broadcast_to(np.atleast_1d(p[k]), len(numbers)) for k in ("value", "low", "high")}
     single: dict[int, Fit] = {}
     for k, v, low, high in zip(numbers, *lists.values(), strict=True):
@@ -84,8 +85,8 @@ class TactileDelay(TouchEffect):
     report = (("delay", "delay"),)
     replaces = frozenset(("clock",))
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        pad.values["delay"] = fitted(finding["parameters"]["delay"], 0.0 if doubt else None)
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        pad.values["delay"] = fitted(finding.parameters["delay"], 0.0 if doubt else None)
         return ""
 
 
@@ -101,8 +102,8 @@ class TactileHysteresis(TouchEffect):
     report = (("fraction", "fraction"), ("time_constant", "time_constant"))
     classes = ("how touch changes with time",)
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        p = finding["parameters"]
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        p = finding.parameters
         pad.values["hysteresis"] = fitted(p["fraction"], 0.0 if doubt else None)
         pad.values["hysteresis_time"] = fitted(p["time_constant"], None)
         return ""
@@ -121,8 +122,8 @@ class TactileStiffening(TouchEffect):
     report = (("c10", "c10"), ("c01", "c01"))
     excludes = frozenset(("contact_stiffness",))
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        p, fact = finding["parameters"], pad.fact
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        p, fact = finding.parameters, pad.fact
         if not doubt:
             rubber = {k: ranged(fitted(p[k], None), *PAD_COLUMNS["c10"][1:3]) for k in self.fits}
             if rubber["c10"]["low"] + rubber["c01"]["low"] <= 0.0:  # a rubber has to press back
@@ -145,13 +146,13 @@ class TactileCrosstalk(TouchEffect):
     report = (("neighbours", "fraction"),)
     widens = True
 
-    def doubt(self, finding: dict[str, Any]) -> str:
-        if finding.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < TOUCH.spread:
+    def doubt(self, finding: Finding) -> str:
+        if finding.parameters.get("fraction", {"low": 1.0})["low"] < TOUCH.spread:
             return "a contact's force may spread over the taxels as much wider than its law says"
         return ""
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        pad.values["crosstalk"] = fitted(finding["parameters"]["fraction"], 0.0 if doubt else None)
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        pad.values["crosstalk"] = fitted(finding.parameters["fraction"], 0.0 if doubt else None)
         return ""
 
 
@@ -174,8 +175,8 @@ class TactileDrift(TouchEffect):
     def begin(self, search: PadSearch) -> list[dict[str, float]]:
         return [{"drift": x / search.warm} for x in (0.15, -0.15)]
 
-    def drift(self, finding: dict[str, Any], fact: PadFacts) -> Fit | None:
-        ends = [1.0 + finding["parameters"]["per_degree"][k] * fact.warmest for k in ("value", "low", "high")]
+    def drift(self, finding: Finding, fact: PadFacts) -> Fit | None:
+        ends = [1.0 + finding.parameters["per_degree"][k] * fact.warmest for k in ("value", "low", "high")]
         return 0.5 * (1.0 + ends[0]), min(1.0, *ends[1:]), max(1.0, *ends[1:])
 
 
@@ -195,10 +196,10 @@ class ContactStiffness(TouchEffect):
     def in_place(self, values: dict[str, float], base: TouchTrial, current: TouchTrial) -> dict[str, float]:
         return base.values | {"stiffness": current.values["gain"]}
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        p, believed = finding["parameters"]["stiffness"], pad.fact.stiffness
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        p, believed = finding.parameters["stiffness"], pad.fact.stiffness
         pad.shared["contact.stiffness"] = fitted(p, believed if doubt else None)
-        if set(finding["indistinguishable"]) - {self.id}:  # a gain would do as well
+        if set(finding.indistinguishable) - {self.id}:  # a gain would do as well
             pad.values["gain"] = times(pad.values.get("gain"), absent(fitted(p, None, 1.0 / believed), 1.0))
         return ""
 
@@ -218,6 +219,6 @@ class ContactFriction(TouchEffect):
     def changes(self, run: PadRun, t: TouchTrial, base: dict[str, float]) -> np.ndarray:
         return np.linalg.norm(shear(run, t.values) - shear(run, t.values | {"mu": 1.0}), axis=1)
 
-    def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
-        pad.shared["object.friction"] = fitted(finding["parameters"]["mu"], pad.fact.friction if doubt else None)
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        pad.shared["object.friction"] = fitted(finding.parameters["mu"], pad.fact.friction if doubt else None)
         return ""

@@ -18,12 +18,12 @@ from dexsim.gap import locate
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.body import add_armature
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
 from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
 from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
-from dexsim.gap.read import wrong_signal
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
@@ -63,7 +63,7 @@ def into_diagnosis(
     kept: Kept,
     noise: Noise,
     how: str,
-    channel: list[dict[str, Any]],
+    channel: list[Finding],
     plains: Sequence[baseline.Baseline],
     written: Written,
     refused: dict[str, str],
@@ -76,7 +76,7 @@ def into_diagnosis(
     """
     data, notes, m = d.data, d.notes, d.mechanism
     assert m is not None  # that of the answers
-    findings: list[dict[str, Any]] = []
+    findings: list[Finding] = []
     for a in answers:
         joint = a.case.joint
         findings += a.found
@@ -107,7 +107,7 @@ def into_diagnosis(
         "joints": {k: float(v) for k, v in noise.joints.items()},
         "recordings": {kept.runs[i].name: {k: float(v) for k, v in x.items()} for i, x in noise.motions.items()},
     }
-    findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
+    findings = [f for f in findings if EFFECTS[f.effect].effort_only or not set(f.joints) & refuted]
     for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
         v = d.joints[joint]
         notes.append(
@@ -125,15 +125,15 @@ def into_diagnosis(
     _judged_by_ringing(d, rings)
     _not_better(d, refused)
     findings.sort(key=lambda f: -_weight(f, rings))
-    _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
+    findings = _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
     _hand_on(d, m, answers, findings)
     data["baseline"] = baseline.overall(plains, [j for j, name in written.chosen.items() if name == "plain"])
     notes += baseline.stopped(data["baseline"])
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
     # that says nothing of what is wrong with the reading of the effort alone
-    held_out.unneeded([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
-    data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
+    findings = [f if EFFECTS[f.effect].effort_only else held_out.unneeded(f, quiet) for f in findings]
+    d.findings = sorted(channel, key=lambda f: -f.confidence) + findings
     d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers), noise)
     notes += d.judged.loud
 
@@ -238,14 +238,14 @@ def _rings(a: JointAnswer) -> float:
 
 
 def _take_back(
-    d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]], rings: dict[str, float]
+    d: Diagnosis, answers: Sequence[JointAnswer], findings: list[Finding], rings: dict[str, float]
 ) -> set[str]:
     """Joints whose findings did not help on what was held out: they keep none of them, and are left as they were
     believed. rings: of `_rings`, by joint: no free run keeps step with those."""
     refuted = set()
     for a in answers:
         joint = a.case.joint
-        mine = [f for f in findings if joint in f["where"]["joints"] and not EFFECTS[f["effect"]].effort_only]
+        mine = [f for f in findings if joint in f.joints and not EFFECTS[f.effect].effort_only]
         v = d.joints[joint]
         if not mine or joint in rings or _less(v["after"], v["before"]):
             continue
@@ -261,7 +261,7 @@ def _take_back(
             continue
         refuted.add(joint)
         d.notes += [
-            f"{f['effect']} on {joint} earned its place on the training conditions but not on what was held out; not "
+            f"{f.effect} on {joint} earned its place on the training conditions but not on what was held out; not "
             "claimed"
             for f in mine
         ]
@@ -277,7 +277,7 @@ def _less(a: float, b: float) -> bool:
     return a**2 < (1 - SEARCH.tie) * b**2
 
 
-def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> None:
+def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], findings: list[Finding]) -> None:
     """The fitted servo and model; what is not sure reaches towards what was believed."""
     assert d.written is not None  # as into_diagnosis has it
     choice = {a.case.joint: d.written.candidate(a.case.joint) for a in answers}
@@ -293,11 +293,11 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
         if choice[a.case.joint].found
     }
     for f in findings:
-        joint, effect = f["where"]["joints"][0], f["effect"]
+        joint, effect = f.joints[0], f.effect
         if (
-            f["confidence"] < JUDGE.sure
+            f.confidence < JUDGE.sure
             and (joint, effect) in members
-            and widen(d.servo, *members[joint, effect], f["confidence"], earned(f))
+            and widen(d.servo, *members[joint, effect], f.confidence, earned(f))
         ):
             d.notes.append(
                 f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed"
@@ -370,10 +370,10 @@ def _error(
     return {"recordings": list(recordings), "error": name} | {k: values[k] for k in order} | {"how": how}
 
 
-def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
+def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Finding]) -> list[str]:
     """Joints without a finding of which what was held out is missed by far more than the noise, and what was fitted is
     not: what is missing (a limit, a sag) shows there alone, and what is held out must not be fitted."""
-    found = {j for f in findings for j in f["where"]["joints"]}
+    found = {j for f in findings for j in f.joints}
     return [
         j
         for j, v in joints.items()
@@ -396,39 +396,33 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     return "what was held out does not show it" if sides_with_neither and plain else ""
 
 
-def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str, Any]]) -> None:
-    """Confidences of the joints' findings (the weightiest first), after what they and the signals say of each other."""
+def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> list[Finding]:
+    """Return the joints' findings (the weightiest first), as sure as what they and the signals say of each other
+    leaves them."""
     by = {(e.joint, e.effect): e for e in d.evidence}
-    mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
+    mine = [by[f.joints[0], f.effect] for f in findings]
     for joint in {e.joint for e in mine}:
         confidence.doubt_beside_others([e for e in mine if e.joint == joint])
-    coupled = {
-        f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"]
-        for f in findings
-        if EFFECTS[f["effect"]].couples
-    }
-    signs = {j for f in channel if f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
-    others = {j for f in channel if not f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
+    coupled = {f.joints[0]: f.parameters["from_joint"]["value"] for f in findings if EFFECTS[f.effect].couples}
+    signs = {j for f in channel if f.regime.startswith(SIGN) for j in f.joints}
+    others = {j for f in channel if not f.regime.startswith(SIGN) for j in f.joints}
     confidence.of_the_whole(mine, coupled, signs | others, signs - others)
-    for f, e in zip(findings, mine, strict=True):
-        f["confidence"] = round(e.confidence, 3)
-        d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]
+    d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for e in mine for reason in e.reasons]
     d.evidence = mine
+    return [replace(f, confidence=round(e.confidence, 3)) for f, e in zip(findings, mine, strict=True)]
 
 
-def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
+def _elsewhere(channel: Finding, kept: Kept) -> bool:
     """Whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or with all
     of it: that casts no doubt on what the other recordings tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
     judged = {run.name for run in kept.runs}
-    return bool(channel["when"]) and all(
-        w["recording"] not in judged or (w["recording"], j) in left_out
-        for w in channel["when"]
-        for j in channel["where"]["joints"]
+    return bool(channel.when) and all(
+        w["recording"] not in judged or (w["recording"], j) in left_out for w in channel.when for j in channel.joints
     )
 
 
-def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:
+def _linkages(findings: list[Finding], answers: Sequence[JointAnswer]) -> list[Finding]:
     """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is
     the end that is dragged, where one of them feels only the pull; the name is as sure as its surer end."""
     pulled = {
@@ -438,9 +432,9 @@ def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) ->
         if mm.effect.couples and mm.variant.params[0].columns == ("reaction",)
     }
     ends = {
-        (f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f
+        (f.joints[0], f.parameters["from_joint"]["value"]): f
         for f in findings
-        if EFFECTS[f["effect"]].couples
+        if EFFECTS[f.effect].couples
     }
     out = list(findings)
     for (joint, other), f in ends.items():
@@ -450,33 +444,26 @@ def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) ->
         first, second = (second, f) if joint in pulled and other not in pulled else (f, second)
         place = min(out.index(first), out.index(second))
         out = [x for x in out if x is not first and x is not second]
-        joints = [*first["where"]["joints"], *second["where"]["joints"]]
-        out.insert(
-            place,
-            first
-            | {
-                "where": first["where"] | {"joints": joints},
-                "confidence": max(first["confidence"], second["confidence"]),
-            },
-        )
+        sure = max(first.confidence, second.confidence)
+        out.insert(place, replace(first, joints=[*first.joints, *second.joints], confidence=sure))
     return out
 
 
-def _weight(f: dict, rings: dict[str, float]) -> float:
+def _weight(f: Finding, rings: dict[str, float]) -> float:
     """How much of the error on what was held out a finding removes; of a joint that rings (`_rings`), of how it
     rings."""
-    h, share = f["held_out"], rings.get(f["where"]["joints"][0]) if f["where"]["joints"] else None
+    h, share = f.held_out, rings.get(f.joints[0]) if f.joints else None
     return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
 
 
-def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[logged_torque.IdentifiedJoint]) -> None:
+def add_behind(d: Diagnosis, findings: list[Finding], by_torque: Sequence[logged_torque.IdentifiedJoint]) -> None:
     """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
     that is left on the recording held out, where the loop's own error shows nothing."""
-    taken = {(f["effect"], *f["where"]["joints"]) for f in d.data["findings"]}
-    findings = [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
-    d.data["findings"] += findings
-    sure = [f for f in findings if f["confidence"] >= JUDGE.firm]
-    judged = [x for x in by_torque if any(x.case.joint in f["where"]["joints"] for f in sure)]
+    taken = {(f.effect, *f.joints) for f in d.findings}
+    findings = [f for f in findings if (f.effect, *f.joints) not in taken]
+    d.findings += findings
+    sure = [f for f in findings if f.confidence >= JUDGE.firm]
+    judged = [x for x in by_torque if any(x.case.joint in f.joints for f in sure)]
     if not judged:
         return
     # not what the catalogue has no name for
@@ -487,7 +474,7 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[logged_to
     )
     assert d.judged is not None  # the joints come first
     d.judged.torque = _error(
-        sure[0]["held_out"]["error"],
+        (sure[0].held_out or {})["error"],
         (b, None, None),
         (a, None, None),
         judged[0].judges,
@@ -498,8 +485,8 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[logged_to
 def _followed(d: Diagnosis, joint: str) -> bool:
     """Whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
     out."""
-    named = any(f["confidence"] >= JUDGE.firm and joint in f["where"]["joints"] and f["held_out"]
-                for f in d.data["findings"])  # fmt: skip
+    named = any(f.confidence >= JUDGE.firm and joint in f.joints and f.held_out
+                for f in d.findings)  # fmt: skip
     fitted = any(x.joint == joint and x.best.fit.loss <= JUDGE.within**2 for x in d.outcomes)
     return named and fitted and d.joints[joint]["after"] <= JUDGE.within * d.joints[joint]["sigma"]
 
@@ -520,16 +507,16 @@ def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
     joints = {p.joint for p in pushes if not p.cut}
     kept = [
         f
-        for f in d.data["findings"]
-        if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])
+        for f in d.findings
+        if f.effect not in EFFECTS or EFFECTS[f.effect].effort_only or not joints & set(f.joints)
     ]
     d.notes += [
-        f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or "
+        f"{f.effect} on {', '.join(f.joints)} is not claimed: something outside moved the joint, or "
         "its recorded torque is not its own"
-        for f in d.data["findings"]
+        for f in d.findings
         if f not in kept
     ]
-    d.data["findings"] = [p.finding() for p in pushes] + kept
+    d.findings = [p.finding() for p in pushes] + kept
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
@@ -540,21 +527,26 @@ def decide(d: Diagnosis) -> None:
     sentence: the last step, after everything was found of signals, joints, pushes and touch. Nothing else decides any
     of these."""
     data, felt = d.data, d.touch
-    held_out.settle(data["findings"])
-    of_touch = [] if felt is None else felt.findings
-    mine = [f for f in data["findings"] if not any(f is x for x in of_touch)]
+    mine, of_touch = held_out.settle(d.findings), [] if felt is None else held_out.settle(felt.findings)
     joints, error = ("unusable", None) if d.judged is None else _of_joints(mine, d.judged, _floor(d))
+    if joints == "none":
+        mine = [held_out.whispered(f) if f.held_out and not f.hint and not _by_torque(f) else f for f in mine]
     depends = [] if joints in ("none", "explained") else list(data["unexplained"]["depends_on"])
-    word, touch = joints, None if felt is None else _of_touch(felt)
+    word, touch = joints, None if felt is None else _of_touch(felt, of_touch)
+    if touch == "none" and felt is not None and felt.before is not None:
+        of_touch = [f if f.hint else held_out.whispered(f) for f in of_touch]
     if felt is not None and touch is not None:
         word = _of_both(joints, touch)
         depends += felt.depends_on if word not in ("none", "explained") else []
-        named = [f for f in mine if not wrong_signal(f) and not f.get("hint")]
-        felt_alone = not named and (joints == "none" or any(not f.get("hint") for f in of_touch)) and touch != "none"
+        named = [f for f in mine if not f.wrong_signal and not f.hint]
+        felt_alone = not named and (joints == "none" or any(not f.hint for f in of_touch)) and touch != "none"
         if joints == "unusable" or (felt_alone and felt.before is not None):
             error = _error_of_touch(felt)
-    data["verdict"] = word
-    data["findings"].sort(key=lambda f: f.get("hint", False))
+    if felt is not None:
+        felt.findings = of_touch
+    of_touch = sorted(of_touch, key=lambda f: -f.confidence)
+    d.findings = sorted([*mine, *of_touch], key=lambda f: f.hint)
+    data["verdict"], data["findings"] = word, [f.to_json() for f in d.findings]
     data["unexplained"]["depends_on"] = depends
     if error is not None:
         beside = {k: v for k, v in data["held_out"].items() if k == "not_judged"}
@@ -579,7 +571,7 @@ def _floor(d: Diagnosis) -> float:
     return d.data["noise_floor"]["position_rad"] or 0.0
 
 
-def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> tuple[str, dict[str, Any]]:
+def _of_joints(findings: Sequence[Finding], by: Judged, floor: float) -> tuple[str, dict[str, Any]]:
     """The word for the joints, and the error that it goes by: that of the torque where nothing but that names anything,
     that of the effort where nothing but its reading is wrong, of the motion otherwise."""
     behind = [f for f in held_out.firm(findings) if by.torque is not None and _by_torque(f)]
@@ -588,7 +580,7 @@ def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> 
         b, a = by.torque["before"], by.torque["after"]
         part = any(map(held_out.lowers, behind)) and a < (1 - JUDGE.removed) * b
         return ("partly_explained" if part else "unknown"), by.torque
-    if named and by.effort is not None and all(EFFECTS[f["effect"]].effort_only for f in named):
+    if named and by.effort is not None and all(EFFECTS[f.effect].effort_only for f in named):
         if any(map(held_out.lowers, named)):
             return "explained", by.effort
     p, of_motion = by.position, [f for f in findings if not _by_torque(f)]
@@ -599,33 +591,23 @@ def _of_joints(findings: Sequence[dict[str, Any]], by: Judged, floor: float) -> 
         told = held_out.verdict(of_motion, floor, q["before"], q["before_low"], q["after"], rest, quiet, loud)
         if told != "unknown":
             word, p = told, q
-    if word == "none":
-        _whispered(named)
     return word, p
 
 
-def _by_torque(f: dict[str, Any]) -> bool:
+def _by_torque(f: Finding) -> bool:
     """Whether a finding was judged by its torque alone (`add_behind`)."""
-    return bool(f["held_out"]) and f["held_out"].get("error", "").startswith("effort")
+    return bool(f.held_out) and (f.held_out or {}).get("error", "").startswith("effort")
 
 
-def _whispered(findings: Sequence[dict[str, Any]]) -> None:
-    """Makes hints of names where nothing is missing."""
-    for f in findings:
-        f["confidence"], f["hint"] = min(f["confidence"], JUDGE.hinted), True
-
-
-def _of_touch(felt: TouchResult) -> str | None:
+def _of_touch(felt: TouchResult, findings: Sequence[Finding]) -> str | None:
     """The word for touch alone; None where it was not judged."""
-    named = [f for f in felt.findings if not f.get("hint")]
+    named = [f for f in findings if not f.hint]
     if felt.before is None:
         return "explained" if named else None
     assert felt.floor is not None and felt.after is not None  # with a force predicted
     seen = {"before": 1.0, "after": 0.0}  # what is constant was seen, not fitted
-    given = [{"effect": f["effect"], "held_out": f.get("held_out") or seen, "hint": False} for f in named]
+    given = [replace(f, confidence=1.0, held_out=f.held_out or seen) for f in named]
     word = held_out.verdict(given, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
-    if word == "none":
-        _whispered(named)
     return "partly_explained" if word == "explained" and felt.structured else word
 
 
@@ -695,7 +677,7 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
             continue
         if allowed is not None and e not in allowed:
             out[e] = "not asked for (effects=)"
-        elif touch and not any(f["effect"] == e for f in felt.findings):
+        elif touch and not any(f.effect == e for f in felt.findings):
             out[e] = touch
     return out
 
@@ -735,9 +717,9 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
-    named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
-    bad = [f for f in data["findings"] if wrong_signal(f) and not f.get("hint")]
-    prefix = _first_of_all([f for f in data["findings"] if not f.get("hint")], bad, d)
+    named = [f for f in d.findings if modelled(f) and not f.hint]
+    bad = [f for f in d.findings if f.wrong_signal and not f.hint]
+    prefix = _first_of_all([f for f in d.findings if not f.hint], bad, d)
     if data["verdict"] == "none":
         return (
             prefix
@@ -767,7 +749,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
             + f"Something is missing that no effect of the catalogue explains: {left} where {limit}{depends}."
         )
     of = ""
-    alone = {j for f in named for j in f["where"]["joints"]}
+    alone = {j for f in named for j in f.joints}
     # not thinned by joints that are well
     if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):
         of, mine = " of that joint", d.joints[next(iter(alone))]
@@ -799,11 +781,11 @@ def _unit(metric: str) -> str:
     return "mm" if metric.endswith("_m") else "mrad"
 
 
-def _first_of_all(findings: list[dict], bad: list[dict], d: Diagnosis) -> str:
+def _first_of_all(findings: list[Finding], bad: list[Finding], d: Diagnosis) -> str:
     """What comes before the verdict: signals that are not what they say (`bad`), and pushes from outside."""
     said = (
         f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} "
-        f"({bad[0]['regime']}). "
+        f"({bad[0].regime}). "
         if bad
         else ""
     )
@@ -814,15 +796,15 @@ def _first_of_all(findings: list[dict], bad: list[dict], d: Diagnosis) -> str:
     return said
 
 
-def _names(named: list[dict], d: Diagnosis) -> str:
+def _names(named: list[Finding], d: Diagnosis) -> str:
     """The two largest effects, where they sit, and how many more there are."""
     parts = []
     for f in named[:2]:
         words = words_of(f, d.mechanism)
-        others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
+        others = " or ".join(x.replace("_", " ") for x in f.indistinguishable if x != f.effect)
         doubt = f", or it is {others}: these recordings cannot tell" if others else ""
         parts.append(f"{spoken(f, d.mechanism)} {words}{_size(f)}{doubt}")
-    first = named[0]["where"]["joints"]
+    first = named[0].joints
     if not first or first[0] in spoken(named[0], d.mechanism)[1:]:
         parts[0] = parts[0][:1].upper() + parts[0][1:]
     left_out = len(named) - len(parts)
@@ -834,11 +816,11 @@ ORDER = ("first", "second", "third", *(f"{n}th" for n in range(4, 40)))
 FINGERS = {"thumb": "the thumb", "mid": "the middle finger", "pinky": "the little finger"}
 
 
-def spoken(f: dict, m: Mechanism | None) -> str:
+def spoken(f: Finding, m: Mechanism | None) -> str:
     """Where a finding sits as a person says it: a hand's joints by finger, another mechanism's by name."""
-    if len(f["where"]["joints"]) != 1:
+    if len(f.joints) != 1:
         return place(f, m)
-    joint = f["where"]["joints"][0]
+    joint = f.joints[0]
     hand = None if m is None else m.whose
     owner = hand.finger_of_joint[hand.joints.index(joint)] if hand is not None and joint in hand.joints else -1
     if hand is None or owner < 0:
@@ -851,9 +833,9 @@ def spoken(f: dict, m: Mechanism | None) -> str:
     return f"{FINGERS.get(finger.name, f'the {finger.name} finger')}'s {kind} ({joint})"
 
 
-def words_of(f: dict, m: Mechanism | None) -> str:
+def words_of(f: Finding, m: Mechanism | None) -> str:
     """What an effect does, in words, with its direction where its size tells that."""
-    joint, effect = next(iter(f["where"]["joints"]), None), entry(f)
+    joint, effect = next(iter(f.joints), None), entry(f)
     assert effect is not None  # what has words is of the catalogue
     if joint is None or not isinstance(effect, Effect):
         return effect.words
@@ -866,26 +848,26 @@ def words_of(f: dict, m: Mechanism | None) -> str:
     return effect.said(f, believed)
 
 
-def place(f: dict, m: Mechanism | None) -> str:
+def place(f: Finding, m: Mechanism | None) -> str:
     """Where a finding sits, in words."""
-    if f["where"]["joints"]:
-        return ", ".join(f["where"]["joints"])
-    if f["where"]["taxels"] and m is not None:
-        pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
-        count = len(f["where"]["taxels"])
+    if f.joints:
+        return ", ".join(f.joints)
+    if f.taxels and m is not None:
+        pads = sorted({int(t.split(":")[0]) for t in f.taxels})
+        count = len(f.taxels)
         fingers = " and ".join(m.sensors.names[p] for p in pads)
         return (
             f"the {fingers}'s pad"
-            if count > 12 or "taxels" not in f["parameters"]
+            if count > 12 or "taxels" not in f.parameters
             else f"the {fingers}'s pad (taxel{'s' * (count > 1)} "
-                 f"{', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+                 f"{', '.join(t.split(':')[1] for t in f.taxels)})"
         )
-    return ", ".join(f["where"]["topics"])
+    return ", ".join(f.topics)
 
 
-def _size(f: dict) -> str:
+def _size(f: Finding) -> str:
     """The first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
-    name, p = next(iter(f["parameters"].items()), (None, None))
+    name, p = next(iter(f.parameters.items()), (None, None))
     if name is None or p is None or p["value"] is None or isinstance(p["value"], str):
         return ""
     number = np.atleast_1d(p["value"])  # com and tilt are vectors, gains one a taxel

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import SHAPES, neutral_of
 from dexsim.gap.rules import BELIEF, JUDGE
@@ -179,18 +180,18 @@ def doubt_beside_others(mine: list[Evidence]) -> None:
             e.doubt(f"{len(mine)} effects on one joint: together they may stand for another")
 
 
-def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
-    """Lowers the confidence of touch's findings that are too small, or that the law of a contact's pressure may stand
-    for; returns why, a line each."""
-    said = []
+def of_touch(findings: list[Finding], before: float, noise: float) -> tuple[list[Finding], list[str]]:
+    """(touch's findings, less sure where they are too small or the law of a contact's pressure may stand for them, why:
+    a line each)."""
+    out, said = [], []
     for f in findings:
-        h = f["held_out"]
+        h = f.held_out
         reason = too_small(before, h["before"], h["after"], noise, len(findings) == 1) if h else ""
-        reason = reason or TOUCH_EFFECTS[f["effect"]].doubt(f)
+        reason = reason or TOUCH_EFFECTS[f.effect].doubt(f)
         if reason:
-            f["confidence"] = min(f["confidence"], JUDGE.doubted)
-            said.append(f"{f['effect']} is not sure: {reason}")
-    return said
+            said.append(f"{f.effect} is not sure: {reason}")
+        out.append(f.at_most(JUDGE.doubted) if reason else f)
+    return out, said
 
 
 def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str], signs: Set[str] = frozenset()) -> None:

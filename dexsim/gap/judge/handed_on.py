@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from dexsim.actuator.reference import (
 )
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.case import Case, true_motion
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
@@ -188,14 +189,11 @@ def missing_of(case: Case, trial: Trial) -> tuple[str, ...]:
     return tuple(out)
 
 
-def earned(finding: dict[str, Any]) -> float:
+def earned(finding: Finding) -> float:
     """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or
     more off the error on what was held out (against all others fitted again without it), less by what other names claim
     of it, which would go on in another way where nothing was recorded."""
-    error, others = (
-        finding.get("held_out") or {},
-        sum(float(x["confidence"]) for x in finding.get("alternatives") or ()),
-    )
+    error, others = finding.held_out or {}, sum(float(x["confidence"]) for x in finding.alternatives)
     if not error or error["before"] is None or error["after"] is None:
         return 0.0
     less = float(np.clip((error["before"] - error["after"]) / (JUDGE.earns * error["before"] + 1e-12), 0.0, 1.0))

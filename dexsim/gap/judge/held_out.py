@@ -4,17 +4,17 @@ verdict by them."""
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dexsim import intervals
+from dexsim.gap.finding import Finding
 from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.read import BLOCK, Run, same_commands, wrong_signal
+from dexsim.gap.read import BLOCK, Run, same_commands
 from dexsim.gap.rules import JUDGE, SEARCH
 
 # -- what is held out -------------------------------------------------------------------------------------------------
@@ -329,45 +329,43 @@ def rms_interval(
 STRETCH = 4  # neighbouring blocks that the bootstraps of a gain draw together
 
 
-def unneeded(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
-    """Lowers what is known of names on joints that are followed to their floor without any effect (`quiet`) to what a
-    hint has."""
-    for f in findings:
-        joints = f["where"]["joints"]
-        if joints and set(joints) <= quiet and f["held_out"]:
-            f["confidence"] = min(f["confidence"], JUDGE.hinted)
+def unneeded(f: Finding, quiet: set[str]) -> Finding:
+    """Return a finding, as a hint where its joints are followed to their floor without any effect (`quiet`)."""
+    return f.at_most(JUDGE.hinted) if f.joints and set(f.joints) <= quiet and f.held_out else f
 
 
-def settle(findings: Sequence[dict[str, Any]]) -> None:
-    """Marks the findings that are hints: whatever is named below `JUDGE.firm`, of a joint, a signal, a push or of
-    touch."""
-    for f in findings:
-        if f["confidence"] < JUDGE.firm:
-            f["hint"] = True
+def settle(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the findings, those as hints that are named below `JUDGE.firm`: of a joint, a signal, a push, of touch."""
+    return [replace(f, hint=True) if f.confidence < JUDGE.firm else f for f in findings]
 
 
-def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def whispered(f: Finding) -> Finding:
+    """Return a name as a hint: nothing is missing."""
+    return replace(f.at_most(JUDGE.hinted), hint=True)
+
+
+def firm(findings: Sequence[Finding]) -> list[Finding]:
     """The findings of physics that are more than hints."""
-    return [f for f in findings if f["held_out"] and not f.get("hint")]
+    return [f for f in findings if f.held_out and not f.hint]
 
 
-def lowers(f: dict[str, Any]) -> bool:
+def lowers(f: Finding) -> bool:
     """Whether a finding lowers the error on what was held out, by more than the interval of what it removes. What acts
     in a few moments alone, as a limit does, removes nothing in draws without them: an interval that begins at nothing
     (`SEARCH.tie`) is no loss then, and the part that it removes of the whole decides (`JUDGE.part`)."""
-    h = f["held_out"]
+    h = f.held_out or {}
     if "removed_low" not in h or h["removed_low"] > 0:
         return bool(h["after"] < h["before"] or "removed_low" in h)
     return bool(h["removed_low"] >= -SEARCH.tie and h["after"] ** 2 <= (1 - JUDGE.part) * h["before"] ** 2)
 
 
-def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def wrong_signals(findings: Sequence[Finding]) -> list[Finding]:
     """The findings that a signal is not what it says, where they are more than hints."""
-    return [f for f in findings if wrong_signal(f) and f["confidence"] >= JUDGE.firm]
+    return [f for f in findings if f.wrong_signal and f.confidence >= JUDGE.firm]
 
 
 def verdict(
-    findings: Sequence[dict[str, Any]],
+    findings: Sequence[Finding],
     floor: float,
     before: float,
     before_low: float,
@@ -392,7 +390,7 @@ def verdict(
         return "unknown"
     # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
     if after <= JUDGE.within * floor:
-        sure = any(f.get("confidence", 1.0) >= JUDGE.sure_of_one or f.get("indistinguishable") for f in named)
+        sure = any(f.confidence >= JUDGE.sure_of_one or f.indistinguishable for f in named)
         return "explained" if sure else "partly_explained"
     return "partly_explained" if (before - after) / max(before - floor, 1e-12) >= JUDGE.removed else "unknown"
 

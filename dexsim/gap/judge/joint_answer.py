@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -15,6 +14,7 @@ from scipy.optimize import brentq, minimize
 from dexsim.gap import locate
 from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import confusable, inseparable, separating
+from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.inquiry import Curve
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.plant.case import Case, intervals_of
@@ -86,7 +86,7 @@ class JointAnswer:
         self.earlier: JointAnswer | None = None  # with an effect that was taken back since
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}
-        self.found: list[dict[str, Any]] = []
+        self.found: list[Finding] = []
         self.evidence: list[confidence.Evidence] = []
         self.spots: list[locate.Spot] = []
         self.depends_on: list[str] = []
@@ -173,7 +173,7 @@ class JointAnswer:
         return self._trials[mm.id]
 
     def judge(self, m: Mechanism) -> None:
-        """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each.
+        """Fills `found`: what was found, and the evidence behind each.
 
         Where an effect was taken back, what is left is judged with it and without, and believed the more: unless the
         one that went explains a part of what was held out by itself. It is another explanation then, and the less
@@ -187,9 +187,9 @@ class JointAnswer:
             lost = np.mean((self.measured - self.earlier._without_id(mm.id)) ** 2)
             other = lost <= (1 - JUDGE.part) * np.mean(self.before)
             chosen = (min if other else max)(self.evidence[k], with_it, key=lambda e: e.confidence)
-            self.evidence[k], self.found[k]["confidence"] = chosen, chosen.confidence
+            self.evidence[k], self.found[k] = chosen, replace(self.found[k], confidence=chosen.confidence)
 
-    def _finding(self, mm: Member, m: Mechanism) -> dict[str, Any]:
+    def _finding(self, mm: Member, m: Mechanism) -> Finding:
         case, best = self.case, self.best
         raw, spread = self._fitted(mm, self.bounds)
         self.raw[mm.id] = raw
@@ -219,27 +219,21 @@ class JointAnswer:
         signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
-        finding: dict[str, Any] = {
-            "effect": mm.id,
-            "confidence": evidence.confidence,  # what the other findings say of it comes last
-            "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
-            "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
-            "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
-            "where": {"joints": [case.joint], "taxels": [], "topics": []},
-            "regime": mm.effect.shows,
-            "when": intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
-            "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
-            "held_out": {
-                "before": was,
-                "after": left,
-                "removed_low": round(told[0], 4),
-                "removed_high": round(told[1], 4),
-            },
-        }
         late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.within**2 else None
-        if late is not None:
-            finding["parameters"]["jitter"] = late.entry()
-        return finding
+        sizes = mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table))
+        alike = [mm.id, *(e for e, _ in same)] if same else []
+        return Finding(
+            mm.id,
+            evidence.confidence,  # what the other findings say of it comes last
+            mm.effect.shows,
+            [case.joint],
+            alternatives=chances(rivals),
+            indistinguishable=alike,
+            separating_experiment=separating(alike) if alike else None,
+            when=intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
+            parameters=sizes | ({} if late is None else {"jitter": late.entry()}),
+            held_out=removed(was, left, told),
+        )
 
     def _judged(
         self,

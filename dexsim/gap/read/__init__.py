@@ -3,9 +3,7 @@ plain arrays, in the order of the joints that are diagnosed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -15,39 +13,8 @@ from dexsim.recording.smooth import LocalPolynomial, local_polynomial
 BLOCK = 0.5
 """s of a stretch whose samples are resampled together: errors that lie nearer to each other are not independent."""
 
-WRONG_SIGNAL = "bad_channel"
-"""Of a finding that is no effect: a signal is not what it says (`effect` in `diagnosis.json`)."""
-
-
-def wrong_signal(finding: dict[str, Any]) -> bool:
-    """Whether a finding says that a signal is not what it says."""
-    return bool(finding["effect"] == WRONG_SIGNAL)
-
-
 COLUMNS = ("v", "torque", "temperature", "duty", "enabled", "read")
 """Of a run, what may be absent and has a column for each joint."""
-
-
-def gathered(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return findings with those of one kind of fault in several signals as one, at the place of the first."""
-    out: dict[Any, dict[str, Any]] = {}
-    for f in findings:
-        kind = f["regime"].partition(":")[0]
-        key = (kind, f.get("hint", False)) if wrong_signal(f) else id(f)
-        if key not in out:
-            out[key] = f | {"alike": [f]}
-            continue
-        one = out[key]
-        one["alike"] = [*one["alike"], f]
-        one["confidence"] = max(one["confidence"], f["confidence"])
-        one["when"] = [*one["when"], *f["when"]]
-        one["where"] = {k: list(dict.fromkeys([*x, *f["where"][k]])) for k, x in one["where"].items()}
-    for one in out.values():
-        if len(one["alike"]) > 1:
-            places = one["where"]["joints"] or one["where"]["topics"]
-            more = f" and {len(places) - 3} more" if len(places) > 3 else ""
-            one["regime"] += f" (the same in {len(one['alike'])} signals, of {', '.join(places[:3])}{more})"
-    return list(out.values())
 
 
 @dataclass

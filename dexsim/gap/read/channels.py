@@ -16,7 +16,7 @@ before.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -24,10 +24,12 @@ import numpy as np
 from scipy import fft
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run
+from dexsim.gap.finding import WRONG_SIGNAL, Finding
+from dexsim.gap.read import COLUMNS, Run
 from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording.audit_values import repeats
-from dexsim.recording.schema import COMMANDS, STATES, Finding, Recording
+from dexsim.recording.schema import COMMANDS, STATES, Recording
+from dexsim.recording.schema import Finding as AuditFinding
 
 # kinds of the audit's errors after which a position or a target cannot be used
 SPOILS = ("joint_order", "wrap", "unit")
@@ -43,20 +45,10 @@ Spans = list[tuple[float, float]]  # s
 
 def finding(
     kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float | None = None
-) -> dict[str, Any]:
-    """A finding that a signal is not what it says, as `diagnosis.json` has it."""
-    return {
-        "effect": WRONG_SIGNAL,
-        "confidence": SIGNAL.told if confidence is None else confidence,
-        "alternatives": [],
-        "indistinguishable": [],
-        "separating_experiment": None,
-        "where": {"joints": [joint] if joint else [], "taxels": [], "topics": topics},
-        "regime": f"{kind}: {text}",
-        "when": when,
-        "parameters": {},
-        "held_out": None,
-    }
+) -> Finding:
+    """A finding that a signal is not what it says."""
+    told = SIGNAL.told if confidence is None else confidence
+    return Finding(WRONG_SIGNAL, told, f"{kind}: {text}", [joint] if joint else (), topics=topics, when=when)
 
 
 def driven_openly(runs: list[Run]) -> set[tuple[str, str]]:
@@ -64,7 +56,7 @@ def driven_openly(runs: list[Run]) -> set[tuple[str, str]]:
     return {(run.name, joint) for run in runs for j, joint in enumerate(run.joints) if _within_drive(run, j)}
 
 
-def far_target(f: Finding, name: str, openly: Set[tuple[str, str]]) -> bool:
+def far_target(f: AuditFinding, name: str, openly: Set[tuple[str, str]]) -> bool:
     """Whether what the audit found in the recording `name` is that targets lie far off on a joint that is driven so:
     it knows no gains."""
     return f.kind == "unit" and f.topic == COMMANDS and (name, f.joint) in openly
@@ -86,27 +78,20 @@ def spoiled(recordings: list[Recording], openly: Set[tuple[str, str]] = frozense
     return out
 
 
-def secondary(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def secondary(findings: list[Finding]) -> list[Finding]:
     """The findings without those that follow from another: an effort's sign is read against the position."""
-    wrong = {
-        j
-        for f in findings
-        for j in f["where"]["joints"]
-        if f["regime"].split(":")[0] in SPOILS and "position" in f["regime"]
-    }
-    return [
-        f
-        for f in findings
-        if not (f["regime"].startswith(("sign_mismatch", "lost_sign")) and set(f["where"]["joints"]) & wrong)
-    ]
+    spoiled = [f for f in findings if f.regime.split(":")[0] in SPOILS and "position" in f.regime]
+    wrong = {j for f in spoiled for j in f.joints}
+    of_sign = ("sign_mismatch", "lost_sign")
+    return [f for f in findings if not (f.regime.startswith(of_sign) and set(f.joints) & wrong)]
 
 
 def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]
-            ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
+            ) -> tuple[list[Finding], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
     """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by
     run in s in which nothing is known of a joint). `known`: what the audit has named already. Repeated readings are
     taken out of the runs, which can then be used, but for those stretches."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    found: dict[tuple[str, str], Finding] = {}
     out = dict(known)
     targets = [Targets(run) for run in runs]
     long = {joint: repeated_stretches(runs, joint, targets) for joint in {j for run in runs for j in run.joints}}
@@ -117,8 +102,9 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     def add(
         kind: str, text: str, run: Run, joint: str, topics: list[str], spans: Spans, confidence: float | None = None
     ) -> None:
-        entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
-        entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
+        first = found.get((kind, joint)) or finding(kind, text, joint, topics, [], confidence)
+        when = [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
+        found[kind, joint] = replace(first, when=[*first.when, *when])
 
     for i, run in enumerate(runs):
         if (spans := _pauses(run)):

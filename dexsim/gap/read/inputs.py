@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import numpy as np
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap.read import COLUMNS, WRONG_SIGNAL, Run, channels
+from dexsim.gap.finding import WRONG_SIGNAL, Finding
+from dexsim.gap.read import COLUMNS, Run, channels
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording import readers, spikes
 from dexsim.recording.mechanism import Mechanism, merged
@@ -332,10 +334,10 @@ def channel_findings(
     joints: Sequence[str],
     sensors: dict[str, str],
     openly: Set[tuple[str, str]] = frozenset(),
-) -> list[dict[str, Any]]:
-    """Findings of signals that are not what they say, as `diagnosis.json` has them. sensors: ids of the effects that
+) -> list[Finding]:
+    """Findings of signals that are not what they say. sensors: ids of the effects that
     make the same of an effort's sign, each with the experiment that shows it; openly: of `channels.driven_openly`."""
-    out: dict[tuple, dict[str, Any]] = {}
+    out: dict[tuple, Finding] = {}
     for r in recordings:
         for f in r.findings:
             if f.kind not in WRONG or f.severity != "error" or channels.far_target(f, r.path.name, openly):
@@ -345,28 +347,16 @@ def channel_findings(
                 continue
             key = (f.kind, f.topic, f.joint)
             sensor = f.kind in SIGN and f.joint in joints
-            entry = out.setdefault(
-                key,
-                {
-                    "effect": WRONG_SIGNAL,
-                    "confidence": SIGNAL.told,
-                    "alternatives": [],
-                    "indistinguishable": [WRONG_SIGNAL, *sensors] if sensor else [],
-                    "separating_experiment": next(iter(sensors.values()), None) if sensor else None,
-                    "where": {
-                        "joints": [f.joint] if f.joint in joints else [],
-                        "taxels": [],
-                        "topics": [f.topic] if f.topic else [],
-                    },
-                    "regime": f"{f.kind}: {f.text}",
-                    "when": [],
-                    "parameters": {},
-                    "held_out": None,
-                },
-            )
+            joint, topics = f.joint if f.joint in joints else "", [f.topic] if f.topic else []
+            one = out.get(key) or channels.finding(f.kind, f.text, joint, topics, [])
+            if sensor:
+                experiment = next(iter(sensors.values()), None)
+                one = replace(one, indistinguishable=[WRONG_SIGNAL, *sensors], separating_experiment=experiment)
             if np.isfinite(f.time):
                 end = f.end if np.isfinite(f.end) else f.time
-                entry["when"].append({"recording": r.path.name, "start": float(f.time), "end": float(max(end, f.time))})
+                when = {"recording": r.path.name, "start": float(f.time), "end": float(max(end, f.time))}
+                one = replace(one, when=[*one.when, when])
+            out[key] = one
     return list(out.values())
 
 

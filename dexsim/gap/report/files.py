@@ -20,12 +20,12 @@ from dexsim import outputs
 from dexsim.console.tables import number
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import entry
+from dexsim.gap.finding import Finding, gathered
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.conclude import place, spoken, words_of
 from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
-from dexsim.gap.read import gathered, wrong_signal
 from dexsim.gap.report import charts
 from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
@@ -205,13 +205,13 @@ class Where(Section):
         d = self.d
         if d.mechanism is None or not (d.joints or d.touch is not None):
             return None
-        named = {j for f in d.data["findings"] for j in f["where"]["joints"]}
+        named = {j for f in d.findings for j in f.joints}
         marked = {
             t
-            for f in d.data["findings"]
-            if "taxels" in f["parameters"]
-            for t in f["where"]["taxels"]
-            if len(f["where"]["taxels"]) <= 40
+            for f in d.findings
+            if "taxels" in f.parameters
+            for t in f.taxels
+            if len(f.taxels) <= 40
         }
         taxels = d.touch.error if d.touch is not None else None
         before = {j: v["before"] for j, v in d.joints.items()}
@@ -273,7 +273,7 @@ class Where(Section):
 
         rows = [row("before", "before", charts.BEFORE)]
         replayed = h.get("replayed") if h["error"].startswith("position") else None
-        if any(not wrong_signal(f) for f in d.data["findings"]):
+        if any(not f.wrong_signal for f in d.findings):
             rows.append(row("after, search's plant" if replayed else "after", "after", charts.AFTER))
         if replayed:
             rows.insert(1, ("as written, replayed", k * replayed["error"], None, None, charts.AFTER))
@@ -294,62 +294,62 @@ class Findings(Section):
     template = "findings.html"
 
     def values(self) -> dict[str, Any] | None:
-        cards = [(f.get("hint", False), self._card(f)) for f in gathered(self.d.data["findings"])]
+        cards = [(f.hint, self._card(f)) for f in gathered(self.d.findings)]
         sure, hints = ([card for hint, card in cards if hint is kind] for kind in (False, True))
         nearest = [] if sure else self._nearest()
         return {"sure": sure, "hints": hints, "nearest": nearest} if sure or hints or nearest else None
 
-    def _card(self, f: dict[str, Any]) -> dict[str, Any]:
+    def _card(self, f: Finding) -> dict[str, Any]:
         """One finding."""
-        e, h = entry(f), f["held_out"]
-        where = place(f, self.d.mechanism) if len(f["where"]["joints"]) < 4 else f"{len(f['where']['joints'])} joints"
+        e, h = entry(f), f.held_out
+        where = place(f, self.d.mechanism) if len(f.joints) < 4 else f"{len(f.joints)} joints"
         unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
-        doubtful = f["indistinguishable"] or f.get("hint")
+        doubtful = f.indistinguishable or f.hint
         return {
-            "kind": "bad" if wrong_signal(f) else "set" if doubtful else "",
-            "name": _name(f["effect"]),
+            "kind": "bad" if f.wrong_signal else "set" if doubtful else "",
+            "name": _name(f.effect),
             "where": where,
-            "confidence": f"{100 * f['confidence']:.0f}",
-            "words": f"{_capital(spoken(f, self.d.mechanism))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}."
+            "confidence": f"{100 * f.confidence:.0f}",
+            "words": f"{_capital(spoken(f, self.d.mechanism))} {words_of(f, self.d.mechanism)}; it shows {f.regime}."
             if e is not None
-            else f"{where}: {f['regime']}.",
-            "parameters": [_parameter(key, p) for key, p in f["parameters"].items() if p["value"] is not None],
+            else f"{where}: {f.regime}.",
+            "parameters": [_parameter(key, p) for key, p in f.parameters.items() if p["value"] is not None],
             "strip": self._strip(f),
             "before": number(k * h["before"]) if h else "",
             "after": number(k * h["after"]) if h else "",
             "unit": unit,
         } | self._lost(f)
 
-    def _metric(self, f: dict[str, Any]) -> str:
+    def _metric(self, f: Finding) -> str:
         """The metric of a finding's held-out error."""
-        if not f["where"]["joints"]:
+        if not f.joints:
             return "tactile_rmse_N"
         if isinstance(e := entry(f), Effect) and e.effort_only:
             return "effort_rmse_Nm"
         h = self.held_out["error"]
         return h if not h.startswith("tactile") else "position_rmse_rad"
 
-    def _strip(self, f: dict[str, Any]) -> Markup | None:
+    def _strip(self, f: Finding) -> Markup | None:
         """When it acts, a line for each of the first recordings."""
         rows = []
-        for name in list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]:
-            spans = [(w["start"], w["end"]) for w in f["when"] if w["recording"] == name]
-            every = [w["end"] for g in self.d.data["findings"] for w in g["when"] if w["recording"] == name]
+        for name in list(dict.fromkeys(w["recording"] for w in f.when))[:4]:
+            spans = [(w["start"], w["end"]) for w in f.when if w["recording"] == name]
+            every = [w["end"] for g in self.d.findings for w in g.when if w["recording"] == name]
             rows.append((name, max(self.d.lengths.get(name, 0.0), *every), spans))
         return Markup(charts.strips(rows)) if rows else None
 
-    def _lost(self, f: dict[str, Any]) -> dict[str, Any]:
+    def _lost(self, f: Finding) -> dict[str, Any]:
         """The runner-up and why it lost, or the set that cannot be told apart."""
-        rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
+        rivals = [a for a in f.alternatives if a["confidence"] >= 0.005]
         out: dict[str, Any] = dict.fromkeys(
             ("set", "separating", "lone", "open", "rival", "then", "wins"), ""
         )
-        if f["indistinguishable"]:
+        if f.indistinguishable:
             return out | {
-                "set": " and ".join(_name(x) for x in f["indistinguishable"]),
-                "separating": f["separating_experiment"],
+                "set": " and ".join(_name(x) for x in f.indistinguishable),
+                "separating": f.separating_experiment,
             }
-        if not f["held_out"]:  # found before any fit: a signal, or a push from outside
+        if not f.held_out:  # found before any fit: a signal, or a push from outside
             return out
         if not rivals:
             return out | {"lone": True}
@@ -357,7 +357,7 @@ class Findings(Section):
         return out | {
             "rival": _name(first["effect"]),
             "wins": f"{100 * first['confidence']:.0f}",
-            "open": first["confidence"] > f["confidence"],
+            "open": first["confidence"] > f.confidence,
             "then": ", ".join(_name(a["effect"]) for a in rest),
         }
 
@@ -377,7 +377,7 @@ class Curves(Section):
 
     def values(self) -> dict[str, Any] | None:
         d = self.d
-        found = {j for f in d.data["findings"] for j in f["where"]["joints"]}
+        found = {j for f in d.findings for j in f.joints}
         order = sorted(d.curves, key=lambda c: (c.joint not in found, -d.joints[c.joint]["before"]))
         felt = d.touch.curves[:3] if d.touch is not None else []
         joints, pads = (
@@ -391,8 +391,8 @@ class Curves(Section):
 
     def _joint(self, c: Any, found: bool) -> dict[str, Any]:
         d = self.d
-        mine = [f for f in d.data["findings"] if c.joint in f["where"]["joints"]]
-        spans = [(w["start"], w["end"]) for f in mine for w in f["when"] if w["recording"] == c.recording]
+        mine = [f for f in d.findings if c.joint in f.joints]
+        spans = [(w["start"], w["end"]) for f in mine for w in f.when if w["recording"] == c.recording]
         svg = charts.curves(c.t, c.measured, c.before, c.after if found else None, c.command, self.unit[1:], spans)
         before, after = (f"{1e3 * d.joints[c.joint][k]:.3g}" for k in ("before", "after"))
         return {"chart": Markup(svg), "name": c.joint, "recording": c.recording, "before": before, "after": after}
@@ -412,7 +412,7 @@ class Next(Section):
         data, n = self.d.data, self.d.data["next_recording"]
         if n:
             return {"why": n["why"][:1].upper() + n["why"][1:], "commands": n["commands"]}
-        sure = data["verdict"] in ("explained", "none") and not any(f["indistinguishable"] for f in data["findings"])
+        sure = data["verdict"] in ("explained", "none") and not any(f.indistinguishable for f in self.d.findings)
         return {"why": "", "commands": ""} if sure else None
 
 
@@ -521,16 +521,16 @@ def _ratios(d: Diagnosis, most: tuple[tuple[int, str], ...], named: bool = True,
 
 def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, str]]:
     """The joints with the largest errors, and the pads."""
-    plain, found, rows = d.data["baseline"].get("joints", {}), d.data["findings"], []
+    plain, found, rows = d.data["baseline"].get("joints", {}), d.findings, []
     for j, v in sorted(d.joints.items(), key=lambda x: -x[1]["before"])[:most]:
-        names = [_name(f["effect"]) + " (hint)" * f.get("hint", False) for f in found if j in f["where"]["joints"]]
+        names = [_name(f.effect) + " (hint)" * f.hint for f in found if j in f.joints]
         rows.append(
             _row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}")
         )
     if d.touch is not None:
         for finger, v in d.touch.pads.items():
             mine = f"{d.touch.names.index(finger)}:"
-            names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
+            names = [_name(f.effect) for f in found if any(t.startswith(mine) for t in f.taxels)]
             rows.append(_row(f"pad of the {finger}", names, v, "", f"{1e3 * v['noise']:.2g} mN"))
     return rows
 

@@ -17,6 +17,7 @@ from dexsim import outputs
 from dexsim.errors import UserError
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Diagnosis, Settings
 from dexsim.gap.judge.conclude import place
 from dexsim.gap.plant.batch import JointPlant
@@ -42,25 +43,25 @@ def plan_next(
 ) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
-    named = [f for f in data["findings"] if modelled(f)]
-    unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < JUDGE.sure]
+    named = [f for f in d.findings if modelled(f)]
+    unsure = [f for f in named if f.indistinguishable or f.confidence < JUDGE.sure]
     kinds, joints, why = None, None, ""
-    if unsure and not unsure[0]["where"]["joints"]:
+    if unsure and not unsure[0].joints:
         _next_touch(d, s, m, unsure[0], recordings)
         return
     if unsure:
         f = unsure[0]
         rivals = list(
-            dict.fromkeys(f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])])
+            dict.fromkeys(f.indistinguishable or [f.effect, *(a["effect"] for a in f.alternatives[:1])])
         )
-        joints = f["where"]["joints"]
+        joints = f.joints
         kinds = sorted({k for e in rivals for k in EFFECTS.get(e, Effect).motions})
         head = (
             f"to tell {' from '.join(rivals)} on {joints[0]}"
             if len(rivals) > 1
             else f"to make sure of {rivals[0]} on {joints[0]}"
         )
-        experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f["effect"]].experiment
+        experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f.effect].experiment
         why = f"{head}: {experiment}"
         choice = _choice(d, s, m, searched, f, rivals)
         if choice is not None:
@@ -90,15 +91,15 @@ def _choice(
     s: Settings,
     m: Mechanism,
     searched: Sequence[SearchedJoint],
-    f: dict,
+    f: Finding,
     rivals: list[str],
 ) -> Choice | None:
     """The motions on which the finding's hypotheses disagree most; None where they cannot be simulated or planned."""
     for x in searched:
         search, outcome = x.search, x.outcome
-        if x.case.joint not in f["where"]["joints"] or not outcome.best.members:
+        if x.case.joint not in f.joints or not outcome.best.members:
             continue
-        other = rival_of(search, outcome, f["effect"], rivals[1] if len(rivals) > 1 else None)
+        other = rival_of(search, outcome, f.effect, rivals[1] if len(rivals) > 1 else None)
         if other is None:
             return None
         try:
@@ -110,10 +111,10 @@ def _choice(
     return None
 
 
-def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Sequence[Any]) -> None:
+def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: Finding, recordings: Sequence[Any]) -> None:
     """The presses again, as they were sent, with what was missing: nothing else is known to be safe against the
     object."""
-    names = " from ".join(dict.fromkeys(f["indistinguishable"] or [f["effect"]]))
+    names = " from ".join(dict.fromkeys(f.indistinguishable or [f.effect]))
     effect = entry(f)
     assert effect is not None  # `modelled` says so
     why = (
@@ -121,13 +122,13 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
         "cell recorded beside /tactile"
     )
     d.data["next_recording"] = {"why": why, "commands": None}
-    pads = {w["recording"] for w in f["when"]}
+    pads = {w["recording"] for w in f.when}
     sent = [r for r in recordings if r.path.name in pads and len(r.commands)]
     if not sent:
         return
     from dexsim.recording.writer import Writer
 
-    best = max(sent, key=lambda r: sum(w["end"] - w["start"] for w in f["when"] if w["recording"] == r.path.name))
+    best = max(sent, key=lambda r: sum(w["end"] - w["start"] for w in f.when if w["recording"] == r.path.name))
     meta = {k: v for k, v in best.meta.items() if k in ("robot", "gravity")} | {
         "source": "sim",
         "effort_is": "none",

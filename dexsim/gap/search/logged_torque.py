@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,6 +15,7 @@ from dexsim import intervals
 from dexsim.gap.effects import ByTorque
 from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.plant.case import intervals_of
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
@@ -295,8 +296,8 @@ def _alike(
 
 def findings(
     given: Sequence[IdentifiedJoint], unknown: Sequence[str], runs: list[Run], train: list[int]
-) -> list[dict]:
-    """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed
+) -> list[Finding]:
+    """The further effects as findings, for joints of which nothing of the friction was believed
     (`unknown`)."""
     out = []
     for joint in given:
@@ -310,27 +311,20 @@ def findings(
             active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
             confidence = min(n.share, TORQUE.told if helped > SEARCH.least else JUDGE.hinted)
+            metric = {"error": f"effort_rmse_{'N' if case.scales.slide else 'Nm'}"}
             out.append(
-                {
-                    "effect": n.effect,
-                    "confidence": round(float(confidence), 3),
-                    "alternatives": [{"effect": n.rival, "confidence": round(1 - n.share, 3)}]
-                    if n.rival and n.share < 1
-                    else [],
-                    "indistinguishable": list(effect.alike_by_torque),
-                    "separating_experiment": effect.experiment if effect.alike_by_torque else None,
-                    "where": {"joints": [case.joint], "taxels": [], "topics": []},
-                    "regime": effect.shows_by_torque,
-                    "when": intervals_of(active, case, runs, train),
-                    "parameters": parameters,
-                    "held_out": {
-                        "before": n.before,
-                        "after": n.after,
-                        "removed_low": round(n.removed[0], 4),
-                        "removed_high": round(n.removed[1], 4),
-                        "error": f"effort_rmse_{'N' if case.scales.slide else 'Nm'}",
-                    },
-                }
+                Finding(
+                    n.effect,
+                    round(float(confidence), 3),
+                    effect.shows_by_torque,
+                    [case.joint],
+                    alternatives=chances([(n.rival, 1 - n.share)] if n.rival and n.share < 1 else ()),
+                    indistinguishable=effect.alike_by_torque,
+                    separating_experiment=effect.experiment if effect.alike_by_torque else None,
+                    when=intervals_of(active, case, runs, train),
+                    parameters=parameters,
+                    held_out=removed(n.before, n.after, n.removed) | metric,
+                )
             )
     return out
 
@@ -365,8 +359,8 @@ class Push:
     spans: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     cut: bool = False  # whether the joint was judged without these stretches
 
-    def finding(self) -> dict[str, Any]:
-        """As `diagnosis.json` has it."""
+    def finding(self) -> Finding:
+        """As a name."""
         unit = "N" if self.slide else "N.m"
         count = sum(map(len, self.spans.values()))
         said = (
@@ -376,29 +370,14 @@ class Push:
             else f"all the time: {100 * self.left:.0f} % of the torque's variance fits no inertia, gravity or "
                  "friction (or it is not this joint's torque)"
         )
-        return {
-            "effect": ExternalForce.id,
-            "confidence": TORQUE.told if self.clear else JUDGE.hinted,
-            "alternatives": [],
-            "indistinguishable": [],
-            "separating_experiment": None,
-            "where": {"joints": [self.joint], "taxels": [], "topics": []},
-            "regime": said,
-            "when": [
-                {"recording": name, "start": round(a, 3), "end": round(b, 3)}
-                for name, spans in self.spans.items()
-                for a, b in spans
-            ],
-            "parameters": {
-                "torque": {
-                    "value": abs(self.torque),
-                    "low": self.interval[0],
-                    "high": self.interval[1],
-                    "unit": unit,
-                }
-            },
-            "held_out": None,
-        }
+        size = {"value": abs(self.torque), "low": self.interval[0], "high": self.interval[1], "unit": unit}
+        when = [
+            {"recording": name, "start": round(a, 3), "end": round(b, 3)}
+            for name, spans in self.spans.items()
+            for a, b in spans
+        ]
+        confidence = TORQUE.told if self.clear else JUDGE.hinted
+        return Finding(ExternalForce.id, confidence, said, [self.joint], when=when, parameters={"torque": size})
 
 
 def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:

@@ -17,10 +17,10 @@ import yaml
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
+from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
 from dexsim.gap.judge import confidence
 from dexsim.gap.judge.held_out import rms_interval
-from dexsim.gap.read import wrong_signal
 from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer
@@ -74,7 +74,7 @@ class Touch(Steps):
         contact = {r.path.name: s for r in recordings if (s := stretches(r))}
         self.result = TouchResult(names=self.sensors.names, contact=contact)
         self.data = TouchData()
-        self.constant: list[dict] = []
+        self.constant: list[Finding] = []
         self.pads: list[Pad] = []
 
     def read(self) -> None:
@@ -142,17 +142,18 @@ class Touch(Steps):
             out.notes += pad.notes
         searched = {pad.number for pad in self.pads if pad.search is not None}
         for f in self.constant:
-            number = int(f["where"]["taxels"][0].split(":")[0])
+            number = int(f.taxels[0].split(":")[0])
             if number not in searched:
                 out.findings.append(f)
-                readings = judge.readings_of(self.recordings, f["where"]["taxels"])
+                readings = judge.readings_of(self.recordings, f.taxels)
                 out.facts[out.names[number]] = PadFacts(readings, judged=False)
         if judged:
             times = [a.times for a in judged]
             out.before = rms_interval([a.before for a in judged], times, self.seed)
             out.after = rms_interval([a.after for a in judged], times, self.seed)
             out.floor = float(np.sqrt(np.mean(np.square([a.floor for a in judged]))))
-            out.notes += confidence.of_touch(out.findings, out.before[0], out.floor)
+            out.findings, said = confidence.of_touch(out.findings, out.before[0], out.floor)
+            out.notes += said
         out.notes += handed(out.findings, out.facts, out.names).doubts
 
     def _take(self, answer: PadAnswer) -> None:
@@ -198,9 +199,7 @@ def into_diagnosis(d: Diagnosis, felt: TouchResult) -> None:
         data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
     elif felt.floor is not None:
         data["noise_floor"]["tactile_N"] = felt.floor
-    bad = [f for f in data["findings"] if wrong_signal(f)]
-    rest = [f for f in data["findings"] if not wrong_signal(f)]
-    data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
+    d.findings = [*sorted(d.findings, key=lambda f: not f.wrong_signal)]
     data["nuisance"] |= felt.nuisance
 
 
@@ -232,30 +231,30 @@ class Handed:
     doubts: list[str] = field(default_factory=list)
 
 
-def doubted(finding: dict[str, Any]) -> bool:
-    return finding["confidence"] < JUDGE.sure or bool(finding["indistinguishable"])
+def doubted(finding: Finding) -> bool:
+    return finding.confidence < JUDGE.sure or bool(finding.indistinguishable)
 
 
-def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
+def handed(findings: list[Finding], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
     """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
     out = Handed()
     pads: dict[str, PadSettings] = {}
     drifts: dict[str, Any] = {}
     for f in findings:
-        if not f["where"]["taxels"]:
+        if not f.taxels:
             continue
-        name, effect = names[int(f["where"]["taxels"][0].split(":")[0])], TOUCH_EFFECTS[f["effect"]]
+        name, effect = names[int(f.taxels[0].split(":")[0])], TOUCH_EFFECTS[f.effect]
         pad = pads.setdefault(name, PadSettings(facts.get(name) or PadFacts(judged=False)))
         doubt, drift = doubted(f), effect.drift(f, pad.fact)
         if drift is not None:
             drifts[name] = drift
         lost = effect.hand_on(f, pad, doubt)
-        either = " or ".join(f["indistinguishable"] or [f["effect"]])
+        either = " or ".join(f.indistinguishable or [f.effect])
         unsure = ", not sure: its range holds what was believed" if doubt else ""
-        out.said.append(f"{name}: {either}, confidence {f['confidence']:.2f}{unsure}")
+        out.said.append(f"{name}: {either}, confidence {f.confidence:.2f}{unsure}")
         if doubt:
             out.doubts.append(
-                f"{f['effect']} on the {name}'s pad is not sure: in tactile.yaml its range holds what was "
+                f"{f.effect} on the {name}'s pad is not sure: in tactile.yaml its range holds what was "
                 f"believed as well{lost}"
             )
     for name, drift in drifts.items():

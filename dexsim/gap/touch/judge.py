@@ -3,6 +3,8 @@ part, findings with their doubts, facts for training."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from dexsim.gap.effects import Fit, PadFacts, word
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.touch import TactileGain
+from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.inquiry import PadCurve
 from dexsim.gap.judge.held_out import gain_interval
 from dexsim.gap.read import spans
@@ -51,23 +54,21 @@ class PadAnswer:
         self.left = float(np.sqrt(e1.mean()))  # what the plant leaves, constant taxels apart
         self.numbers = {"before": rms(self.before), "after": rms(self.after), "noise": search.noise}
         if self.constant is not None:
-            self.constant["held_out"] = {
-                "before": self.numbers["before"],
-                "after": rms(np.concatenate([e0, silent[1]])),
-            }
+            left = {"before": self.numbers["before"], "after": rms(np.concatenate([e0, silent[1]]))}
+            self.constant = replace(self.constant, held_out=left)
 
-    def findings(self) -> list[dict[str, Any]]:
-        """What was found, as `diagnosis.json` says it."""
+    def findings(self) -> list[Finding]:
+        """What was found."""
         found = [f for e in self.best.ids if (f := self._finding(e)) is not None]
         if self.constant is not None:  # one finding per effect and pad: constant taxels are gains of 0
-            gain = next((f for f in found if TOUCH_EFFECTS[f["effect"]].by_taxel), None)
-            if gain is None:
+            k = next((k for k, f in enumerate(found) if TOUCH_EFFECTS[f.effect].by_taxel), None)
+            if k is None:
                 found.append(self.constant)
             else:
-                merge_constant(gain, self.constant)
+                found[k] = with_constant(found[k], self.constant)
         return found
 
-    def _finding(self, e: str) -> dict[str, Any] | None:
+    def _finding(self, e: str) -> Finding | None:
         """One effect; None where it did not help on what was held out."""
         search, best, effect = self.search, self.best, TOUCH_EFFECTS[e]
         stage = _stage(search, e)
@@ -84,18 +85,19 @@ class PadAnswer:
             return None
         taxels, parameters = self._parameters(e)
         gain = gain_interval(without, with_it, 0.5 * blocks)
-        return {
-            "effect": e,
-            "confidence": round(float(min(share * earned, JUDGE.surest)), 3),
-            "alternatives": [{"effect": x, "confidence": round(c, 3)} for x, c in rivals[:3]],
-            "indistinguishable": [e, *(x for x, _ in same)] if same else [],
-            "separating_experiment": effect.experiment if same else None,
-            "where": {"joints": [], "taxels": taxels, "topics": [TACTILE]},
-            "regime": effect.shows,
-            "when": when(e, search, best),
-            "parameters": parameters,
-            "held_out": {"before": b, "after": a, "removed_low": round(gain[0], 4), "removed_high": round(gain[1], 4)},
-        }
+        return Finding(
+            e,
+            round(float(min(share * earned, JUDGE.surest)), 3),
+            effect.shows,
+            taxels=taxels,
+            topics=[TACTILE],
+            alternatives=chances(rivals),
+            indistinguishable=[e, *(x for x, _ in same)] if same else [],
+            separating_experiment=effect.experiment if same else None,
+            when=when(e, search, best),
+            parameters=parameters,
+            held_out=removed(b, a, gain),
+        )
 
     def facts(self) -> PadFacts:
         """What training is told of the pad beside its findings."""
@@ -322,7 +324,7 @@ def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: boo
 # Taxels that read the same for ever, dead or stuck: seen from the readings alone, without any geometry.
 
 
-def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[dict[str, Any]]:
+def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[Finding]:
     """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the
     pad feel many counts. Their gain is 0."""
     if sensors.layout is None:
@@ -359,7 +361,7 @@ def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
     return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= TOUCH.neighbours}
 
 
-def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, float]:
+def readings_of(recordings: list[Recording], taxels: Sequence[str]) -> dict[int, float]:
     """What constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
     out = {}
     for pad, k in (map(int, t.split(":")) for t in taxels):
@@ -373,26 +375,13 @@ def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, flo
     return out
 
 
-def constant_finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
-    """Gains of 0 of taxels ("pad:k"), as `diagnosis.json` has a finding."""
-    return {
-        "effect": TactileGain.id,
-        "confidence": confidence,
-        "alternatives": [],
-        "indistinguishable": [],
-        "separating_experiment": None,
-        "where": {"joints": [], "taxels": names, "topics": [TACTILE]},
-        "regime": regime,
-        "when": [],
-        "parameters": {
-            "gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"},
-            "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""},
-        },
-        "held_out": None,
-    }
+def constant_finding(names: list[str], regime: str, confidence: float) -> Finding:
+    """Gains of 0 of taxels ("pad:k")."""
+    sizes = {"gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"}, "taxels": word(", ".join(names))}
+    return Finding(TactileGain.id, confidence, regime, taxels=names, topics=[TACTILE], parameters=sizes)
 
 
-def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
+def pressed(silent: dict[int, float], pad: int) -> Finding | None:
     """The finding of a pad's taxels that read the same although the plant has them pressed. silent: their reading [N]
     by number."""
     if not silent:
@@ -403,13 +392,11 @@ def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
     return constant_finding([f"{pad}:{k}" for k in sorted(silent)], regime, JUDGE.surest)
 
 
-def merge_constant(gain: dict, dead: dict) -> None:
-    """Broken taxels into the finding of the pad's gains."""
-    p = gain["parameters"]["gain"]
-    count = len(gain["where"]["taxels"])
+def with_constant(gain: Finding, dead: Finding) -> Finding:
+    """The finding of a pad's gains with its broken taxels."""
+    p, count, more = gain.parameters["gain"], len(gain.taxels), len(dead.taxels)
     wide = lambda x: list(np.atleast_1d(x)) if len(np.atleast_1d(x)) == count else [float(x)] * count  # noqa: E731
-    for key, zero in (("value", 0.0), ("low", 0.0), ("high", 0.05)):
-        p[key] = [float(x) for x in wide(p[key])] + [zero] * len(dead["where"]["taxels"])
-    gain["where"]["taxels"] = [*gain["where"]["taxels"], *dead["where"]["taxels"]]
-    gain["parameters"]["taxels"]["value"] = ", ".join(gain["where"]["taxels"])
-    gain["regime"] += "; " + dead["regime"]
+    ends = {k: [float(x) for x in wide(p[k])] + [z] * more for k, z in (("value", 0.0), ("low", 0.0), ("high", 0.05))}
+    names = [*gain.taxels, *dead.taxels]
+    sizes = gain.parameters | {"gain": p | ends, "taxels": gain.parameters["taxels"] | {"value": ", ".join(names)}}
+    return replace(gain, taxels=names, parameters=sizes, regime=f"{gain.regime}; {dead.regime}")
