@@ -96,10 +96,9 @@ def test_what_the_encoder_does_not_resolve_is_doubted():
 
 
 def test_touch_is_doubted_alike():
-    given = [{"effect": "tactile_hysteresis", "confidence": 0.99, "held_out": {"before": 215.0, "after": 40.0}},
-                {"effect": "tactile_crosstalk", "confidence": 0.99, "held_out": {"before": 54.5, "after": 40.0}},
-                {"effect": "tactile_gain", "confidence": 0.95, "held_out": None}]  # fmt: skip
-    findings, said = confidence.of_touch([*map(Finding.from_json, given)], 215.0, 35.0)
+    names = (("tactile_hysteresis", 0.99, 215.0), ("tactile_crosstalk", 0.99, 54.5))
+    given = [Finding(e, sure, "", held_out={"before": before, "after": 40.0}) for e, sure, before in names]
+    findings, said = confidence.of_touch([*given, Finding("tactile_gain", 0.95, "")], 215.0, 35.0)
     assert [f.confidence for f in findings] == [0.99, DOUBTED, 0.95] and len(said) == 1
 
 

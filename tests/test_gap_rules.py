@@ -310,7 +310,7 @@ def test_a_rival_of_the_same_class_makes_a_set():
     for share, together in ((0.045, False), (0.055, True)):
         answer = Judged(1.0, 0.1)
         answer.outcome.rivals = {"lag": [("command_delay", share)]}
-        assert (len(judged(answer)["indistinguishable"]) == 2) is together, share
+        assert (len(judged(answer).indistinguishable) == 2) is together, share
 
 
 def test_an_effect_must_remove_a_part_of_what_was_held_out():
@@ -550,7 +550,7 @@ def test_jitter_is_looked_for_where_much_is_left():
         answer.best = SimpleNamespace(members=(answer.member,), fit=SimpleNamespace(loss=loss, params=[], x=[]))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(joint_answer, "estimate_jitter", lambda *_: SimpleNamespace(entry=lambda: {}))
-            assert ("jitter" in judged(answer)["parameters"]) is looked_for, loss
+            assert ("jitter" in judged(answer).parameters) is looked_for, loss
 
 
 def test_a_little_friction_stays_in_the_model():

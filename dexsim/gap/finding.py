@@ -41,12 +41,6 @@ class Finding:
         """The finding with no more than this confidence."""
         return replace(self, confidence=min(self.confidence, confidence))
 
-    @classmethod
-    def from_json(cls, entry: dict[str, Any]) -> Self:
-        """Return the finding of an entry of `findings`; what is not there is empty."""
-        given = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
-        return cls(**{"effect": "", "confidence": 0.0, "regime": ""} | given | entry.get("where", {}))
-
     def to_json(self) -> dict[str, Any]:
         """The entry of `findings`."""
         return {
