@@ -346,8 +346,8 @@ MUTATIONS = (
     Mutation(
         "a whisper about an effort's sensor decides the verdict",
         "dexsim/gap/judge/held_out.py",
-        'if f["confidence"] < JUDGE.firm:',
-        'if f["confidence"] < JUDGE.firm and f["effect"] != "current_sensor":',
+        'if f.confidence < JUDGE.firm else f',
+        'if f.confidence < JUDGE.firm and f.effect != "current_sensor" else f',
         "tests/test_gap_verdict.py::test_what_is_wrong_with_an_effort_alone_is_a_hint_below_a_half",
     ),
     Mutation(

@@ -52,10 +52,10 @@ def test_the_size_of_a_push_lies_inside_its_interval(size, cogging):
         r.torque[:, 1] += cogging * size * np.sin(25.0 * r.q[:, 1])  # cogging
         true.append(r)
     (push,) = (p for p in logged_torque.find_pushes(model, true, [0, 1]) if p.joint == "elbow")
-    told = push.finding()["parameters"]["torque"]
+    told = push.finding().parameters["torque"]
     assert told["low"] < size < told["high"] and told["value"] == pytest.approx(size, rel=0.06)
     assert told["high"] - told["low"] < 0.5 * size
-    sample = logged_torque.Push("elbow", 0.906, (0.7, 1.0), 0.5, True, False).finding()["parameters"]["torque"]
+    sample = logged_torque.Push("elbow", 0.906, (0.7, 1.0), 0.5, True, False).finding().parameters["torque"]
     assert (sample["value"], sample["low"], sample["high"]) == (0.906, 0.7, 1.0)
 
 

@@ -140,7 +140,7 @@ def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
     search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=None, best=None)
     drives.searched = [SearchedJoint(SimpleNamespace(joint=j), search, outcome) for j in "abc"]
     joints = {j: {"after": 1e3} for j in "abc"}
-    d = SimpleNamespace(joints=joints, data={"findings": []}, standins=[], notes=[])
+    d = SimpleNamespace(joints=joints, findings=[], standins=[], notes=[])
     clock[0] = 100 * spent
     drives.stand_in(d)
     assert len(d.standins) == fitted

@@ -377,7 +377,7 @@ def test_a_stand_in_must_take_a_least_share_off():
 
 def test_a_stand_in_is_offered_where_much_is_left():
     for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
-        d = SimpleNamespace(joints={"j": {"after": left}}, data={"findings": []}, standins=[], notes=[])
+        d = SimpleNamespace(joints={"j": {"after": left}}, findings=[], standins=[], notes=[])
         parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
         search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(best=None, none=None)
         drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],

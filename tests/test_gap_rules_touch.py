@@ -168,7 +168,7 @@ def claimed(after=0.5, share=0.0):
 
 def test_a_touch_rival_of_the_same_class_makes_a_set():
     for share, together in ((0.045, False), (0.055, True)):
-        assert (len(claimed(share=share)["indistinguishable"]) == 2) is together, share
+        assert (len(claimed(share=share).indistinguishable) == 2) is together, share
 
 
 def test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed():
