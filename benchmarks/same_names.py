@@ -45,11 +45,12 @@ NAMED = 0.5  # confidence from which an effect counts as named
 SETS = ("concealed", "planted", "foreign")
 
 
-def concealed(number: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Make one case of our own plant. Return its recordings, those held out, its files and what is hidden."""
+def concealed(number: int, seed: int, folder: Path, mix: dict[str, int] = MIX) -> dict[str, Any]:
+    """Make one case of our own plant, of these groups. Return its recordings, those held out, its files and what is
+    hidden."""
     from benchmarks.concealed import generate
 
-    entry = generate.plan(MIX, seed)[number]
+    entry = generate.plan(mix, seed)[number]
     made = generate.once((entry, number, seed, folder, "two"))
     truth = generate.reveal(folder / "truth" / f"{made['name']}.json", made["digest"])
     case = folder / "cases" / made["name"]

@@ -531,3 +531,21 @@ def test_the_first_cases_of_a_set_are_those_of_the_whole(monkeypatch, tmp_path):
             command.main(["mix=effect:8,none:4", "seed=3", f"out={tmp_path}", *more])
     whole, first = built
     assert len(whole) == 12 and first == whole[:5]
+
+
+def test_spatial_rigs_are_a_little_off_what_their_files_say(tmp_path):
+    for k, shape in enumerate(rigs.SPATIAL):
+        d = rigs.draw(np.random.default_rng(k), shape)
+        rigs.files(tmp_path, d)
+        model = mujoco.MjModel.from_xml_path(str(tmp_path / "rig.xml"))
+        assert model.njnt == d.joints == k + 2 and len(d.told.place) == d.joints
+        body = model.jnt_bodyid[model.joint("joint1").id]
+        at = tuple(d.rig.place[1])
+        np.testing.assert_allclose(model.body_pos[body], d.told.offset[at], atol=1e-5)
+        away = np.abs(d.rig.com - d.told.com).max()
+        assert 0 < away < 0.03 * np.abs(d.told.com).max() and (d.rig.axis != d.told.axis).any()
+        tilt = np.degrees(np.arccos(-d.gravity[:, 2] / np.linalg.norm(d.gravity, axis=1)))
+        assert (0 < tilt).all() and (tilt < 1.0).all() and np.ptp(tilt) > 0
+        np.testing.assert_allclose(np.linalg.norm(d.gravity, axis=1), 9.81, rtol=1e-3)
+    plan = generate.plan({"spatial": 12}, 1)
+    assert sum(not p["kinds"] for p in plan) == 8 and {p["shape"] for p in plan} == set(rigs.SPATIAL)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS
+from dexsim.gap.finding import Finding
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import judge, read
 from dexsim.gap.touch import search as pad_search
@@ -248,7 +249,7 @@ def test_what_is_left_of_a_pad_goes_with_something():
 
 def test_a_little_crosstalk_may_be_another_law():
     crosstalk = TOUCH_EFFECTS["tactile_crosstalk"]
-    doubt = lambda low: crosstalk.doubt({"parameters": {"fraction": {"low": low}}})  # noqa: E731
+    doubt = lambda low: crosstalk.doubt(Finding("", 1.0, "", parameters={"fraction": {"low": low}}))  # noqa: E731
     assert doubt(0.13) and not doubt(0.17)
 
 

@@ -35,7 +35,8 @@ REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_
 BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
 DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
-MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0, "large": 0}
+MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0, "large": 0,
+       "spatial": 0}  # fmt: skip
 ELSEWHERE = 4  # other joints at which a large effect is tried where the drawn one does not show it
 SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
@@ -46,7 +47,9 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
     noise doubled), pair (two effects), outside (the catalogue), decoy, hand (a hand: of every six two with nothing
     missing, three with an effect, one with effects at two joints), large (a hand, always one large effect, at a joint
-    that shows it), touch (a fingertip under a ball: of every four one with nothing missing). Effects, tiers and shapes
+    that shows it), touch (a fingertip under a ball: of every four one with nothing missing), spatial (arms and hands of
+    2 to 7 joints whose geometry, gravity, encoders, cables, supply and warmth are a little off: of every three two with
+    nothing missing). Effects, tiers and shapes
     take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
@@ -77,6 +80,11 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
                     entry["kinds"].append(BY_EFFECT[effects[(k + len(effects) // 3) % len(effects)]][0])
             elif group == "large":
                 entry |= {"shape": "hand", "tier": "easy"}
+            elif group == "spatial":
+                entry["shape"] = rigs.SPATIAL[k % len(rigs.SPATIAL)]
+                if k % 3 == 2:
+                    names = BY_EFFECT[effects[k // 3 % len(effects)]]
+                    entry |= {"kinds": [names[k // 3 // len(effects) % len(names)]], "tier": tiers[k // 3 % 2]}
             elif group == "touch":
                 names = list(touch_cases.KINDS)
                 hidden = k % 4 > 0
@@ -167,6 +175,8 @@ class Bench:
         begins = np.array([laws.chance_of(k) for k in range(R)], float)
         values["jitter_from"] = np.tile(begins[:, None] + np.zeros(self.d.joints), (V, 1))
         command = np.tile(self.command, (V, 1, 1)) if commands is None else np.concatenate(commands)
+        if self.d.gravity is not None:
+            kw["gravity"] = np.tile(self.d.gravity[:R], (V, 1))
         # at rest at the first target, so that nothing swings in
         start = command[:, :, 0]
         encoder = ("scale", "offset", "eccentric", "eccentric_at", "second_harmonic")
@@ -383,7 +393,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
             }
         ]
     tier = entry["tier"]
-    if group in ("effect", "hand", "large", "pair", "outside") and kinds:
+    if group in ("effect", "hand", "large", "pair", "outside", "spatial") and kinds:
         tier = min((tier_of(f["ratio"]) for f in facts), key=("silent", "hard", "medium", "easy").index)
     answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier,
               "shape": d.shape, "joints": len(d.rig.names),

@@ -14,7 +14,13 @@ import yaml
 from benchmarks.concealed.plant import Rig, dynamics, pendulum
 
 OFF = 0.03  # how far off each nominal quantity may be
-SHAPES = ("one", "bench2", "bench4", "arm2", "arm3", "finger", "hand")
+SPATIAL = tuple(f"spatial{n}" for n in range(2, 8))
+SHAPES = ("one", "bench2", "bench4", "arm2", "arm3", "finger", "hand", *SPATIAL)
+# how far off a spatial rig is, as a calibrated machine is: lengths and centres of mass (shares), axes [rad], gravity
+# and gravity by run [rad], eccentricity of encoders [rad], cables (share of the weight), supply (share lost while the
+# others give their typical torque), torque constant and friction (share per degC)
+GEOMETRY, AXES, TILT, TILT_BY_RUN, ECCENTRIC = 0.012, 0.005, 0.009, 0.0026, (4e-4, 9e-4)
+CABLE, SAG, WARM_TORQUE, WARM_FRICTION = 0.01, 0.01, -0.001, -0.003
 RADIUS = 0.012  # m, of the bobs
 COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_speed": "no_load_speed",
            "coulomb": "coulomb_friction", "viscous": "viscous_friction"}
@@ -24,7 +30,8 @@ COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_spee
 class Drawn:
     """A rig as it is and as it is believed to be. true, believed: parameters [J]; unit [J]: a typical torque, N.m; low,
     high [J]: where its joints may be sent, rad; voltage: whether the loop gives a duty; motor_side: whether it reads
-    the motor; hand: what recordings of a hand call it, reach [J, 2] rad: the ranges of its joints."""
+    the motor; hand: what recordings of a hand call it, reach [J, 2] rad: the ranges of its joints. told: the rig as its
+    file has it, None for the true one; gravity [R, 3] m/s2: of each recording, None for the rig's."""
 
     rig: Rig
     shape: str
@@ -38,6 +45,8 @@ class Drawn:
     motor_side: bool
     hand: str = ""
     reach: np.ndarray | None = None
+    told: Rig | None = None
+    gravity: np.ndarray | None = None
 
     @property
     def joints(self) -> int:
@@ -65,6 +74,8 @@ def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Draw
     ValueError for a shape that there is not."""
     if shape == "hand":
         return _hand(rng, hand)
+    if shape in SPATIAL:
+        return _spatial(rng, shape)
     if shape in ("one", "bench2", "bench4"):
         n = {"one": 1, "bench2": 2, "bench4": 4}[shape]
         rig = pendulum(radius=RADIUS, names=tuple(f"joint{i}" for i in range(n)),
@@ -77,6 +88,12 @@ def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Draw
         mass = rng.uniform(0.1, 0.2) * np.cumprod(np.r_[1.0, rng.uniform(0.6, 0.9, n - 1)])
     else:
         raise ValueError(f"no shape '{shape}'; there are {', '.join(SHAPES)}")
+    return _driven(rng, rig, shape, mass)
+
+
+def _driven(rng: np.random.Generator, rig: Rig, shape: str, mass: np.ndarray) -> Drawn:
+    """Return a rig with drives that suit links of mass [J] kg."""
+    n = len(mass)
     b = {"mass": mass, "rotor": rng.uniform(2e-4, 8e-4, n)}
     weight, link = _scales(rig, mass)
     inertia = link + b["rotor"]
@@ -95,6 +112,44 @@ def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Draw
         b["kp"], b["kd"] = kp, kd
     return _finish(rng, rig, shape, b, 0.1 * kp, inertia, np.full(n, -0.8), np.full(n, 0.8), voltage,
                    bool(rng.uniform() < 0.3))
+
+
+def _spatial(rng: np.random.Generator, shape: str) -> Drawn:
+    """Return an arm, or a hand of two or three fingers, of joints about any axis, whose geometry, gravity, encoders,
+    cables, supply and warmth are a little off."""
+    n = int(shape.removeprefix("spatial"))
+    C = int(rng.integers(2, 4)) if n >= 4 and rng.uniform() < 0.5 else 1
+    depth = [len(x) for x in np.array_split(np.arange(n), C)]
+    D = max(depth)
+    place = np.array([(c, d) for c in range(C) for d in range(depth[c])])
+    lengths = rng.uniform(0.07, 0.12, (C, 1)) * np.cumprod(np.c_[np.ones(C), rng.uniform(0.6, 0.9, (C, D - 1))], 1)
+    offset, com, axis = np.zeros((C, D, 3)), np.zeros((C, D, 3)), np.zeros((C, D, 3))
+    offset[:, 1:, 2] = -lengths[:, :-1]
+    offset[:, 0, 1] = 0.04 * (np.arange(C) - 0.5 * (C - 1))
+    com[..., 2] = -lengths * rng.uniform(0.5, 0.9, (C, D))
+    com[..., :2] = 0.1 * lengths[..., None] * rng.uniform(-1, 1, (C, D, 2))
+    for c in range(C):
+        for d in range(D):  # two neighbours are not alike everywhere, the last bears its link
+            axis[c, d] = np.eye(3)[rng.choice(3, p=[0.4, 0.4, 0.2] if d < D - 1 else [0.5, 0.5, 0.0])]
+    eye, spread = np.tile(np.eye(3), (C, D, 1, 1)), np.tile(0.4 * RADIUS**2 * np.eye(3), (C, D, 1, 1))
+    names = tuple(f"joint{i}" for i in range(n))
+    told = Rig(names, place, eye, offset, axis, com, spread, np.array([0, 0, -9.81]))
+    off = lambda size, of: size * rng.uniform(-1, 1, of)  # noqa: E731
+    turned = axis + off(AXES, axis.shape)
+    true = Rig(names, place, eye, offset * (1 + off(GEOMETRY, (C, D, 1))),
+               turned / np.linalg.norm(turned, axis=2, keepdims=True),
+               com * (1 + off(GEOMETRY, (C, D, 1))) + GEOMETRY * lengths[..., None] * rng.uniform(-1, 1, com.shape),
+               spread, told.gravity)  # fmt: skip
+    mass = rng.uniform(0.1, 0.2) * np.cumprod(np.r_[1.0, rng.uniform(0.7, 0.95, n - 1)])
+    out = _driven(rng, told, shape, mass)
+    weight = _scales(told, mass)[0]
+    lean = off(TILT, 2) + off(TILT_BY_RUN, (8, 2))
+    out.rig, out.told = true, told
+    out.gravity = 9.81 * np.c_[np.sin(lean), -np.cos(np.linalg.norm(lean, axis=1))]
+    out.true |= {"eccentric": rng.uniform(*ECCENTRIC, n), "cable": rng.uniform(0, CABLE, n) * weight / 0.8,
+                 "thermal_torque": rng.uniform(WARM_TORQUE, 0, n), "thermal_friction": rng.uniform(WARM_FRICTION, 0, n),
+                 "sag": np.full(n, rng.uniform(0, SAG) / max(float(out.unit.sum()), 1e-9))}  # fmt: skip
+    return out
 
 
 def _scales(rig: Rig, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +252,7 @@ def files(where: Path, d: Drawn) -> list[str]:
     the settings that hand them to `diagnose.py`."""
     if d.hand == "xhand_right":
         return []
-    g, rig, b = (lambda x: "%.5g" % x), d.rig, d.believed
+    g, rig, b = (lambda x: "%.5g" % x), d.told or d.rig, d.believed
     pos = lambda v: " ".join(g(x) for x in v)  # noqa: E731
     C, D = rig.com.shape[:2]
     lines = ['<mujoco model="rig">', '  <compiler angle="radian"/>', "  <worldbody>"]

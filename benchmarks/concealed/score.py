@@ -155,7 +155,7 @@ def one(truth: dict, d: dict) -> dict:
         return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
 
     group = truth["group"]
-    inside = group in ("effect", "pair") or (group in ("hand", "large", "touch") and effects)
+    inside = group in ("effect", "pair") or (group in ("hand", "large", "touch", "spatial") and effects)
     out["wrong_sure"] = any(
         f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
         for f in confident
@@ -188,7 +188,7 @@ def one(truth: dict, d: dict) -> dict:
         if truth["joints"] > 1:
             out["joint_f1"] = [len(said_joints & true_joints), len(said_joints), len(true_joints)]
         out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None
-    elif group in ("none", "noise") or (group in ("hand", "touch") and not effects):
+    elif group in ("none", "noise") or (group in ("hand", "touch", "spatial") and not effects):
         out["false_alarm"] = bool(findings) or d["verdict"] == "failed"
         out["alarm"] = 1.0 if d["verdict"] == "failed" else max((f["confidence"] for f in findings), default=-1.0)
     elif group == "outside":
@@ -295,6 +295,12 @@ def table(results: list[dict]) -> dict[str, dict]:
     f1("  effects at two joints (F1)", [r["f1"] for r in hand if len(r["hidden"]) > 1])
     put("  confident and wrong", rate([r["wrong_sure"] for r in hand]))
     put("false alarm, hand", rate([r["false_alarm"] for r in empty if r["group"] == "hand"]))
+    spatial = [r for r in results if r["group"] == "spatial"]
+    for tier in ("easy", "medium"):
+        these = [r["right"] for r in spatial if "right" in r and r["tier"] == tier]
+        put(f"spatial rigs, geometry a little off: right effect first, {tier}", rate(these))
+    put("  false alarm", rate([r["false_alarm"] for r in spatial if "false_alarm" in r]))
+    put("  nothing missing, unknown", rate([r["verdict"] == "unknown" for r in spatial if "false_alarm" in r]))
     put("touch and contact: right effect first", rate([r["right"] for r in hidden if r["group"] == "touch"]))
     put("  false alarm", rate([r["false_alarm"] for r in empty if r["group"] == "touch"]))
     put("outside the catalogue: not claimed", rate([r["humble"] for r in results if r["group"] == "outside"]))

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.gap import compute
+from dexsim.gap import compute, posterior
 from dexsim.gap.compute import LONGER, TimeLimit, map_joints, workers
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import (
@@ -612,6 +612,7 @@ class Drives(Steps):
                 "does"
             )
         d.stages = [x.text for x in self.stages] + self.behind
+        d.hypotheses = {x.case.joint: posterior.entry(x.search.shadow.hypotheses) for x in self.searched}
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
         conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out

@@ -159,6 +159,7 @@ class Diagnosis:
     # joints that ring by themselves, as what was found of them does in what was held out
     ringing: frozenset[str] = frozenset()
     judged: Judged | None = None  # None where no joint is
+    hypotheses: dict[str, Any] = field(default_factory=dict)  # by joint: what was tried, with masses (`posterior`)
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:

@@ -57,7 +57,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             except (ValueError, mujoco.FatalError) as error:
                 d.notes.append(f"model.xml could not be written: {error}")
         asked, more = specified(d.data)
-        more |= {"notes": d.notes, "seconds": d.shares}
+        more |= {"notes": d.notes, "seconds": d.shares, "hypotheses": d.hypotheses}
         data = {"diagnosis.json": asked, "details.json": more} | (
             {"evidence.json": [e.plain() for e in d.evidence]} if d.evidence else {}
         )

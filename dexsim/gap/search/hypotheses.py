@@ -16,6 +16,7 @@ from dexsim.gap.effects.friction import give
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
+from dexsim.gap.posterior import Shadow
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
@@ -314,6 +315,7 @@ class JointHypotheses:
                 for k in sorted(set(fold.values()))
             ]
         self.blocks = self._blocks(self.fitter, self.long)
+        self.shadow = Shadow(self.fitter, (sigma, case.sigma_torque), self.fold_of)
         self.by_law: dict[str, list[Trial]] = {}  # by effect: the hypothesis by every law that the effect may have
         self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
         self._run_free: dict[int, tuple[Trial, np.ndarray]] = {}  # likewise

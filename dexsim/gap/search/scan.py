@@ -93,14 +93,17 @@ class JointLosses(JointHypotheses):
         _, s = mine.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
         res = mine.eliminated(mine.residuals(f.params, np.array(guesses)), s)
         a = huber_square(res, k)
+        chosen = []
         for n, number in enumerate(folds):
             test = fold == number
             on = ~test if len(folds) > 1 else test
             options = [0] if P == 0 else [0, *range(1 + n * len(lengths), 1 + (n + 1) * len(lengths))]
             best = min(options, key=lambda o: a[o][on].sum())
             trial.folds.append(np.array(guesses)[best])
+            chosen.append(best)
             out += np.bincount(self.blocks[test], a[best][test], len(out))
         trial.left_out = out
+        self.shadow.add(trial.members, f.loss, res[chosen])
         return out
 
     def refold(self, trial: Trial) -> Trial:
@@ -108,7 +111,7 @@ class JointLosses(JointHypotheses):
         sag, play), one step from the optimum of all lands anywhere."""
         f = trial.fit
         out = np.zeros(int(self.blocks.max()) + 1)
-        folds, parts = np.unique(self.fold_of), []
+        folds, parts, left = np.unique(self.fold_of), [], []
         if len(folds) < 2 or not len(f.params):
             return trial
         whole = self.fitter.given(trial.members)
@@ -120,9 +123,11 @@ class JointLosses(JointHypotheses):
             x = part.given(trial.members).fit(
                 f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False
             ).x
-            a = huber_square(whole.evaluate(f.params, x), self.r.huber)
+            left.append(whole.evaluate(f.params, x))
+            a = huber_square(left[-1], self.r.huber)
             out += np.bincount(self.blocks[~rows], a[~rows], len(out))
             parts.append(x)
+        self.shadow.add(trial.members, f.loss, np.array(left))
         return replace(trial, left_out=out, folds=parts, refitted=True)
 
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
