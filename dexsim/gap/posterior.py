@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TEMPERATURE = 30.0  # of the scores, in nats: plants are no truer than that
 ODDS = 3.0  # nats that each effect costs beforehand
 HELD = 0.9  # of the mass that the smallest set holds
-ALONE = 0.5  # marginal from which an effect is named
+MOST = 400  # samples of a window that are looked at
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,12 @@ class Shadow:
         """Of the position, and of the torque where it is fitted: its part of the residuals, and their density."""
         f, r = self.fitter, self.fitter.r
         window, t = f.w.sample_window, f.plant.t[f.w.sample_row]
-        out = [(slice(0, len(t)), Density(window, t, noises(self.white[0] / r.sigma_q)))]
+        step = max(len(t) // (MOST * max(f.count, 1)), 1)
+        use = np.arange(len(t)) % step == 0
+        out = [(slice(0, len(t)), Density(window, t, noises(self.white[0] / r.sigma_q), use))]
         if f.use_torque:
             given = noises(self.white[1] / r.sigma_torque)
-            out.append((slice(len(t), 2 * len(t)), Density(window, t, given, f.tau_on)))
+            out.append((slice(len(t), 2 * len(t)), Density(window, t, given, use & f.tau_on)))
         return out
 
     def add(self, members: Sequence[Member], loss: float, residuals: np.ndarray) -> None:
