@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dexsim import typed
 from dexsim.errors import UserError
+from dexsim.learning.names import leaves
 from dexsim.typed import Count
 
 Size = Annotated[int, msgspec.Meta(ge=1, le=10**6)]
@@ -112,12 +113,6 @@ def check(data: dict[str, Any], path: object) -> None:
                 )
 
 
-def tensors(node: Any, prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
+def tensors(node: Any) -> Iterator[tuple[str, torch.Tensor]]:
     """Yield (dotted name, tensor) of all below a nest of dicts and lists."""
-    items = node.items() if isinstance(node, dict) else enumerate(node)
-    for key, value in items:
-        name = f"{prefix}{key}"
-        if isinstance(value, torch.Tensor):
-            yield name, value
-        elif isinstance(value, (dict, list, tuple)):
-            yield from tensors(value, f"{name}.")
+    return ((name, value) for name, value in leaves(node) if isinstance(value, torch.Tensor))
