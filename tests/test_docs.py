@@ -128,7 +128,7 @@ def test_command_exists(page, command):
         return
     assert words[1] in COMMANDS or words[1].startswith("--"), f"{page}: no command dexsim {words[1]}"
     if words[1] in LISTED:
-        unknown = [k for k in given if k not in _keys(words[1]) and not k.startswith(("remap.", "meta."))]
+        unknown = [k for k in given if k not in _keys(words[1]) and not k.startswith(("remap.", "meta.", "+"))]
         assert not unknown, f"{page}: {command}: dexsim {words[1]} has no {unknown}"
 
 
