@@ -6,14 +6,17 @@
     [project.entry-points."dexsim.drivers"]    a hand's driver: what makes a dexsim.deploy.driver.HandDriver
     [project.entry-points."dexsim.readers"]    a format of recordings
 
-Loading one runs its package's code, so only what is installed, or what the user typed in full, is loaded.
+Loading one runs its package's code, so only what is installed, or what the user typed in full, is loaded. A law and an
+effect of the current folder are typed with any command: law=MODULE:NAME effect=MODULE:CLASS.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import sys
+from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -22,11 +25,26 @@ from dexsim.errors import UserError
 
 NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """What the user names in full: module:Class."""
+TYPED = "DEXSIM_TYPED"
+"""Environment variable with what was typed: processes that this one begins know it too."""
+
+
+def take(argv: Sequence[str]) -> list[str]:
+    """Take law=MODULE:NAME and effect=MODULE:CLASS off a command line, and remember them. Returns the rest."""
+    own = [a for a in argv if a.startswith(("law=", "effect=")) and is_named(a.partition("=")[2])]
+    os.environ[TYPED] = " ".join([os.environ.get(TYPED, ""), *own])
+    return [a for a in argv if a not in own]
 
 
 def installed(group: str) -> dict[str, EntryPoint]:
-    """Entry points of a group by name."""
-    return {point.name: point for point in entry_points(group=group)}
+    """Entry points of a group by name, and what was typed as such."""
+    out = {point.name: point for point in entry_points(group=group)}
+    for text in os.environ.get(TYPED, "").split():
+        kind, _, where = text.partition("=")
+        if group == f"dexsim.{kind}s":
+            name = where.partition(":")[2].lower()
+            out[name] = EntryPoint(name, where, group)
+    return out
 
 
 def is_named(text: str) -> bool:

@@ -95,6 +95,13 @@ def test_a_driver_of_ones_own(installed, tmp_path):
 def test_a_law_and_an_effect_of_ones_own(installed, tmp_path):
     """Both files of the page in an installed package: what the law does is found, named, written and trained with."""
     law, effect = re.findall(r"```python\n(.*?)```", (ROOT / "docs/howto/own_effect.md").read_text("utf-8"), re.S)
+    (tmp_path / "tight_spot_law.py").write_text(law)
+    (tmp_path / "tight_spot_effect.py").write_text(effect)
+    own = ("law=tight_spot_law:TIGHT_SPOT", "effect=tight_spot_effect:TightSpot")
+    assert "that angle" in call(installed, tmp_path, "dexsim", "diagnose", "columns=true", *own)
+    call(installed, tmp_path, "dexsim", "diagnose", "demo=tight_spot", "effects=[tight_spot]", "out=typed", *own)
+    for file in ("tight_spot_law.py", "tight_spot_effect.py"):
+        (tmp_path / file).unlink()
     provide(installed, "tight_spot_law.py", law, "dexsim.laws", "tight_spot = tight_spot_law:TIGHT_SPOT")
     provide(installed, "tight_spot_effect.py", effect, "dexsim.effects", "tight_spot = tight_spot_effect:TightSpot")
 

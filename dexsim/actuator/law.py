@@ -1,5 +1,5 @@
 """A column of the servo table, and a law of one's own: what an installed package adds to every drive, in training and
-in the diagnosis (entry points of the group `dexsim.laws`, docs/howto/own_effect.md)."""
+in the diagnosis (entry points of the group `dexsim.laws`, or law=MODULE:NAME; docs/howto/own_effect.md)."""
 
 from __future__ import annotations
 

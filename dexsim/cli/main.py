@@ -8,6 +8,7 @@ import os
 import sys
 from dataclasses import dataclass
 
+from dexsim import door
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.version import VERSION
@@ -99,7 +100,7 @@ def dispatch(argv: list[str]) -> int:
     if COMMANDS[name].side_by_side:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     module, _, function = COMMANDS[name].where.partition(":")
-    status: int = getattr(importlib.import_module(module), function)(argv[1:])
+    status: int = getattr(importlib.import_module(module), function)(door.take(argv[1:]))
     return status
 
 
