@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -26,9 +25,6 @@ from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tasks.building import UNIT_SPAN, hand_of
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
-
-if TYPE_CHECKING:
-    pass
 
 TABLE = 6000  # joint angles tried for each finger
 TRIES = 400  # places of a cube for each that is wanted, before it is said that there are none
