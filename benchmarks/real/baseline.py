@@ -7,11 +7,14 @@ recorded motion, gravity to first order about it, steps of a millisecond.
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import warp as wp
 from scipy.optimize import least_squares
 
 from dexsim.actuator.columns import INDEX
@@ -22,6 +25,7 @@ from dexsim.recording.smooth import local_polynomial
 
 STEP = 1e-3  # s
 STARTS, EVALUATIONS = 3, 25
+WIDE = 0.05  # rad or m: misses far beyond it count by their size alone
 NAMES = ("kp", "kd", "limit", "coulomb", "viscous", "delay", "lag", "inertia", "offset")
 SLIDE = 1e-3  # rad (m) by which gravity's slope is taken
 
@@ -104,57 +108,82 @@ def piece(m: Mechanism, r: Recording, joint: str, start: float = 0.0, end: float
     )
 
 
+@wp.kernel
+def _run(
+    x: wp.array2d(dtype=wp.float64),
+    series: wp.array3d(dtype=wp.float64),
+    target: wp.array3d(dtype=wp.float64),
+    row: wp.array2d(dtype=wp.float64),
+    steps: wp.array(dtype=int),
+    voltage: int,
+    friction: wp.float64,
+    out: wp.array3d(dtype=wp.float64),
+):
+    """Run guess h of x [H, 9] along piece p: series [P, n, 5] inertia, bias, slope, measured position, enabled; target
+    [H, P, n]; row [P, 7] kp, kd, limit, no-load speed, supply, position and speed at the start; out [H, P, n]."""
+    h, p = wp.tid()
+    zero, one, step = wp.float64(0.0), wp.float64(1.0), wp.float64(STEP)
+    kp, limit, no_load = row[p, 0] * x[h, 0], row[p, 2] * x[h, 2], row[p, 3]
+    kd = row[p, 1] * x[h, 1]
+    if row[p, 1] == zero:
+        kd = x[h, 1]
+    coulomb, viscous = x[h, 3] + friction, x[h, 4]
+    keep = wp.exp(-step / wp.max(x[h, 6], wp.float64(1e-9)))
+    q, v, tau = row[p, 5] + zero, row[p, 6] + zero, wp.float64(0.0)
+    for i in range(steps[p]):
+        out[h, p, i] = q
+        wanted = kp * (target[h, p, i] - q) - kd * v
+        new, most, gives = wp.float64(0.0), limit + zero, wp.float64(1.0)
+        if voltage == 1:
+            new = limit * (row[p, 4] * wp.clamp(wanted, -one, one) - v / no_load)
+            most, gives = one, limit
+        else:
+            room = wp.float64(1.0)
+            if no_load < wp.float64(1e8):
+                room = wp.clamp(one - wp.sign(wanted) * v / no_load, zero, one)
+            new = wp.clamp(wanted, -limit * room, limit * room)
+        tau = new + keep * (tau - new)
+        inertia = wp.max(series[p, i, 0] + x[h, 7], wp.float64(1e-9))
+        pull = tau * series[p, i, 4] - series[p, i, 1] - series[p, i, 2] * (q - series[p, i, 3]) + x[h, 8]
+        damp = viscous + zero  # what damps is stiff: implicitly
+        if keep < wp.float64(0.5) and wp.abs(wanted) < most:
+            damp += gives * kd
+        free = v + step * (pull - viscous * v) / (inertia + step * damp)
+        stop = step * coulomb / (inertia + step * damp)
+        v = wp.clamp(wp.sign(free) * wp.max(wp.abs(free) - stop, zero), wp.float64(-1e3), wp.float64(1e3))
+        q = wp.clamp(q + step * v, wp.float64(-1e3), wp.float64(1e3))
+
+
 def simulate(x: np.ndarray, pieces: Sequence[Piece], voltage: bool, friction: float) -> list[np.ndarray]:
     """Return positions [H, S] of each piece run free, for figures x [H, 9] as `NAMES` (factors on what is believed;
     what is added). friction: the model's own in the joint [N.m]."""
-    H, P = len(x), len(pieces)
-    n = max(len(p.grid) for p in pieces)
+    n, late = max(len(p.grid) for p in pieces), x[:, NAMES.index("delay")]
     pad = lambda y: np.pad(y, (0, n - len(y)), mode="edge")  # noqa: E731
-    M, bias, slope, at, on = (np.stack([pad(getattr(p, k)) for p in pieces]) for k in ("inertia", "bias", "slope", "at",
-                                                                                       "enabled"))  # fmt: skip
-    col = lambda name: np.array([p.row[INDEX[name]] for p in pieces])  # noqa: E731
-    kp, kd, limit, no_load = (col(c)[None] for c in ("kp", "kd", "torque_limit", "no_load_speed"))
-    g = lambda k: x[:, [NAMES.index(k)]]  # noqa: E731
-    kp, limit = kp * g("kp"), np.minimum(limit, 1e9) * g("limit")
-    kd = kd * g("kd") if kd.any() else np.broadcast_to(g("kd"), kp.shape)
-    coulomb, viscous = g("coulomb") + friction, g("viscous")
-    target = np.empty((H, P, n))
-    for i, p in enumerate(pieces):
-        for h in range(H):
-            target[h, i] = np.interp(pad(p.grid) - x[h, NAMES.index("delay")], *p.cmd)
-    lag = np.maximum(g("lag"), 1e-9)
-    keep = np.exp(-STEP / lag)
-    supply = np.array([p.supply for p in pieces])[None]
-    q, v = (np.broadcast_to([getattr(p, k) for p in pieces], (H, P)).astype(float).copy() for k in ("q0", "v0"))
-    tau, out = np.zeros((H, P)), np.empty((n, H, P))
-    for i in range(n):
-        out[i] = q
-        wanted = kp * (target[:, :, i] - q) - kd * v
-        if voltage:
-            new = limit * (supply * np.clip(wanted, -1.0, 1.0) - v / no_load)
-        else:
-            room = np.where(np.isfinite(no_load) & (no_load < 1e8), np.clip(1 - np.sign(wanted) * v / no_load, 0, 1), 1)
-            new = np.clip(wanted, -limit * room, limit * room)
-        tau = new + keep * (tau - new)
-        inertia = np.maximum(M[:, i] + g("inertia"), 1e-9)
-        pull = tau * on[:, i] - bias[:, i] - slope[:, i] * (q - at[:, i]) + g("offset")
-        # what damps is stiff: implicitly
-        damp = viscous + np.where(np.abs(wanted) < (1.0 if voltage else limit), (limit if voltage else 1.0) * kd, 0.0)
-        damp = damp * (keep < 0.5) + viscous * (keep >= 0.5)
-        free = v + STEP * (pull - viscous * v) / (inertia + STEP * damp)
-        stop = STEP * coulomb / (inertia + STEP * damp)
-        v = np.clip(np.sign(free) * np.maximum(np.abs(free) - stop, 0.0), -1e3, 1e3)
-        q = np.clip(q + STEP * v, -1e3, 1e3)
-    return [
-        np.stack([np.interp(p.t, STEP * np.arange(n), out[:, h, i]) for h in range(H)]) for i, p in enumerate(pieces)
-    ]
+    names = ("inertia", "bias", "slope", "at", "enabled")
+    series = np.stack([np.stack([pad(getattr(p, k)) for k in names], 1) for p in pieces])
+    target = np.stack([np.stack([pad(np.interp(p.grid - d, *p.cmd)) for p in pieces]) for d in late])
+    believed = ("kp", "kd", "torque_limit", "no_load_speed")
+    row = np.array([[*(min(p.row[INDEX[c]], 1e9) for c in believed), p.supply, p.q0, p.v0] for p in pieces])
+    out = wp.empty(target.shape, dtype=wp.float64, device="cpu")
+    given = [wp.array(a, dtype=wp.float64, device="cpu") for a in (x, series, target, row)]
+    steps = wp.array([len(p.grid) for p in pieces], dtype=int, device="cpu")
+    wp.launch(_run, target.shape[:2], [*given, steps, int(voltage), friction], [out], device="cpu")
+    q = out.numpy()
+    return [np.stack([np.interp(p.t, p.grid, y[i, : len(p.grid)]) for y in q]) for i, p in enumerate(pieces)]
 
 
 def fit(
-    m: Mechanism, joint: str, train: Sequence[tuple[Recording, float, float]], test: Sequence, seed: int = 0
+    m: Mechanism,
+    joint: str,
+    train: Sequence[tuple[Recording, float, float]],
+    test: Sequence,
+    seed: int = 0,
+    limit: float = np.inf,
 ) -> dict:
     """Return figures of one joint fitted to parts (recording, start s, end s) and the error of others, rms [rad or m],
-    beside what is believed (without friction that nobody knows)."""
+    beside what is believed (without friction that nobody knows). limit: seconds after which no further start is tried,
+    and one under way ends."""
+    begun = time.monotonic()
     pieces, judging = ([piece(m, *([r, joint, a, b])) for r, a, b in parts] for parts in (train, test))
     table: ServoTable = m.table
     voltage, model = table.drive == "voltage", m.spec.compile()
@@ -183,6 +212,15 @@ def fit(
             [p.q - q for p, q in zip(given, simulate(np.atleast_2d(x), given, voltage, friction), strict=True)], 1
         )
 
+    tried: list[tuple[float, np.ndarray]] = []
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        left = missed(x, pieces)[0]
+        tried.append((float(np.mean(np.sqrt(1 + (left / WIDE) ** 2))), x))
+        if time.monotonic() - begun > limit:
+            raise TimeoutError
+        return left
+
     def jacobian(x: np.ndarray) -> np.ndarray:
         step = 1e-3 * scale * np.where(x + 1e-3 * scale > high, -1, 1)
         every = missed(np.vstack([x, x + np.diag(step)]), pieces)
@@ -194,18 +232,18 @@ def fit(
     guesses[:, 1] = np.exp(rng.uniform(np.log(0.2), np.log(6.0), 40)) if damped else guesses[:, 1]
     guesses[:, 7:] = 0.0
     loss = np.concatenate([np.mean(missed(guesses[k : k + 10], pieces) ** 2, 1) for k in range(0, 40, 10)])
-    best = None
-    for x0 in [believed, *guesses[np.argsort(loss)[: STARTS - 1]]]:
-        found = least_squares(
-            lambda x: missed(x, pieces)[0], np.clip(x0, low + 1e-9 * scale, high - 1e-9 * scale), jacobian,
-            bounds=(low, high), x_scale=scale, loss="soft_l1", f_scale=0.05, max_nfev=EVALUATIONS,
-        )  # fmt: skip
-        best = found if best is None or found.cost < best.cost else best
-    assert best is not None  # of several starts
+    with contextlib.suppress(TimeoutError):
+        for x0 in [believed, *guesses[np.argsort(loss)[: STARTS - 1]]]:
+            least_squares(
+                residuals, np.clip(x0, low + 1e-9 * scale, high - 1e-9 * scale), jacobian,
+                bounds=(low, high), x_scale=scale, loss="soft_l1", f_scale=WIDE, max_nfev=EVALUATIONS,
+            )  # fmt: skip
+    best = min(tried, key=lambda row: row[0])[1]
     rms = lambda x: float(np.sqrt(np.mean(missed(x, judging) ** 2)))  # noqa: E731
     return {
         "believed": rms(believed),
-        "error": rms(best.x),
-        "fitted": float(np.sqrt(np.mean(missed(best.x, pieces) ** 2))),
-        "figures": dict(zip(NAMES, map(float, best.x), strict=True)),
+        "error": rms(best),
+        "fitted": float(np.sqrt(np.mean(missed(best, pieces) ** 2))),
+        "figures": dict(zip(NAMES, map(float, best), strict=True)),
+        "ended_early": time.monotonic() - begun > limit,
     }
