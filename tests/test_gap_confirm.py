@@ -278,3 +278,20 @@ def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs(
         assert got == pytest.approx([kp, 0.12, 0.01, friction])
         run = SimpleNamespace(servo=own, supply=None)
         assert full_model.rows_of(table, run, ["joint"])[0] == pytest.approx(written[0], nan_ok=True)
+
+
+def test_a_joint_that_anothers_choice_harms_is_not_left_worse_than_plain():
+    """b's found model throws a off unless c is as found too, which itself is worse than believed: a swap of b alone
+    is fair to all, and neither a kind for all nor the best of each is."""
+
+    def left(choice):
+        a = {"believed": 3.0, "plain": 1.0, "found": 0.8}[choice["a"]]
+        harmed = choice["b"] == "found" and choice["c"] != "found"
+        b = {"believed": 3.0, "plain": 1.03, "found": 1.0}[choice["b"]]
+        return {"a": 1.3 if harmed else a, "b": b, "c": {"believed": 1.0, "plain": 2.0, "found": 3.0}[choice["c"]]}
+
+    by = {j: ("believed", "plain", "found") for j in "abc"}
+    errors = {j: {} for j in by}
+    chosen = full_model.composed(by, errors, dict.fromkeys(by, 1e-3), lambda choices: [left(x) for x in choices])
+    least = {j: min(errors[j]["believed"], errors[j]["plain"]) for j in by}
+    assert all(left(chosen)[j] <= 1.05 * least[j] for j in by), (chosen, errors)

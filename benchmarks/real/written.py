@@ -1,14 +1,14 @@
 """What `diagnose` writes on real machines, replayed, beside what is believed and plain least squares.
 
     python -m benchmarks.real.written [sets=igris,igris_other,igris_pair,sage,ergocub,bam,panda] [data=PATH]
-                                      [out=out/real/written] [jobs=1] [limit=0] [only=NAME]
+                                      [out=out/real/written] [jobs=1] [limit=0] [hand=300] [only=NAME]
 
 Of each set (a part of one: a gain, a finger, a joint) `diagnose` is run, then `play replay=` on every recording that
 was held out with the files that it wrote, and a least squares of our own (`baseline.py`) is fitted to the same
 recordings. By joint: rms of what was held out as believed, by our own least squares (written and replayed likewise,
 all joints together), by the tool's plain fit (likewise), as reported (`held_out.replayed`) and as `play` prints it.
 Passed where the last is within a tenth of what was reported, and at most 1.05 x the better of belief and plain. limit:
-seconds a diagnosis may take (0: none). Results of each part in out/NAME.json, all in out/written.json.
+seconds a diagnosis may take (0: none); hand: those of our own fit of a joint. Results of each part in out/NAME.json, all in out/written.json.
 """
 
 from __future__ import annotations
@@ -193,14 +193,14 @@ def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[
     return {joint: float(np.sqrt(a / b)) for joint, (a, b) in total.items()}
 
 
-def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
+def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]], float]) -> dict[str, Any]:
     """Fit our own least squares to one joint of a part. held: parts of recordings that were held out (none: all
-    of those files)."""
+    of those files); limit: seconds."""
     from benchmarks.real import baseline
     from dexsim.recording import mechanism, read
     from dexsim.sim.quiet import quiet_warp
 
-    part, out, joint, held = job
+    part, out, joint, held, limit = job
     quiet_warp("cpu")
     begun = time.perf_counter()
     m = mechanism.mechanism(str(part.model), str(part.servo))
@@ -211,7 +211,7 @@ def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]]]) -> dict[str, 
         train = [(files[p.name], 0.0, np.inf) for p in part.recordings]
     else:
         train = [(r, 0.0, next(x["start"] for x in held if x["recording"] == n)) for n, r in files.items()]
-    found = baseline.fit(m, joint, train, test) | {"part": part.name, "joint": joint}
+    found = baseline.fit(m, joint, train, test, limit=limit) | {"part": part.name, "joint": joint}
     found["seconds"] = time.perf_counter() - begun
     (out / f"{part.name}.{joint}.hand.json").write_text(json.dumps(found, default=float), encoding="utf-8")
     return found
@@ -288,7 +288,7 @@ def text_of(results: Sequence[dict[str, Any]]) -> str:
 def main(argv: list[str]) -> int:
     """Runs the sets; returns the exit status."""
     given = dict(a.partition("=")[::2] for a in argv)
-    if set(given) - {"sets", "data", "out", "jobs", "limit", "only"} or not given.get("jobs", "1").isdigit():
+    if set(given) - {"sets", "data", "out", "jobs", "limit", "hand", "only"} or not given.get("jobs", "1").isdigit():
         print(__doc__)
         return 2
     sets = given.get("sets", ",".join(SETS)).split(",")
@@ -296,7 +296,7 @@ def main(argv: list[str]) -> int:
         raise UserError(f"sets={','.join(bad)}: must be of {', '.join(SETS)}")
     data, out = Path(given.get("data", "../shared/realdata")), Path(given.get("out", "out/real/written"))
     out.mkdir(parents=True, exist_ok=True)
-    limit, parts = float(given.get("limit", 0)) or None, []
+    limit, hand_limit, parts = float(given.get("limit", 0)) or None, float(given.get("hand", 300)), []
     for name in sets:
         folder = data / FOLDERS.get(name, "igris")
         if not folder.is_dir():
@@ -308,7 +308,7 @@ def main(argv: list[str]) -> int:
     with ProcessPoolExecutor(max(int(given.get("jobs", 1)), 1), mp_context=get_context("spawn")) as pool:
         waiting = {pool.submit(diagnosed, (p, out, limit)) for p in parts}
         early = [(p, j) for p in parts if p.held_out and p.judged for j in p.judged]
-        waiting |= {pool.submit(by_hand, (p, out, j, [])) for p, j in early}
+        waiting |= {pool.submit(by_hand, (p, out, j, [], hand_limit)) for p, j in early}
         hand: dict[str, dict[str, dict[str, Any]]] = {p.name: {} for p in parts}
         while waiting:
             done = next(as_completed(waiting))
@@ -324,7 +324,7 @@ def main(argv: list[str]) -> int:
                 results[name] = r
                 print(f"{name}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
                 late = [j for j in r["joints"] if r["parts"] and (by[name], j) not in early]
-                waiting |= {pool.submit(by_hand, (by[name], out, j, r["parts"])) for j in late}
+                waiting |= {pool.submit(by_hand, (by[name], out, j, r["parts"], hand_limit)) for j in late}
             if name in results and "by_hand" not in r:
                 joints = results[name]["joints"]
                 if results[name]["parts"] and set(joints) == set(hand[name]):

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
+SWAPS = 3  # times that each joint of the fairest choice is tried as another kind
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
@@ -588,10 +589,24 @@ def write_best(
         square, count = np.sum(parts, 0) if parts else (0.0, 1.0)
         return math.sqrt(square / max(count, 1.0))
 
+    chosen = composed({j: tuple(x) for j, x in by.items()}, errors, noise, replayed, passed)
+    return Written(candidates, errors, chosen, True)
+
+
+def composed(
+    by: Mapping[str, Sequence[str]],
+    errors: dict[str, dict[str, float]],
+    noise: Mapping[str, float],
+    replayed: Callable[[Sequence[dict[str, str]]], list[dict[str, float]]],
+    passed: Callable[[], bool] = lambda: False,
+) -> dict[str, str]:
+    """Return a candidate's name by joint. by: names of each joint's candidates; errors: filled with what each leaves
+    [rad or m] where all joints are of its kind; noise: floor by joint; replayed: what whole choices leave by joint;
+    passed: whether time is up."""
     # every joint as its own kind first, then the best of each together; where joints pull at one another that may be
     # none of them: then each is asked once more with what the others now are
     kinds = [k for k in ORDER if any(k in x for x in by.values())]
-    every = [{j: k if k in x else next(iter(x)) for j, x in by.items()} for k in kinds]
+    every = [{j: k if k in x else x[0] for j, x in by.items()} for k in kinds]
     done = list(zip(every, replayed(every), strict=True))
     for choice, found in done:
         for j, name in choice.items():
@@ -617,10 +632,17 @@ def write_best(
     def worst(found: Mapping[str, float]) -> float:
         return max(found[j] / max(x, quiet[j]) if math.isfinite(x) else 1.0 for j, x in plainly.items())
 
+    # where no choice is fair to every joint, what the fairest leaves with one joint as another kind, again and again
+    for _ in range(SWAPS):
+        nearest, found = min(done, key=lambda d: worst(d[1]))
+        swaps = [x for j, of in by.items() for k in of if (x := nearest | {j: k}) not in [c for c, _ in done]]
+        if worst(found) <= 1 + BELIEF.tolerance or not swaps or passed():
+            break
+        done += zip(swaps, replayed(swaps), strict=True)
     fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
     alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
     total = lambda d: sum(math.log(max(d[1][j], quiet[j])) - alike(d[0]) for j in by)  # noqa: E731
-    return Written(candidates, errors, min(fair, key=total)[0], True)
+    return min(fair, key=total)[0]
 
 
 def _start(r: Recording, start: float) -> float:
