@@ -8,7 +8,8 @@ was held out with the files that it wrote, and a least squares of our own (`base
 recordings. By joint: rms of what was held out as believed, by our own least squares (written and replayed likewise,
 all joints together), by the tool's plain fit (likewise), as reported (`held_out.replayed`) and as `play` prints it.
 Passed where the last is within a tenth of what was reported, and at most 1.05 x the better of belief and plain. limit:
-seconds a diagnosis may take (0: none); hand: those of our own fit of a joint. Results of each part in out/NAME.json, all in out/written.json.
+seconds a diagnosis may take (0: none); hand: those of our own fit of a joint. Results of each part in out/NAME.json,
+all in out/written.json.
 """
 
 from __future__ import annotations
