@@ -567,3 +567,67 @@ def test_two_loops_run_their_policies_on_two_hands_of_a_bus(b):
     for loop, least in zip(loops, (40, 10), strict=True):
         assert loop.report.ended == "done" and loop.report.acts > least and not loop.report.not_relaxed
     assert "right hand" in loops[0].report.limp and "left hand" in loops[1].report.limp
+
+
+# -- a package that somebody else has written
+# --------------------------------------------------------------------------------------------------------------------
+OTHERS = os.path.join(os.path.dirname(__file__), "another_package")
+
+
+def with_another(b, monkeypatch, posture=0.3, seconds=1.5, **faults):
+    """A run in virtual time on the second fake: (report, module, s by the clock at which the port was opened)."""
+    monkeypatch.syspath_prepend(OTHERS)
+    from xhand_controller import xhand_control as package
+
+    clock = VirtualClock(50.0)
+    monkeypatch.setattr(package, "now", clock.now)
+    monkeypatch.setattr(package, "sleep", lambda s: clock.sleep_until(clock.now() + s))
+    monkeypatch.setattr(package, "faults", faults)
+    monkeypatch.setattr(package, "posture", posture)
+    package.log.clear()
+    settings = LoopSettings(seconds=seconds, tor_max=300.0, home_speed=3.0)
+    loop = Watched(b, VendorXHand("auto", clock, package, side="right"), FixedPlace([0.055, 0.0, 0.04]),
+                   Calibration.default(), settings, clock)  # fmt: skip
+    return loop.run(), package, loop
+
+
+def test_another_package_is_driven_at_its_own_rate_from_where_the_hand_stands(b, monkeypatch):
+    report, package, loop = with_another(b, monkeypatch, posture=0.9)
+    t, mode, target, _ = np.array(package.log).T
+    run = (t > loop.began) & (t < loop.relaxed)
+    assert report.ended == "done" and not report.not_relaxed and np.diff(t[run]).mean() < 0.0102
+    assert abs(target[mode == POSITION][0] - 0.9) < 0.02 and package.log[-1][1] == PASSIVE
+
+
+@pytest.mark.parametrize(("fault", "ended", "within"), [
+    ({"crc": 1.2}, "done", None), ({"dead_board": 0.0}, "done", None), ({"dead_board": 1.2}, "done", None),
+    ({"mute": 1.2}, "no taxel board", 0.15), ({"refused": 1.2}, "refuses", 0.15),
+    ({"stuck": 0.3}, "no bit of the readings has changed", 0.45),
+])  # fmt: skip
+def test_faults_of_another_package(b, monkeypatch, fault, ended, within):
+    report, package, loop = with_another(b, monkeypatch, **fault)
+    assert ended in report.ended
+    if within is not None:
+        assert loop.relaxed - (50.0 + next(iter(fault.values()))) < within
+    if "crc" in fault:
+        t = np.array([t for t, *_ in package.log])
+        assert 0.05 < np.diff(t).max() < 0.1, "one pause, and no boot mode"
+    if "dead_board" in fault:
+        assert report.counts["silent_index"] > 50 and not report.counts["silent_mid"]
+    assert bool(report.not_relaxed) == (ended not in ("done", "no taxel board"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faults", ["crc=5", "cable=6"])
+def test_another_package_behind_the_command(b, tmp_path, faults):
+    """In real time, in the driver's own process."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([OTHERS, *sys.path]), "XHAND_FAULTS": faults}
+    done = subprocess.run(
+        [sys.executable, "-m", "dexsim", "deploy", f"bundle={b.path}", "driver=xhand", "place=0.055 0 0.04", "record=none",
+         "seconds=5", "home_speed=3", "late=1", "stale=1", "hang=2", "overruns=1000"],
+        env=env, capture_output=True, text=True, cwd=tmp_path)  # fmt: skip
+    assert "serial 012R3202601010001" in done.stdout and "sdk 1.4.3" in done.stdout, done.stderr
+    if faults[0] == "c" and "cable" not in faults:
+        assert done.returncode == 0 and "ended    done" in done.stdout
+    else:
+        assert "SIGABRT" in done.stdout and "cut its power" in done.stdout + done.stderr and done.returncode

@@ -103,10 +103,10 @@ class BusDriver:
         self._era = self._number = self._object = 0
         self._ended = ""
         if type(self.clock) is not Clock:
-            own = VirtualClock(self.clock.now())
-            self.body = self._make(own)
-            info = self.body.open()
-            self.clock.sleep_until(own.now())  # it has taken its time
+            assert isinstance(self.clock, VirtualClock)
+            self.body = self._make(self.clock)
+            info = self.body.open()  # which takes its time
+            self._bus_time = self.clock.now()
             self._command: HandCommand | None = None
             self._waiting: list[tuple[float, HandState | None, np.ndarray]] = []
             self._state: HandState | None = None
@@ -289,10 +289,14 @@ class BusDriver:
 
     def _step(self, body: Body) -> HandState | None:
         """In place: the bus cycles that have begun by now."""
-        now = self.clock.now()
+        clock, now = self.clock, self.clock.now()
+        assert isinstance(clock, VirtualClock)
+        clock.go(self._bus_time)  # the bus is ahead of the loop, by one clock: the package may have been given it
         while body.due <= now + 1e-6:
             state = body.cycle(self._command)
-            self._waiting.append((body.clock.now() if state is None else state.time, state, body.seen()))
+            self._waiting.append((clock.now() if state is None else state.time, state, body.seen()))
+        self._bus_time = clock.now()
+        clock.go(now)
         while self._waiting and self._waiting[0][0] <= now + 1e-6:
             _, state, self._object_row = self._waiting.pop(0)
             self._state = state or self._state

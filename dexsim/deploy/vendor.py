@@ -28,6 +28,7 @@ import numpy as np
 
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
 from dexsim.deploy.process import HANG, BusDriver
+from dexsim.deploy.readings import Frozen
 from dexsim.errors import UserError
 
 BAUD = 3_000_000
@@ -51,8 +52,10 @@ SEED = 3
 """Forced readings before the first command, 20 ms apart: until then the cache holds zeros."""
 LOST = 0.1
 """s without an answer of all taxel boards, or of one: silent; without an accepted command: refused."""
-FEW = 8
-"""Frames in a row: one that is late (111 ms were seen) or torn proves nothing."""
+FEW, STILL = 8, 0.08
+"""Frames in a row, and s: one that is late (111 ms were seen) or torn proves nothing, nor do many within a moment."""
+SHORTEST = 0.002
+"""s between two cycles, where a command does not wait for its round trip (EtherCAT)."""
 LIMP, YIELD, WATCH = 30.0, 0.02, 0.1
 """mA that motors may draw in a limp hand; rad by which a joint that gives way shows that it is; s that a hand is
 watched for each way to let go."""
@@ -72,14 +75,17 @@ class XHandBus:
         self.label = _label(serial, side)
         self._sdk = package(clock) if package is not None else _import()
         self.counts: Counter = Counter()
-        self._pause_until = self._refused_at = clock.now()
+        self._pause_until = self._refused_at = self._next = clock.now()
         self._sent: HandCommand | None = None
+        self._driven: tuple[Any, Any] = None, None  # targets and limits of the last command that was not passive
+        self._frozen = Frozen()
         self._frame: list[Any] = []
         self._sequence, self._fast = 0, False
         self._last_bits: tuple[list, list] = ([], [])
         self._stirred, self._restless, self._same, self._unfelt = clock.now(), False, 0, 0
         self._steps = np.zeros(JOINTS)
-        self._boards = [b""] * TAXELS[0]
+        self._boards, self._changed = [b""] * TAXELS[0], np.full(TAXELS[0], clock.now())
+        self._rested = np.zeros(TAXELS[0])  # s that a board which answers has given the same
         self._touch = np.zeros(TAXELS, np.int16)
         self._touched = np.full(TAXELS[0], -np.inf)
         self._touch_worked, self._why, self._refusal = False, "", ""
@@ -89,7 +95,7 @@ class XHandBus:
     @property
     def due(self) -> float:
         """When the next round trip may begin [s]."""
-        return max(self.clock.now(), self._pause_until)
+        return max(self.clock.now(), self._pause_until, self._next)
 
     # -- opening
     # ---------------------------------------------------------------------------------------------------------------
@@ -167,19 +173,20 @@ class XHandBus:
     # ---------------------------------------------------------------------------------------------------------------
     def cycle(self, command: HandCommand | None) -> HandState | None:
         """Send, one round trip; then the state that it brought. None where it brought nothing that is new and whole."""
-        self.clock.sleep_until(self._pause_until)
-        code = 0
+        self.clock.sleep_until(self.due)
+        self._next, code = self.clock.now() + SHORTEST, 0
         if command is None:
             error, raw = self._call(lambda: self._device.read_state(self._id, True), (None, None))
         else:
             self._sent = command
             if command.mode != PASSIVE:
-                self._letting_go = None
+                self._letting_go, self._driven = None, (command.position, command.tor_max)
             code = self._send(self._letting(command) if command.mode == PASSIVE else command)
             error, raw = self._call(lambda: self._device.read_state(self._id, False), (None, None))
-        state = self._state_of(error, raw, code)
+        state = self._call(lambda: self._state_of(error, raw, code), None)  # fields may be others in another package
         if state is not None:
             self._state = state
+            self._frozen.note(state.time, state, self._driven[0])
         if self._letting_go is not None:
             self._watch_limp(code, state)
         return state
@@ -203,14 +210,15 @@ class XHandBus:
         answer = self._call(lambda: self._device.send_command(self._id, self._wire), None)
         code, message = _error(answer)
         now = self.clock.now()
+        if code == CRC:  # not confirmed, which is no refusal
+            self._pause_until = now + PAUSE
+            return code
         if code in ACCEPTED:
             self._refusal = ""
             return code
         if not self._refusal:
             self._refused_at = now
         self.counts[f"code {code}"] += 1
-        if code == CRC:
-            self._pause_until = now + PAUSE
         if code == TOO_WARM:
             self._refusal = f"a motor is too warm (code {code})"
         elif code == BOOT:
@@ -249,17 +257,18 @@ class XHandBus:
         speed = _int16([getattr(j, "default5", 0) for j in joints]).astype(np.float32) * 1e-3
         self._fast = self._fast or bool(speed.any())
         self._stir(now, code)
-        error_codes = [0 if code == CRC else (j.commboard_err or j.jonitboard_err) for j in joints]
+        errors = [getattr(j, "commboard_err", 0) or getattr(j, "jonitboard_err", 0) for j in joints]
         self._sequence += 1
         silent = now - self._touched > LOST
         return HandState(
             now, self._sequence, np.array([j.position for j in joints], np.float32),
             _int16([j.torque for j in joints]), np.array([j.temperature & 0xFF for j in joints], float),
-            np.array(error_codes, np.int64), np.where(silent[:, None, None], 0, self._touch).astype(np.int16),
+            np.array(errors, np.int64) * (code != CRC), np.where(silent[:, None, None], 0, self._touch).astype(np.int16),
             speed if self._fast else None, silent if silent.any() else None)  # fmt: skip
 
     def _feel(self, raw: Any, code: int, now: float) -> None:
-        """The taxels of boards that answer: of all with a good code, else of those whose content changes."""
+        """The taxels of boards that answer: of all with a good code; else of those whose content changes, or is there
+        and stood still before, too."""
         self._unfelt += 1
         if code == CRC:
             return
@@ -268,9 +277,15 @@ class XHandBus:
             flat = [x for t in board.raw_force for x in (t.fx, t.fy, t.fz)]
             touch = np.array(flat, np.int16).reshape(TAXELS[1:])
             content = touch.tobytes() + bytes([int(x) & 0xFF for x in getattr(board, "temperature", ())])
-            if code in GOOD_TOUCH or (content != self._boards[f] and any(content)):
+            if content != self._boards[f]:
+                self._boards[f], self._changed[f] = content, now
+            rested = now - self._changed[f]
+            if code in GOOD_TOUCH:
+                self._rested[f] = max(self._rested[f], rested)
+            if code in GOOD_TOUCH or (
+                any(content) and (not rested or self._rested[f] > LOST or not self._touch_worked)
+            ):
                 self._touch[f], self._touched[f], self._unfelt = touch, now, 0
-            self._boards[f] = content
         self._touch_worked = self._touch_worked or code in GOOD_TOUCH
 
     def _stir(self, now: float, code: int) -> None:
@@ -287,12 +302,17 @@ class XHandBus:
 
     def _dead(self) -> str:
         """What is said of a bus whose cache alone answers; empty where it lives."""
-        still = self.clock.now() - self._stirred
+        now = self.clock.now()
+        still = now - self._stirred
+        if self._restless and self._same >= FEW and still > STILL:
+            why = "of a hand whose encoders never stand still"
+        elif self._state and self._frozen.problem(now, self._driven[0], self._state, self._driven[1]):
+            why = "while its targets moved and it drew no more current"
+        else:
+            return ""
         return (
-            f"no bit of the readings has changed for {1e3 * still:.0f} ms, of a hand whose encoders never stand still:"
-            " the bus is dead, and the package's cache answers"
-            if self._restless and self._same >= FEW
-            else ""
+            f"no bit of the readings has changed for {1e3 * still:.0f} ms, {why}: the bus is dead, and the package's"
+            " cache answers"
         )
 
     # -- what the loop asks
