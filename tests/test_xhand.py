@@ -4,10 +4,10 @@ that a driver must know. In virtual time, but for what only processes show."""
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from functools import partial
 
@@ -19,7 +19,8 @@ from worlds import task_cfg
 
 from dexsim import export
 from dexsim.calibration.file import Calibration
-from dexsim.deploy import bundle
+from dexsim.cli.deploy import main as command
+from dexsim.deploy import bundle, simulated_hand
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, VirtualClock
 from dexsim.deploy.fake_xhand import ENCODER_JITTER, FakeXHand, Faults, LaggingHand
 from dexsim.deploy.loop import Loop, LoopSettings
@@ -546,27 +547,34 @@ def test_two_hands_are_let_go_by_their_process_where_the_loop_is_silent(tmp_path
         d.close()
 
 
-def test_two_loops_run_their_policies_on_two_hands_of_a_bus(b):
-    """In real time, each in a thread; the left hand's loop ends first, and the right hand goes on."""
-    d = two(Clock(), serials=("FAKE0001", "FAKE0002"), hang=3.0)
-    patient = {"late": 2.0, "stale": 1.0, "overruns": 1000, "hang": 3.0, "home_speed": 3.0, "tor_max": 300.0}
-    make = partial(Loop, b, eye=FixedPlace([0.055, 0.0, 0.04]), calibration=Calibration.default(), clock=d.clock)
-    right, remaining = d.hands
-    loops = [make(right, settings=LoopSettings(seconds=1.5, **patient)),
-             make(remaining, settings=LoopSettings(seconds=0.5, **patient))]  # fmt: skip
-    d.open()
-    threads = [threading.Thread(target=loop.run) for loop in loops]
-    try:
-        for t in threads:
-            t.start()
-        for t in threads:
-            t.join(60)
-    finally:
-        for hand in d.hands:
-            hand.close()
-    for loop, least in zip(loops, (40, 10), strict=True):
-        assert loop.report.ended == "done" and loop.report.acts > least and not loop.report.not_relaxed
-    assert "right hand" in loops[0].report.limp and "left hand" in loops[1].report.limp
+@pytest.fixture(scope="module")
+def left(b, tmp_path_factory):
+    """The same bundle, for a left hand."""
+    folder = tmp_path_factory.mktemp("xhand") / "left"
+    shutil.copytree(b.path, folder)
+    manifest = folder / "manifest.yaml"
+    manifest.write_text(manifest.read_text().replace("mirror: false", "mirror: true"))
+    return folder
+
+
+def test_the_command_runs_two_policies_on_two_hands_of_a_bus(b, left, tmp_path, monkeypatch, capsys):
+    """In real time, each in a thread."""
+    fake = lambda config, calibration, text, *_: partial(FakeXHand, faults=Faults.parse(text))  # noqa: E731
+    monkeypatch.setattr(simulated_hand, "fake_package", fake)
+    patient = ["late=2", "stale=1", "overruns=1000", "hang=3", "home_speed=3", "tor_max=300", "seconds=1"]
+    settings = [f"bundle={b.path}", f"second={left}", "driver=xhand", "port=fake", f"record={tmp_path / 'a.mcap'}"]
+    with pytest.raises(UserError, match="nothing sees the object"):
+        command([*settings, "place=0.055 0 0.04"])
+    places = ["place=0.055 0 0.04", "second_place=0.055 0 0.04"]
+    assert command([*settings, *places, *patient]) == 0
+    said = capsys.readouterr().out
+    for side in ("right", "left"):
+        assert f"the {side} hand is relaxed (" in said
+    assert said.count("ended    done") == 2 and "FAKE0001, FAKE0002" in said
+    for name in ("a.mcap", "a_second.mcap"):
+        assert len(read(tmp_path / name, audit=False).states.position) > 30
+    with pytest.raises(UserError, match="second=DIR names none"):
+        command([settings[0], "second_serial=A"])
 
 
 # -- a package that somebody else has written
@@ -623,8 +631,8 @@ def test_another_package_behind_the_command(b, tmp_path, faults):
     """In real time, in the driver's own process."""
     env = os.environ | {"PYTHONPATH": os.pathsep.join([OTHERS, *sys.path]), "XHAND_FAULTS": faults}
     done = subprocess.run(
-        [sys.executable, "-m", "dexsim", "deploy", f"bundle={b.path}", "driver=xhand", "place=0.055 0 0.04", "record=none",
-         "seconds=5", "home_speed=3", "late=1", "stale=1", "hang=2", "overruns=1000"],
+        [sys.executable, "-m", "dexsim", "deploy", f"bundle={b.path}", "driver=xhand", "place=0.055 0 0.04",
+         "record=none", "seconds=5", "home_speed=3", "late=1", "stale=1", "hang=2", "overruns=1000"],
         env=env, capture_output=True, text=True, cwd=tmp_path)  # fmt: skip
     assert "serial 012R3202601010001" in done.stdout and "sdk 1.4.3" in done.stdout, done.stderr
     if faults[0] == "c" and "cable" not in faults:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import signal
+import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from dexsim import door, system, typed
@@ -26,6 +28,8 @@ settings (key=default):
                       ethercat:INTERFACE; fake: the simulated hand behind a fake of the vendor's package, with faults
                       as in fake:crc=0.005,board=2 (dexsim/deploy/fake_xhand.py)
   serial=             driver=xhand: the hand with this serial number, of several
+  second=             driver=xhand: bundle of a second hand on the same bus, of its side; some 50 readings a second each
+                      (second_serial=, second_place=, second_calibration= are as those of the first)
   ros2=               driver=ros2: topics of states and commands (default: /joint_states,/joint_commands), both
                       sensor_msgs/JointState; a command's effort is the current limit [mA], 0 lets go
   ros2_message=       joint_state, or xhand: the messages of the vendor's ROS driver (needs rclpy)
@@ -56,8 +60,9 @@ safety (key=default):
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
-OWN = ("bundle", "driver", "port", "serial", "ros2", "ros2_message", "ros2_effort", "calibration", "record", "vision",
-       "place", "imu", "shape", "seed", "task")  # fmt: skip
+SECOND = ("second", "second_serial", "second_place", "second_calibration")
+OWN = (*SECOND, "bundle", "driver", "port", "serial", "ros2", "ros2_message", "ros2_effort", "calibration", "record",
+       "vision", "place", "imu", "shape", "seed", "task")  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> int:
@@ -73,10 +78,7 @@ def main(argv: Sequence[str]) -> int:
     given, changes = _settings(argv)
     import torch
 
-    from dexsim.calibration.file import Calibration
-    from dexsim.deploy import bundle as bundles
-    from dexsim.deploy.loop import Loop, LoopSettings
-    from dexsim.deploy.measure import of
+    from dexsim import files, outputs
     from dexsim.tasks import registry
 
     if "task" in given:
@@ -84,51 +86,137 @@ def main(argv: Sequence[str]) -> int:
     torch.set_num_threads(1)
     if "bundle" not in given:
         raise UserError("say which policy: bundle=DIR (dexsim export writes one)")
-    b = bundles.load(given["bundle"])
-    base = b.manifest["normalization"]["tau_max"]
-    if "calibration" in given:
-        calibration = Calibration.load(given["calibration"], base, b.hand)
-    else:
-        calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
-    if given.get("port", "").startswith("fake"):
-        changes.setdefault("seen", 0.3)  # the fake's world is seen over its bus: after its pauses and outliers
-    elif given.get("driver") == "xhand" and "tor_max" not in changes:
-        from dexsim.deploy.vendor import MOST_CURRENT
-
-        changes["tor_max"] = tuple(min(1e3 * float(x), MOST_CURRENT) for x in calibration.current_max)
-        print(f"note     no motor gets more than {max(changes['tor_max']):.0f} mA; tor_max= says otherwise")
-    settings = LoopSettings(**changes)
-    settings.check()
-    if "command" in changes and "command" not in of(b.manifest["task"]).OPTIONS:
-        raise UserError(
-            f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
-            " commanded force"
-        )
-    driver, eye = _hand(given, b, calibration, settings.hang)
-    for text in calibration.assumed:
-        print(f"note     {text}")
-    loop = Loop(b, driver, eye, calibration, settings, say=lambda text: print(text, flush=True))
-    loop.recorder = recorder = _recorder(given, b, settings, calibration)
-    print(
-        f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g}"
-        " Hz"
-    )
+    all_given = [{k: v for k, v in given.items() if k not in SECOND}]
+    if "second" in given:
+        more = {k.removeprefix("second_"): v for k, v in given.items() if k in SECOND}
+        shared = {k: v for k, v in all_given[0].items() if f"second_{k}" not in SECOND}
+        all_given.append(shared | more | {"bundle": given["second"]})
+        if given.get("record") != "none":
+            path = files.place(given.get("record") or _recording())
+            all_given[0]["record"] = str(path)
+            all_given[1]["record"] = str(outputs.new(path.with_name(f"{path.stem}_second.mcap"), "record="))
+    elif wrong := [k for k in SECOND if k in given]:
+        raise UserError(f"{wrong[0]}={given[wrong[0]]}: says something of a second hand, but second=DIR names none")
+    loops = _loops(all_given, changes)
     if given.get("driver", "sim") != "sim":
         print("note     if this computer dies, the hand keeps its last target: keep its power switch within reach")
-    print(f"driver   {driver.name}; starting ...", flush=True)
+    print(f"driver   {', '.join(loop.driver.name for loop in loops)}; starting ...", flush=True)
     with _Stop() as stop:
         try:
-            loop.run()
+            _run(loops)
         finally:
             stop.ending = True
             try:
-                driver.close()
+                _each([loop.driver.close for loop in loops])
             finally:
-                with contextlib.suppress(OSError):  # the terminal may be gone
-                    _ending(loop.report, recorder)
-                    if rescued := getattr(driver, "rescued", ""):
-                        print(f"since    {rescued}", flush=True)
-    return 0 if loop.report.ended == "done" else stop.status or 1
+                for loop in loops:
+                    with contextlib.suppress(OSError):  # the terminal may be gone
+                        _ending(loop.report, loop.recorder, loop.driver.name if len(loops) > 1 else "hand")
+                        if rescued := getattr(loop.driver, "rescued", ""):
+                            print(f"since    {rescued}", flush=True)
+    return 0 if all(loop.report.ended == "done" for loop in loops) else stop.status or 1
+
+
+def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list[Any]:
+    """A loop for each hand. Raises UserError."""
+    from dexsim.calibration.file import Calibration
+    from dexsim.deploy import bundle as bundles
+    from dexsim.deploy.loop import Loop, LoopSettings
+    from dexsim.deploy.measure import of
+    from dexsim.deploy.process import HANG
+
+    found = []
+    for given in all_given:
+        b = bundles.load(given["bundle"])
+        base = b.manifest["normalization"]["tau_max"]
+        if "calibration" in given:
+            calibration = Calibration.load(given["calibration"], base, b.hand)
+        else:
+            calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
+        mine = dict(changes)
+        if given.get("port", "").startswith("fake"):
+            mine.setdefault("seen", 0.3)  # the fake's world is seen over its bus: after its pauses and outliers
+        elif given.get("driver") == "xhand" and "tor_max" not in mine:
+            from dexsim.deploy.vendor import MOST_CURRENT
+
+            mine["tor_max"] = tuple(min(1e3 * float(x), MOST_CURRENT) for x in calibration.current_max)
+            print(f"note     no motor gets more than {max(mine['tor_max']):.0f} mA; tor_max= says otherwise")
+        settings = LoopSettings(**mine)
+        settings.check()
+        if "command" in mine and "command" not in of(b.manifest["task"]).OPTIONS:
+            raise UserError(
+                f"command={mine['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
+                " commanded force"
+            )
+        found.append((given, b, calibration, settings))
+    hands = _two_hands(found, changes.get("hang", HANG)) if len(found) > 1 else [None]
+    loops = []
+    pairs = [_hand(*x[:3], x[3].hang, hand) for x, hand in zip(found, hands, strict=True)]  # before there are files
+    for (given, b, calibration, settings), (driver, eye) in zip(found, pairs, strict=True):
+        for text in calibration.assumed:
+            print(f"note     {text}")
+        name = f"{driver.name:<11}" if len(found) > 1 else ""
+        loop = Loop(b, driver, eye, calibration, settings, say=partial(print, name, sep="", flush=True))
+        loop.recorder = _recorder(given, b, settings, calibration)
+        rate = 1 / b.manifest["rates"]["policy_period_s"]
+        print(f"bundle   {b.path}, policy {rate:.1f} Hz, readings {settings.read_hz:g} Hz")
+        loops.append(loop)
+    return loops
+
+
+def _two_hands(found: Sequence[tuple], hang: float) -> list[Any]:
+    """Drivers of two xHands on one bus."""
+    from dexsim.deploy.vendor import VendorXHands
+
+    given, b, calibration, _ = found[0]
+    if given.get("driver") != "xhand":
+        raise UserError(f"second={found[1][0]['bundle']}: two hands on a bus are for driver=xhand")
+    sides = [x[1].hand.handedness for x in found]
+    package, port = None, given.get("port", "auto")
+    if port.split(":")[0] == "fake":
+        from dexsim.deploy.simulated_hand import fake_package
+
+        faults = f"side={sides[0][0].upper()},second=FAKE0002,{port.partition(':')[2]}"
+        package, port = fake_package(b.config, calibration, faults, 0, False, None, b.manifest.get("grip")), "auto"
+    bus = VendorXHands([x[0].get("serial") for x in found], sides, port, package=package, hang=hang)
+    bus.start = 180.0
+    return bus.hands
+
+
+def _run(loops: Sequence[Any]) -> None:
+    """Run the loops, of two hands each in a thread; a signal ends both."""
+    if len(loops) == 1:
+        loops[0].run()
+        return
+    loops[0].driver.open()
+    failed: list[BaseException] = []
+
+    def work(loop: Any) -> None:
+        try:
+            loop.run()
+        except BaseException as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work, args=(loop,)) for loop in loops]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        try:
+            for thread in threads:
+                thread.join(0.05)
+        except KeyboardInterrupt as error:
+            for loop in loops:
+                loop.report.ended = loop.report.ended or str(error) or "stopped by Ctrl-C"
+                loop.stop.set()
+    if failed:
+        raise failed[0]
+
+
+def _each(works: Sequence[Any]) -> None:
+    """Do all; what the first that fails raises comes after the last."""
+    with contextlib.ExitStack() as stack:
+        for work in reversed(works):
+            stack.callback(work)
 
 
 class _Stop:
@@ -155,11 +243,11 @@ class _Stop:
             raise KeyboardInterrupt(f"stopped by {self._names[number]}")
 
 
-def _ending(report: Any, recorder: Any) -> None:
+def _ending(report: Any, recorder: Any, name: str = "hand") -> None:
     """What the run was, on standard output."""
     if report.not_relaxed:
-        print(f"\nDANGER   the hand could not be relaxed ({report.not_relaxed}): cut its power", flush=True)
-    hand = "the hand may still drive" if report.not_relaxed else "the hand is relaxed"
+        print(f"\nDANGER   the {name} could not be relaxed ({report.not_relaxed}): cut its power", flush=True)
+    hand = f"the {name} may still drive" if report.not_relaxed else f"the {name} is relaxed"
     hand += f" ({report.limp})" if report.limp else ""
     print(f"\nended    {report.ended or 'failed'} after {report.acts} actions; {hand}")
     print(report.timing.table())
@@ -170,7 +258,8 @@ def _ending(report: Any, recorder: Any) -> None:
         print(f"mcap     {what if recorder.written or lost else 'none: there was nothing to record'}", flush=True)
 
 
-def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple[Any, Any]:
+def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: Any = None) -> tuple[Any, Any]:
+    """The driver, `hand` where there is one of several on a bus, and what sees the object."""
     import numpy as np
 
     from dexsim.deploy.measure import ORIENTATION, PLACE, of
@@ -200,17 +289,17 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float) -> tuple
     wrong += [k for k in ("imu",) if (kind == "sim" or fake) and k in given]
     if wrong:
         raise UserError(f"{wrong[0]}={given[wrong[0]]}: driver={kind} does not use it{' with port=fake' * fake}")
-    if kind == "ros2" or (kind == "xhand" and not fake):
+    if kind == "ros2" or (kind == "xhand" and not fake) or hand is not None:
         needs = of(task).measure(b, calibration).needs
         if needs == PLACE and place is None:
             raise UserError(
                 f'driver={kind}: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with'
                 " your own HeightSource (dexsim.deploy.vision)"
             )
-        driver: Any = None
+        driver: Any = hand
         if kind == "ros2":
             driver = _ros2(given, b.hand)
-        else:
+        elif hand is None:
             from dexsim.deploy.vendor import VendorXHand
 
             side = b.hand.handedness
@@ -287,6 +376,10 @@ def _imu(given: dict[str, str], b: Any) -> Any:
     return imu
 
 
+def _recording() -> str:
+    return f"out/deploy_{time.strftime('%Y-%m-%d_%H-%M-%S')}.mcap"
+
+
 def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) -> Any:
     import yaml
 
@@ -295,7 +388,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     from dexsim.deploy.recorder import Recorder
     from dexsim.outputs import new
 
-    where = given.get("record") or f"out/deploy_{time.strftime('%Y-%m-%d_%H-%M-%S')}.mcap"
+    where = given.get("record") or _recording()
     if where == "none":
         return None
     path = files.place(where)

@@ -463,17 +463,22 @@ def faked(
 ) -> VendorXHand:
     """The xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
     `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
-    registry.task_class(config)
-    hand = hand_of(config)
-    side = hand.handedness
+    side = hand_of(config).handedness
     text = faults if "side=" in faults else f"side={side[0].upper()}," + faults
-    make = partial(_physics, args=(config, calibration, seed, camera, shape, grip))
-    package = partial(FakeXHand, make=make, faults=Faults.parse(text))
+    package = fake_package(config, calibration, text, seed, camera, shape, grip)
     if camera and clock is None:
         choose_gl()
     driver = VendorXHand("auto", clock, package, serial, side, hang)
     driver.start = 180.0  # kernels compile on a first start
     return driver
+
+
+def fake_package(config: dict[str, Any], calibration: Calibration, faults: str, *how: Any) -> Any:
+    """Return what gives the fake of the vendor's package, with the simulated hand behind it. faults: see
+    `dexsim.deploy.fake_xhand.Faults`; how: as `SimulatedHand` takes it. Raises UserError."""
+    registry.task_class(config)
+    make = partial(_physics, args=(config, calibration, *how))
+    return partial(FakeXHand, make=make, faults=Faults.parse(faults))
 
 
 def _physics(args: tuple) -> SimulatedHand:

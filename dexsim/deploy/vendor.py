@@ -260,10 +260,11 @@ class XHandBus:
         errors = [getattr(j, "commboard_err", 0) or getattr(j, "jonitboard_err", 0) for j in joints]
         self._sequence += 1
         silent = now - self._touched > LOST
+        touch = np.where(silent[:, None, None], 0, self._touch).astype(np.int16)
         return HandState(
             now, self._sequence, np.array([j.position for j in joints], np.float32),
             _int16([j.torque for j in joints]), np.array([j.temperature & 0xFF for j in joints], float),
-            np.array(errors, np.int64) * (code != CRC), np.where(silent[:, None, None], 0, self._touch).astype(np.int16),
+            np.array(errors, np.int64) * (code != CRC), touch,
             speed if self._fast else None, silent if silent.any() else None)  # fmt: skip
 
     def _feel(self, raw: Any, code: int, now: float) -> None:

@@ -1,7 +1,7 @@
 """Joints that follow in 30 ms, encoders and pads without any noise, one thread, the cache written as a call returns.
 
-`faults` (or XHAND_FAULTS="crc=2,dead_board=0") has s since the port was opened: crc: one reply is damaged; stuck: the bus
-dies behind its cache; refused; cable: the library aborts. dead_board, mute: one board, all boards fail from then on.
+`faults` (or XHAND_FAULTS="crc=2,dead_board=0") has s since the port was opened: crc: one reply is damaged; stuck: the
+bus dies behind its cache; refused; cable: the library aborts. dead_board, mute: one board, all boards fail from then.
 """
 
 from __future__ import annotations
