@@ -18,6 +18,7 @@ from dexsim.import_hand import poses
 from dexsim.import_hand.importing import import_hand
 from dexsim.recording.mechanism import drive, of_hand
 from dexsim.recording.schema import Series
+from dexsim.tactile.layout import hand_layout
 from tests.test_import_faithful import jaws, settings
 
 
@@ -239,3 +240,29 @@ def test_a_joint_without_a_name_is_one_that_nobody_drives():
         "</worldbody></mujoco>"
     )
     assert Couplings(m, ["a"]).passive == ("",) and not Couplings(m, ["a"]).tied
+
+
+def test_a_press_of_a_coupled_finger_obeys_virtual_work(tmp_path):
+    """The fingertip's force times its way is the drive's torque times its own, what follows moving along."""
+    from dexsim.calibration.simulate import press_recording
+
+    (tmp_path / "jaws.xml").write_text(jaws(after=f"<equality>{MIMIC}</equality>"))
+    import_hand(tmp_path / "jaws.xml", tmp_path / "hand", settings(pads=(3, 3)), picture=False)
+    hand = load_hand(tmp_path / "hand")
+    pressed = press_recording(hand, "first0", levels=4)
+    taxels, torque = pressed.tactile.value, pressed.states.effort.value[:, 0]  # [T, F, K, 3]
+    at = pressed.tactile.t > 0.5 * pressed.tactile.t[-1]  # let go step by step
+    force = np.linalg.norm(taxels.sum((1, 2)), axis=1)[at]
+    torque = np.abs(np.interp(pressed.tactile.t[at], pressed.states.effort.t, torque))
+    layout, share = hand_layout(hand), taxels[at, 0, :, 2].sum(0)
+    point, normal = (x[0, : len(share)].T @ share / share.sum() for x in (layout.point, layout.normal))
+
+    def place(moved):
+        m, d = hand.compiled, mujoco.MjData(hand.compiled)
+        hand.couplings.put(d, hand.pose("open") + moved * np.eye(len(hand.joints))[0])
+        mujoco.mj_kinematics(m, d)
+        tip = d.body(hand.tip_bodies[0])
+        return tip.xmat.reshape(3, 3) @ point + tip.xpos, tip.xmat.reshape(3, 3) @ normal
+
+    way = abs((place(1e-4)[0] - place(-1e-4)[0]) @ place(0.0)[1]) / 2e-4
+    assert np.polyfit(torque, force, 1)[0] * way == pytest.approx(1.0, abs=0.06)

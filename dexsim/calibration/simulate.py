@@ -11,7 +11,6 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.hand import Hand
-from dexsim.hand.couplings import Couplings
 from dexsim.hand.skin import tip_skins
 from dexsim.recording import mechanism
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
@@ -259,7 +258,7 @@ def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, fl
     closes. Returns its centre [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
     model = hand.compiled
     data = mujoco.MjData(model)
-    Couplings(model, hand.joints).put(data, hand.pose("open"))
+    hand.couplings.put(data, hand.pose("open"))
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     layout, count = pads_of(hand), pads_of(hand).count[finger]
@@ -268,18 +267,18 @@ def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, fl
     point = layout.point[finger, :count] @ rot.T + body.xpos
     normal = layout.normal[finger, :count] @ rot.T
 
-    def motion(j: int) -> np.ndarray:
-        i = model.joint(hand.joints[j]).id
-        return np.cross(data.xaxis[i], point - data.xanchor[i])
-
-    way = motion(joint) * (hand.closing[joint] or 1.0)
+    jacobian = np.zeros((count, 3, model.nv))
+    for k in range(count):
+        mujoco.mj_jac(model, data, jacobian[k], None, point[k], body.id)
+    moves = hand.couplings.along(jacobian, data.qpos)  # [count, 3, J]: what follows moves along
+    way = moves[:, :, joint] * (hand.closing[joint] or 1.0)
     size = np.linalg.norm(way, axis=1)
     good = (way * normal).sum(1) / size
     if rows := layout.rows[finger]:  # away from both ends of the pad
         row = np.arange(count) % rows
         good = good - 10.0 * ((row < rows // 4) | (row > 2 * rows // 3))
     k = int(good.argmax())
-    arms = {i: float(motion(i)[k] @ normal[k]) for i in hand.fingers[finger].joints}
+    arms = {i: float(moves[k, :, i] @ normal[k]) for i in hand.fingers[finger].joints}
     return point[k] + normal[k] * (RADIUS + GAP), arms
 
 
