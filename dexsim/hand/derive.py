@@ -19,8 +19,8 @@ S = np.array([1.0, -1.0, 1.0])
 
 
 def derived(spec: mujoco.MjSpec, mirror: bool, scale: float) -> mujoco.MjSpec:
-    """The mirror image and/or the scaled version of a hand's model in the palm frame. Raises UserError for height
-    fields, flexible bodies and composites."""
+    """Return the mirror image and/or the scaled version of a hand's model in the palm frame. Raises UserError for
+    height fields, flexible bodies and composites."""
     if list(spec.hfields) or list(spec.flexes) or list(spec.skins):
         raise UserError("hand_mirror, hand_scale: not for models with height fields, flexes or skins; take them out")
     out = spec.copy()

@@ -71,22 +71,22 @@ class Hand:
     _spec: mujoco.MjSpec = field(repr=False)
 
     def spec(self) -> mujoco.MjSpec:
-        """A fresh model of the hand alone: world frame = palm frame, no actuators, sensors or lights."""
+        """Return a fresh model of the hand alone: world frame = palm frame, no actuators, sensors or lights."""
         return self._spec.copy()
 
     @cached_property
     def compiled(self) -> mujoco.MjModel:
-        """The compiled model of the hand alone, shared: not to be changed."""
+        """Return the compiled model of the hand alone, shared: not to be changed."""
         return self._spec.copy().compile()
 
     @cached_property
     def couplings(self) -> Couplings:
-        """How joints without a drive of their own follow those that have one, of `compiled`."""
+        """Return how joints without a drive of their own follow those that have one, of `compiled`."""
         return Couplings(self.compiled, self.joints, f"hand {self.folder}")
 
     @property
     def sensed(self) -> tuple[str, ...]:
-        """Joints without a drive that are measured: those of `sensed` in hand.yaml."""
+        """Return joints without a drive that are measured: those of `sensed` in hand.yaml."""
         return tuple(self.file.sensed)
 
     @property
@@ -95,13 +95,13 @@ class Hand:
 
     @property
     def handedness(self) -> str:
-        """right, left or none, mirrored where the hand is."""
+        """Return right, left or none, mirrored where the hand is."""
         other = {"right": "left", "left": "right"}
         return other.get(self.file.handedness, "none") if self.mirror else self.file.handedness
 
     @property
     def robot(self) -> str:
-        """What recordings and bundles call it: name and handedness."""
+        """Return what recordings and bundles call it: name and handedness."""
         scaled = "" if self.scale == 1.0 else f"_x{self.scale:g}"
         side = "" if self.handedness == "none" else f"_{self.handedness}"
         return f"{self.name}{side}{scaled}"
@@ -120,12 +120,12 @@ class Hand:
 
     @property
     def tip_geoms(self) -> tuple[str, ...]:
-        """Of all fingers, finger by finger."""
+        """Return names of the fingertips' geoms, finger by finger."""
         return tuple(g for f in self.fingers for g in f.geoms)
 
     @property
     def touches(self) -> bool:
-        """Whether its fingertips carry touch pads."""
+        """Return whether its fingertips carry touch pads."""
         return self.fingers[0].pad is not None
 
     @property
@@ -154,7 +154,7 @@ class Hand:
 
     @property
     def closing(self) -> np.ndarray:
-        """+1 or -1 of each flexion joint, 0 of every other [J]."""
+        """Return +1 or -1 of each flexion joint, 0 of every other [J]."""
         out = np.zeros(len(self.joints))
         for f in self.fingers:
             out[list(f.flexion)] = f.closes
@@ -166,7 +166,7 @@ class Hand:
 
     @property
     def identity(self) -> dict[str, object]:
-        """What `load_hand` needs to make it again."""
+        """Return what `load_hand` needs to make it again."""
         return {
             "hand": self.name if self.comes_along else str(self.folder),
             "hand_mirror": self.mirror,
@@ -175,7 +175,7 @@ class Hand:
 
     @property
     def comes_along(self) -> bool:
-        """Whether it is one of those in dexsim itself."""
+        """Return whether it is one of those in dexsim itself."""
         return self.folder == Path(__file__).parents[1] / "assets" / self.name
 
     def pose(self, which: str) -> np.ndarray:

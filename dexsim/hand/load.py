@@ -29,7 +29,8 @@ SCALES = (0.2, 5.0)
 
 
 def load_hand(which: str | Path = "xhand", mirror: bool = False, scale: float = 1.0) -> Hand:
-    """The hand of a folder (or of the hand.yaml in it), or by name one that comes with dexsim or lies in `hands/` here.
+    """Return the hand of a folder (or of the hand.yaml in it), or by name one that comes with dexsim or lies in
+    `hands/` here.
 
     mirror: its mirror image (a right hand becomes a left one); scale: all lengths times this, masses times its cube,
     motors unchanged. Raises UserError, one line: file, field, value, what must be there.
@@ -167,7 +168,7 @@ def _twice(names: list[str]) -> str | None:
 
 
 def _names(file: HandFile, where: str) -> None:
-    """What can be told without the model."""
+    """Return what can be told without the model."""
     joints, fingers = [j.name for j in file.joints], [f.name for f in file.fingers]
     for key, names in (
         ("joints", joints),

@@ -24,7 +24,7 @@ ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, list[tuple[str, ...]]]:
-    """The model in the palm frame, and the names of each fingertip's geoms. Raises UserError."""
+    """Return the model in the palm frame, and the names of each fingertip's geoms. Raises UserError."""
     at = path.parent / file.model
     spec = model_file.read(at, f"{where}: model ({file.model})")
     _alone(spec, f"{where}: model ({file.model})")

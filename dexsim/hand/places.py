@@ -70,8 +70,8 @@ def fingertips(hand: Hand, angles: np.ndarray) -> np.ndarray:
 
 
 def approach(hand: Hand) -> np.ndarray:
-    """Which way each joint turns to bring its finger's tip nearer to the fingers it presses against, at the open pose:
-    +1, -1, or 0 where it hardly matters [J]. Flexion joints as `hand.closing` says."""
+    """Return which way each joint turns to bring its finger's tip nearer to the fingers it presses against, at the open
+    pose: +1, -1, or 0 where it hardly matters [J]. Flexion joints as `hand.closing` says."""
     start, step = hand.pose("open"), 1e-3
     out = hand.closing.copy()
     for k, finger in enumerate(hand.fingers):

@@ -134,7 +134,8 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read(path: Path) -> HandFile:
-    """The file's content, its types checked. Raises UserError naming file, field, value and what must be there."""
+    """Return the file's content, its types checked. Raises UserError naming file, field, value and what must be
+    there."""
     raw = yaml_text.load(path, "hand")
     if not isinstance(raw, dict) or raw.get("format") != FORMAT:
         raise UserError(f"hand {path}: format: must be {FORMAT} in its first line; {SEE}")
@@ -142,7 +143,7 @@ def read(path: Path) -> HandFile:
 
 
 def to_yaml(file: HandFile) -> str:
-    """The file's text, fields in their order; what is at its default and optional is left out."""
+    """Return the file's text, fields in their order; what is at its default and optional is left out."""
     data = msgspec.to_builtins(file)
     for joint in data["joints"]:
         if joint["armature"] is None:

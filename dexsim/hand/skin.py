@@ -38,7 +38,7 @@ def link_skins(hand: Hand) -> list[tuple[str, np.ndarray]]:
 
 
 def tip_skins(hand: Hand) -> list[np.ndarray]:
-    """`tip_skin` of every finger."""
+    """Return `tip_skin` of every finger."""
     return [tip_skin(hand, f) for f in hand.fingers]
 
 
@@ -62,7 +62,7 @@ def obj_vertices(path: Path) -> np.ndarray:
 
 
 def geom_points(hand: Hand, geoms: tuple[str, ...]) -> np.ndarray:
-    """Points [V, 3] m of the surfaces of collision geoms, in the frame of their body."""
+    """Return points [V, 3] m of the surfaces of collision geoms, in the frame of their body."""
     model = hand.compiled
     ball = _sphere()
     out = []
@@ -94,7 +94,7 @@ def geom_points(hand: Hand, geoms: tuple[str, ...]) -> np.ndarray:
 
 
 def _sphere(around: int = 32, levels: int = 17) -> np.ndarray:
-    """Points [P, 3] on the unit sphere, both poles among them."""
+    """Return points [P, 3] on the unit sphere, both poles among them."""
     a = np.linspace(0, 2 * np.pi, around, endpoint=False)
     rings = [
         np.stack([np.cos(p) * np.cos(a), np.cos(p) * np.sin(a), np.full_like(a, np.sin(p))], 1)

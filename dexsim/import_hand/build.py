@@ -35,7 +35,7 @@ class Model:
     tip_geoms: list[str] = field(default_factory=list)
 
     def compile(self) -> mujoco.MjModel:
-        """The model, without files."""
+        """Return the model, without files."""
         return mujoco.MjModel.from_xml_string(self.xml, {f"meshes/{n}": t.encode() for n, t in self.meshes.items()})
 
     def write(self, folder: Path, name: str = "model.xml") -> None:

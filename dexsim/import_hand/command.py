@@ -62,7 +62,7 @@ PLACES = ("palm.", "poses.", "fingers.", "joints.", "places.", "opposing", "hand
 
 
 def main(argv: Sequence[str]) -> int:
-    """Returns the exit status. Raises UserError."""
+    """Run the command; return the exit status. Raises UserError."""
     if not argv or argv[0] in ("-h", "--help", "help") or "--help" in argv:
         print(USAGE, end="")
         return 0 if argv else 2
@@ -98,7 +98,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def arguments(argv: Sequence[str]) -> tuple[str, dict[str, str], dict[str, Any]]:
-    """The model's file, settings, and places of hand.yaml with their values."""
+    """Return the model's file, settings, and places of hand.yaml with their values."""
     models, given, said = [], {}, {}
     for text in argv:
         key, equals, value = text.partition("=")
@@ -121,7 +121,7 @@ def arguments(argv: Sequence[str]) -> tuple[str, dict[str, str], dict[str, Any]]
 
 
 def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
-    """The settings as `dexsim.import_hand.importing.Settings`."""
+    """Return the settings as `dexsim.import_hand.importing.Settings`."""
     from dexsim.import_hand.importing import Settings
 
     options = (

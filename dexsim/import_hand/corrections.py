@@ -28,14 +28,14 @@ class Corrections:
     used: set[str] = field(default_factory=set)
 
     def pick(self, place: str, guess: Any) -> Any:
-        """A person's value of a place, or the guess."""
+        """Return a person's value of a place, or the guess."""
         if place in self.values:
             self.used.add(place)
             return self.values[place]
         return guess
 
     def has(self, place: str) -> bool:
-        """Whether a person has said it."""
+        """Return whether a person has said it."""
         return place in self.values
 
 
@@ -56,8 +56,8 @@ def flat(data: Any, place: str = "") -> dict[str, Any]:
 
 
 def read(now: dict[str, Any], written: dict[str, Any], said: Iterable[str] = ()) -> Corrections:
-    """now: the file's content; written: what the importer wrote there (its content too); said: places that were a
-    person's already then (back in `guessed` they are guesses again)."""
+    """Return what a person corrected. now: the file's content; written: what the importer wrote there (its content
+    too); said: places that were a person's already then (back in `guessed` they are guesses again)."""
     before, here = flat(written), flat(now)
     guessed = set(map(str, now.get("guessed") or []))
     confirmed = (set(map(str, written.get("guessed") or [])) | set(said)) - guessed
@@ -108,7 +108,8 @@ def _laid(node: Any, place: str, value: Any) -> bool:
 
 
 def written(folder: Path) -> dict[str, Any] | None:
-    """What the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no note."""
+    """Return what the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no
+    note."""
     try:
         data = files.mapping(folder / NOTE, "note")
     except UserError:

@@ -50,7 +50,7 @@ class Figures:
 def check(
     source: Source, tree: Tree, motions: list[Motion], effort: float | None = None, speed: float | None = None
 ) -> Figures:
-    """The hand's figures. effort, speed: for every joint whose file says none.
+    """Return the hand's figures. effort, speed: for every joint whose file says none.
 
     Raises UserError for what no hand has: a size that is not in metres, joints without limits, angles in degrees.
     """

@@ -22,8 +22,8 @@ SHOWN = ("check.png", "check.mp4")  # what `check` wrote: it stays until the nex
 
 
 def claim(folder: Path) -> dict[str, Any] | None:
-    """What the importer noted in the folder before; None: it is new or empty. Raises UserError for a folder that holds
-    anything else."""
+    """Return what the importer noted in the folder before; None: it is new or empty. Raises UserError for a folder that
+    holds anything else."""
     note = corrections.written(folder)
     if note is None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(
@@ -34,9 +34,9 @@ def claim(folder: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterator[Path]:
-    """A folder beside `folder`, which it replaces when the block ends. Files of the old one that the importer did not
-    write, or that a person changed since, are carried over and named in `kept` (hand.yaml, whose corrections are kept
-    field by field, excepted). Where the block raises, `folder` stays as it was."""
+    """Yield a folder beside `folder`, which it replaces when the block ends. Files of the old one that the importer did
+    not write, or that a person changed since, are carried over and named in `kept` (hand.yaml, whose corrections are
+    kept field by field, excepted). Where the block raises, `folder` stays as it was."""
     folders.make(folder.parent, "out=")
     stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.writing-", dir=folder.parent))
     os.chmod(stage, 0o755)

@@ -48,12 +48,12 @@ class Palm:
 
 
 def unit(v: np.ndarray) -> np.ndarray:
-    """v [..., 3] at length 1; zero stays."""
+    """Scale v [..., 3] to length 1; zero stays."""
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
 
 def neutral(m: mujoco.MjModel) -> np.ndarray:
-    """Every joint at 0, or at the nearest of its limits [nq]."""
+    """Return every joint at 0, or at the nearest of its limits [nq]."""
     return np.clip(np.zeros(m.nq), m.jnt_range[:, 0], m.jnt_range[:, 1])
 
 
@@ -183,7 +183,7 @@ def _moved(
 
 
 def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: np.ndarray) -> tuple[np.ndarray, float]:
-    """Flexion angles at which the tip is farthest from the finger's first flexion joint, and how far."""
+    """Return flexion angles at which the tip is farthest from the finger's first flexion joint, and how far."""
     d = mujoco.MjData(m)
     q = neutral(m)
     root = flexion[0]
@@ -207,12 +207,12 @@ def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: 
 
 
 def tip_at(d: mujoco.MjData, body: int, position: np.ndarray) -> np.ndarray:
-    """A point of a body in the world."""
+    """Return a point of a body in the world."""
     return d.xmat[body].reshape(3, 3) @ position + d.xpos[body]
 
 
 def stretched(m: mujoco.MjModel, motions: list[Motion]) -> np.ndarray:
-    """Every finger stretched [nq]."""
+    """Return every finger stretched [nq]."""
     q = neutral(m)
     for x in motions:
         q[x.flexion] = x.straight
@@ -220,8 +220,8 @@ def stretched(m: mujoco.MjModel, motions: list[Motion]) -> np.ndarray:
 
 
 def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
-    """Which finger presses against the others: the one called thumb, or the one that points and closes least like them.
-    One that closes against the others' direction joins it."""
+    """Return which finger presses against the others: the one called thumb, or the one that points and closes least
+    like them. One that closes against the others' direction joins it."""
     for k, x in enumerate(motions):
         if x.finger.name == "thumb":
             return [k]
@@ -244,8 +244,8 @@ def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
 
 
 def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]) -> Palm:
-    """The palm's frame: forward along the stretched fingers that do not oppose, the normal along their tips' way as
-    they close, the origin in the middle of the palm's surface points."""
+    """Return the palm's frame: forward along the stretched fingers that do not oppose, the normal along their tips' way
+    as they close, the origin in the middle of the palm's surface points."""
     d = mujoco.MjData(m)
     d.qpos[:] = stretched(m, motions)
     mujoco.mj_kinematics(m, d)
@@ -280,7 +280,7 @@ def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]
 
 
 def body_forward(d: mujoco.MjData, motions: list[Motion]) -> np.ndarray:
-    """Mean direction [3] of the tips' links, from the distal joint out, in the world."""
+    """Return mean direction [3] of the tips' links, from the distal joint out, in the world."""
     out = []
     for x in motions:
         turn = d.xmat[x.finger.tip].reshape(3, 3)
@@ -291,13 +291,13 @@ def body_forward(d: mujoco.MjData, motions: list[Motion]) -> np.ndarray:
 
 
 def _snapped(v: np.ndarray) -> np.ndarray:
-    """The nearest axis of the frame, where it is within SNAP."""
+    """Return the nearest axis of the frame, where it is within SNAP."""
     k = int(np.abs(v).argmax())
     return np.sign(v[k]) * np.eye(3)[k] if abs(v[k]) > SNAP else v
 
 
 def palm_points(m: mujoco.MjModel, body: int, count: int = 4000) -> np.ndarray:
-    """Points on the palm and on what is fixed to it, in its frame."""
+    """Return points on the palm and on what is fixed to it, in its frame."""
     d = mujoco.MjData(m)
     mujoco.mj_kinematics(m, d)
     fixed = [body]
@@ -314,8 +314,8 @@ def palm_points(m: mujoco.MjModel, body: int, count: int = 4000) -> np.ndarray:
 
 
 def handedness(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int], frame: Palm) -> str:
-    """right: seen with the fingers up and the palm towards you, the thumb is on your right; left; or none, where it
-    stands in the middle or there are two fingers."""
+    """Return right, left or none. right: seen with the fingers up and the palm towards you, the thumb is on your right;
+    left; or none, where it stands in the middle or there are two fingers."""
     if len(motions) < 3:
         return "none"
     d = mujoco.MjData(m)

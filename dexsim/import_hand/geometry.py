@@ -26,7 +26,7 @@ def quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def geom_surface(m: mujoco.MjModel, g: int) -> Surface:
-    """A geom's surface in its body's frame; empty for planes, height fields and the like."""
+    """Return a geom's surface in its body's frame; empty for planes, height fields and the like."""
     import trimesh
 
     kind, size, t = m.geom_type[g], m.geom_size[g], mujoco.mjtGeom
@@ -91,7 +91,7 @@ def _geoms(m: mujoco.MjModel, body: int) -> list[int]:
 
 
 def points_on(surface: Surface, count: int, seed: int = 0) -> np.ndarray:
-    """Points [count, 3] spread over a surface, by area."""
+    """Return points [count, 3] spread over a surface, by area."""
     vertices, faces = surface
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -101,8 +101,8 @@ def points_on(surface: Surface, count: int, seed: int = 0) -> np.ndarray:
 
 
 def first_hits(surface: Surface, origins: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where parallel rays first meet a surface: distances [R] (inf: never) and the unit normals there [R, 3], turned
-    against the rays.
+    """Return where parallel rays first meet a surface: distances [R] (inf: never) and the unit normals there [R, 3],
+    turned against the rays.
 
     Moeller and Trumbore (1997), Fast, minimum storage ray/triangle intersection; both sides of a triangle count.
     """
@@ -135,7 +135,7 @@ def first_hits(surface: Surface, origins: np.ndarray, direction: np.ndarray) -> 
 
 
 def open_edges(surface: Surface) -> int:
-    """How many edges of a surface border a hole (0: it is closed). Corners at one place count as one."""
+    """Return how many edges of a surface border a hole (0: it is closed). Corners at one place count as one."""
     vertices, faces = surface
     _, same = np.unique(np.round(vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
     merged = same.ravel()[faces]

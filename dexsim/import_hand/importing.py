@@ -231,7 +231,7 @@ def _driven(m: mujoco.MjModel, found: tree.Tree, pulls: Sequence[Pull]) -> list[
 def _corrections(
     out: Path, note: dict[str, Any] | None, found: tree.Tree, m: mujoco.MjModel, settings: Settings, theirs: list[str]
 ) -> Corrections:
-    """What a person said: in the hand.yaml that is there, and in the command."""
+    """Return what a person said: in the hand.yaml that is there, and in the command."""
     fixes = Corrections()
     file = out / folder.HAND
     if note is not None and file.is_file():
@@ -436,7 +436,7 @@ def _hand(
     palm: frame.Palm, known: figures.Figures, order: list[str], open_: dict[str, float], closed: dict[str, float],
     search: poses.Search, pads: dict[str, taxels.Pad], pulls: list[Pull], fixes: Corrections, pick: Callable[..., Any],
 ) -> dict[str, Any]:  # fmt: skip
-    """Content of hand.yaml."""
+    """Return content of hand.yaml."""
 
     def number(place: str, guess: float, missing: list[str], joint: str) -> float:
         return float(pick(place, float(f"{guess:.4g}"), sure=joint not in missing))
@@ -501,7 +501,7 @@ def _list(v: np.ndarray) -> list[float]:
 
 
 def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
-    """A servo table: what the file says of its drives, the rest from efforts and speeds."""
+    """Return a servo table: what the file says of its drives, the rest from efforts and speeds."""
     m, said = robot.model, robot.drives
     friction = {m.joint(j).name: float(m.dof_frictionloss[m.jnt_dofadr[j]]) for j in range(m.njnt)}
     joints, guessed = {}, {"kp": 0, "kd": 0, "coulomb_friction": 0}
@@ -537,13 +537,13 @@ def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
 
 
 def _word(text: str) -> str:
-    """A hand's name: letters, digits, _ and -."""
+    """Return a hand's name: letters, digits, _ and -."""
     out = "".join(c if c.isalnum() and c.isascii() or c in "_-" else "_" for c in str(text)).strip("_-")[:48]
     return out or "hand"
 
 
 def _axis(v: np.ndarray) -> str:
-    """A direction in words: +x, or its three numbers."""
+    """Return a direction in words: +x, or its three numbers."""
     k = int(np.abs(v).argmax())
     return f"{'-' if v[k] < 0 else '+'}{'xyz'[k]}" if abs(v[k]) > 0.999 else f"({v[0]:.2f} {v[1]:.2f} {v[2]:.2f})"
 

@@ -43,7 +43,7 @@ class Move:
 
 
 def moves(hand: Hand) -> list[Move]:
-    """Every joint's move."""
+    """Return every joint's move."""
     model = hand.spec().compile()
     data = mujoco.MjData(model)
     start = hand.pose("open")
@@ -99,7 +99,8 @@ def moves(hand: Hand) -> list[Move]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Returns the exit status: 1 where a joint that should close its finger opens it. Raises UserError."""
+    """Run the command; return the exit status: 1 where a joint that should close its finger opens it. Raises
+    UserError."""
     if not argv or any(a in ("-h", "--help", "help") for a in argv):
         print(USAGE, end="")
         return 0 if argv else 2
@@ -156,7 +157,7 @@ def _opens(m: Move) -> bool:
 
 
 def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
-    """The film and the sheet of pictures; which of them could be made."""
+    """Make the film and the sheet of pictures; return which of them could be made."""
     from dexsim.view import video
 
     model = hand.spec().compile()
@@ -200,7 +201,7 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
 
 
 def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[str, Any], path: Path) -> None:
-    """One row a joint: at its low end, open, at its high end."""
+    """Draw a row a joint: at its low end, open, at its high end."""
     from matplotlib.figure import Figure
 
     from dexsim.view.stills import Shot, render

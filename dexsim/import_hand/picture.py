@@ -31,7 +31,7 @@ def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
 
 
 def posed(model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
-    """The model's data in a pose."""
+    """Return the model's data in a pose."""
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_kinematics(model, data)
@@ -145,7 +145,7 @@ def _frame(axes: Any, shot: Shot, length: float) -> None:
 
 
 def _catch(axes: Any, shot: Shot, hand: Hand) -> None:
-    """A cross on the palm where objects are let fall over it."""
+    """Draw a cross on the palm where objects are let fall over it."""
     at = shot.project(places(hand).catch[None])[0]
     axes.plot(*at, "x", ms=7, mew=1.8, color="#e64bd0")
     axes.text(at[0] + 6, at[1] + 4, "catch", fontsize=7, color="#e64bd0", weight="bold", clip_on=True)

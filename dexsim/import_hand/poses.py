@@ -62,7 +62,7 @@ class Search:
         return (points - origin) @ frame, normals @ frame
 
     def overlaps(self, q: np.ndarray) -> list[tuple[str, str, float]]:
-        """Pairs of bodies that overlap in a pose, and how deep [m]."""
+        """Return pairs of bodies that overlap in a pose, and how deep [m]."""
         d, m = self.data, self.m
         d.qpos[:] = q
         mujoco.mj_kinematics(m, d)
@@ -77,7 +77,8 @@ class Search:
 
 
 def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """The best of some searches from random starts: joint angles [nq] and how well it holds (0 would be perfect).
+    """Return the best of some searches from random starts: joint angles [nq] and how well it holds (0 would be
+    perfect).
 
     Asked of it: every tip on the ball's surface, facing its middle; the opposing fingers' tips across from the others';
     the joints of a finger bent alike; links clear of each other and the ball clear of the palm, near it. The ball's
@@ -159,8 +160,8 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
 
 
 def opened(s: Search, closed: np.ndarray) -> np.ndarray:
-    """The cupped hand with its fingers let go: OPEN of the way from stretched, farther or nearer where links would
-    overlap; bent back where stretched fingertips are nearer to each other than cupped ones, as a claw's are. An
+    """Return the cupped hand with its fingers let go: OPEN of the way from stretched, farther or nearer where links
+    would overlap; bent back where stretched fingertips are nearer to each other than cupped ones, as a claw's are. An
     opposing finger stays turned as it is."""
     bent = [j for k, x in enumerate(s.motions) for j in (x.flexion if k in s.thumbs else x.finger.joints)]
     back = s.rest.copy()
@@ -190,8 +191,8 @@ def gap(s: Search, q: np.ndarray) -> float:
 
 
 def span(s: Search, open_: np.ndarray, closed: np.ndarray) -> float:
-    """How wide a thing [m] the hand can grasp: as wide as the fingers that press against the opposing ones are long
-    (the xHand's reach 98 mm, its span is 100), but no wider than the fingertips come apart from open to cupped.
+    """Return how wide a thing [m] the hand can grasp: as wide as the fingers that press against the opposing ones are
+    long (the xHand's reach 98 mm, its span is 100), but no wider than the fingertips come apart from open to cupped.
 
     The gap of the open pose alone says little: a LEAP opens to twice the width that its fingers reach around.
     """
@@ -204,7 +205,8 @@ def span(s: Search, open_: np.ndarray, closed: np.ndarray) -> float:
 
 
 def near_the_palm(m: mujoco.MjModel, tree: Tree) -> list[tuple[str, str]]:
-    """The palm with the nearer half of each finger's links: they turn in it, and shapes of both overlap there."""
+    """Return the palm with the nearer half of each finger's links: they turn in it, and shapes of both overlap
+    there."""
     out = []
     for finger in tree.fingers:
         moving = list(dict.fromkeys(int(m.jnt_bodyid[j]) for j in finger.joints))
@@ -217,7 +219,7 @@ def near_the_palm(m: mujoco.MjModel, tree: Tree) -> list[tuple[str, str]]:
 
 
 def always_overlapping(s: Search, count: int = 150, seed: int = 1) -> list[tuple[str, str]]:
-    """Pairs of bodies that overlap in most postures: drawn into each other, not in each other's way."""
+    """Return pairs of bodies that overlap in most postures: drawn into each other, not in each other's way."""
     m, rng = s.m, np.random.default_rng(seed)
     times: dict[tuple[str, str], int] = {}
     for _ in range(count):
@@ -227,8 +229,8 @@ def always_overlapping(s: Search, count: int = 150, seed: int = 1) -> list[tuple
 
 
 def meetings(s: Search, count: int = 1500, seed: int = 0) -> tuple[list[tuple[str, str]], int]:
-    """Pairs of bodies that could meet by their bits and never come within each other in random postures, to be left
-    out; and how many pairs are kept. Pairs within a finger do not meet by their bits."""
+    """Return pairs of bodies that could meet by their bits and never come within each other in random postures, to be
+    left out; and how many pairs are kept. Pairs within a finger do not meet by their bits."""
     m, rng = s.m, np.random.default_rng(seed)
     touched: dict[tuple[str, str], int] = {}
     for _ in range(count):

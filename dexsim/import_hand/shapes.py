@@ -44,7 +44,7 @@ class Shapes:
 
 
 def make(m: mujoco.MjModel, tree: Tree, motions: list[Motion], palm: Palm) -> Shapes:
-    """The shapes of a hand."""
+    """Return the shapes of a hand."""
     out = Shapes()
     off = []
     tips = {x.finger.tip: x for x in motions}
@@ -74,7 +74,7 @@ def make(m: mujoco.MjModel, tree: Tree, motions: list[Motion], palm: Palm) -> Sh
 
 
 def _chain(m: mujoco.MjModel, palm: int, tip: int) -> list[int]:
-    """Bodies of a finger below the palm down to the tip, with what is fixed to them."""
+    """Return bodies of a finger below the palm down to the tip, with what is fixed to them."""
     out, b = [], tip
     while b != palm:
         out.append(b)
@@ -102,8 +102,8 @@ def distance(points: np.ndarray, capsules: list[tuple[np.ndarray, np.ndarray, fl
 
 
 def fit(points: np.ndarray, most: int = 2) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """One capsule (a, b, radius) along the longest axis of points on a surface, least squares; two side by side where
-    the surface is broad (half as broad again as it is thick) and two lie closer to it."""
+    """Fit one capsule (a, b, radius) along the longest axis of points on a surface, least squares; two side by side
+    where the surface is broad (half as broad again as it is thick) and two lie closer to it."""
     middle = points.mean(0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes.T

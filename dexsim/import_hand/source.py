@@ -51,8 +51,8 @@ def read(
     path: Path, packages: Sequence[Path] = (), coupled: str = "keep", density: float | None = None,
     inertia: str | None = None,
 ) -> Source:  # fmt: skip
-    """The robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "keep" what ties joints, or
-    "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia. inertia:
+    """Return the robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "keep" what ties
+    joints, or "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia. inertia:
     "shapes" takes one that is none from the link's shapes; else it is balanced, and stands in `Source.mended`.
 
     Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints inside it,
@@ -262,7 +262,7 @@ def _shaped(body: Any) -> bool:
 
 
 def _hinges(body: Any) -> int:
-    """Hinges and slides on a body and below it."""
+    """Return hinges and slides on a body and below it."""
     return sum(j.type in ONE_DOF for j in body.joints) + sum(_hinges(b) for b in body.bodies)
 
 

@@ -34,7 +34,7 @@ class Pad:
     note: str = ""
 
     def csv(self) -> str:
-        """The table's text: k,x,y,z,nx,ny,nz,tx,ty,tz,area."""
+        """Return the table's text: k,x,y,z,nx,ny,nz,tx,ty,tz,area."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow("k x y z nx ny nz tx ty tz area".split())
@@ -53,7 +53,7 @@ def paint(
     size: tuple[int, int],
     holes: str = "hull",
 ) -> Pad:
-    """A grid of size (rows, columns) on the side of `surface` that `normal` looks out of.
+    """Lay a grid of size (rows, columns) on the side of `surface` that `normal` looks out of.
 
     surface: the tip's, tip body's frame; position [3] m: the middle of the pad, about; along [3]: from the joint to
     the tip: rows run that way. The grid covers three quarters of the tip's width and of its length beyond the middle,
@@ -119,8 +119,8 @@ def _smooth(normals: np.ndarray, rows: int, columns: int) -> np.ndarray:
 
 
 def read(path: Path) -> dict[str, Pad]:
-    """A person's taxels: columns finger, x, y, z [m], nx, ny, nz in the tip body's frame, and area [m2] where it is
-    known. Raises UserError, with the line."""
+    """Return a person's taxels: columns finger, x, y, z [m], nx, ny, nz in the tip body's frame, and area [m2] where it
+    is known. Raises UserError, with the line."""
     rows = list(csv.DictReader(io.StringIO(files.text(path, "taxels"))))
     need = ("finger", "x", "y", "z", "nx", "ny", "nz")
     missing = [c for c in need if not rows or c not in rows[0]]

@@ -24,7 +24,7 @@ ABOUT = {
 
 
 def yaml_text(hand: dict[str, Any], guessed: list[str]) -> str:
-    """hand: plain data as `dexsim.hand.schema.HandFile` has it."""
+    """Write a hand as YAML. hand: plain data as `dexsim.hand.schema.HandFile` has it."""
     out = [HEAD.format(name=hand["name"])]
     for key, value in hand.items():
         if key in ABOUT:

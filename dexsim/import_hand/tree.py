@@ -44,18 +44,19 @@ class Tree:
 
     @property
     def every(self) -> list[int]:
-        """Ids of the hand's joints: finger by finger, root to tip, a shared one with the first finger that has it."""
+        """Return ids of the hand's joints: finger by finger, root to tip, a shared one with the first finger that has
+        it."""
         return list(dict.fromkeys(j for f in self.fingers for j in f.joints))
 
     @property
     def joints(self) -> list[int]:
-        """Of these, the ones that have a drive of their own."""
+        """Return ids of the joints that have a drive of their own."""
         return [j for j in self.every if j not in self.passive]
 
 
 def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:
-    """Fingers are the chains that end in a moving body with nothing that moves behind it; the palm is the last body
-    that all of them share.
+    """Find palm and fingers: fingers are the chains that end in a moving body with nothing that moves behind it; the
+    palm is the last body that all of them share.
 
     palm: name of the body to take for it. Raises UserError where this is no hand: fewer than two fingers, a tip
     without a surface.
@@ -93,7 +94,7 @@ def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:
 
 
 def _path(m: mujoco.MjModel, body: int) -> list[int]:
-    """Bodies from the world to this one."""
+    """Return bodies from the world to this one."""
     out = [body]
     while out[-1]:
         out.append(int(m.body_parentid[out[-1]]))
@@ -105,8 +106,8 @@ def _names(m: mujoco.MjModel) -> list[str]:
 
 
 def _tip(m: mujoco.MjModel, end: int) -> int:
-    """The body that carries the fingertip's surface: the distal moving body, or one fixed to it that reaches farther
-    (a rubber tip on a link of its own)."""
+    """Return the body that carries the fingertip's surface: the distal moving body, or one fixed to it that reaches
+    farther (a rubber tip on a link of its own)."""
     fixed = [end]
     for b in range(end + 1, m.nbody):
         if m.body_parentid[b] in fixed and not m.body_jntnum[b]:
@@ -125,7 +126,7 @@ def _tip(m: mujoco.MjModel, end: int) -> int:
 
 
 def _tip_geoms(m: mujoco.MjModel, tip: int) -> list[int]:
-    """The tip's own surface: geoms called tip or pad, else all of the body's."""
+    """Return the tip's own surface: geoms called tip or pad, else all of the body's."""
     geoms = geometry.solid(m, tip)
 
     def named(g: int) -> str:

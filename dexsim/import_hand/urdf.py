@@ -28,7 +28,7 @@ class Urdf:
 
 
 def is_urdf(path: Path) -> bool:
-    """Whether a model file's root element is `robot`. Raises UserError for one that is neither URDF nor MJCF."""
+    """Return whether a model file's root element is `robot`. Raises UserError for one that is neither URDF nor MJCF."""
     return _root(path).tag == "robot"
 
 
@@ -56,7 +56,7 @@ def _root(path: Path) -> ET.Element:
 
 
 def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
-    """The URDF at `path`. packages: folders in which package://NAME/ is looked for, beside those above the file;
+    """Return the URDF at `path`. packages: folders in which package://NAME/ is looked for, beside those above the file;
     scratch: where meshes go that MuJoCo does not read. Raises UserError for missing meshes, and for masses, limits,
     efforts and speeds that are none."""
     root = _root(path)
@@ -125,7 +125,7 @@ def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
 
 
 def _find(path: Path, name: str, packages: Sequence[Path]) -> Path:
-    """The mesh file that a URDF names: package://, file://, relative to the file."""
+    """Find the mesh file that a URDF names: package://, file://, relative to the file."""
     if not name:
         raise UserError(f"model {path}: a <mesh> without filename=")
     plain = name.removeprefix("file://")
@@ -153,7 +153,7 @@ def _ascii_stl(path: Path) -> bool:
 
 
 def _convert(path: Path, to: Path) -> Path:
-    """A mesh file that MuJoCo does not read, as OBJ."""
+    """Write a mesh file that MuJoCo does not read as OBJ; return it."""
     import trimesh
 
     try:
@@ -181,7 +181,7 @@ def _collada_unit(path: Path) -> float:
 
 
 def _number(what: str, text: str | None, allowed: str = "a finite number", low: float = -math.inf) -> float:
-    """A finite number, not below low; 0 where there is none. what: the file, the element and "<tag key="."""
+    """Return a finite number, not below low; 0 where there is none. what: the file, the element and "<tag key="."""
     try:
         value = float(text or 0.0)
     except ValueError:

@@ -133,14 +133,14 @@ class ByPad:
 
     @property
     def longest(self) -> float:
-        """s, the longest delay of a pad."""
+        """Return the longest delay of a pad [s]."""
         j = COLUMNS.index("delay")
         return float((self._low + self._wide)[j].max())
 
     def randomize(
         self, mask: torch.Tensor, generator: torch.Generator | None, episode: wp.array, gain: wp.array
     ) -> None:
-        """Where mask [N] (bool) holds: draw the pads' parameters anew, and lay the gains over `gain` [N, F, T], which
+        """Draw the pads' parameters anew where mask [N] (bool) holds, and lay the gains over `gain` [N, F, T], which
         was drawn before."""
         n, f, _ = self.shape
         u = torch.rand((len(COLUMNS), n, f), generator=generator, device=self.values.device)
@@ -153,8 +153,8 @@ class ByPad:
         wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
 
     def launch_skin(self, touch: Tactile, felt: wp.array) -> wp.array:
-        """[N, F, T] N: felt forces as they reach each taxel's wire; `felt` itself where nothing lies between. touch:
-        `Tactile`."""
+        """Return felt forces [N, F, T] N as they reach each taxel's wire; `felt` itself where nothing lies between.
+        touch: `Tactile`."""
         m, n, f = self._m, self.shape[0], self.shape[1]
         if self.rubber:
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
@@ -191,8 +191,8 @@ class ByPad:
             wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
 
     def launch_choice(self, touch: Tactile) -> tuple[wp.array, wp.array, wp.array]:
-        """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have
-        delays."""
+        """Return (ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads
+        have delays."""
         m, own = touch.imperfect, self._m
         if not self.delayed:
             return m.ring, m.ring_shear, m.chosen

@@ -53,12 +53,12 @@ class TactileConfig:
         return self.params.get(name, (COLUMNS[name][3],) * 2)
 
     def used(self, name: str) -> bool:
-        """Whether an effect can be present at all: code for absent ones is not compiled."""
+        """Return whether an effect can be present at all: code for absent ones is not compiled."""
         return self.range(name) != (COLUMNS[name][3],) * 2
 
     @property
     def measured(self) -> bool:
-        """Whether what the sensor reports differs from the clean forces."""
+        """Return whether what the sensor reports differs from the clean forces."""
         effects = ("threshold", "noise", "lsb", "delay", "hysteresis", "gain_spread", "dead")
         return self.shear or self.feel_others or bool(self.pads) or any(self.used(n) for n in effects)
 

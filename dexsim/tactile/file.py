@@ -43,7 +43,7 @@ File = msgspec.defstruct("File", _parts, forbid_unknown_fields=True)
 
 
 def load(path: str | Path, hand: Hand | None = None) -> dict[str, dict[str, Any]]:
-    """The file as {"tactile": settings, "randomize": {name: [low, high]}}, checked for a hand's fingertips (the
+    """Return the file as {"tactile": settings, "randomize": {name: [low, high]}}, checked for a hand's fingertips (the
     xHand's).
 
     Raises UserError in one line naming the file, the field, its value and what is allowed."""

@@ -80,10 +80,9 @@ class TaxelLayout:
         return centre, radius
 
     def lifted(self, tips: Sequence[np.ndarray], limit: float = 1e-3) -> TaxelLayout:
-        """The taxels moved along their normals onto the convex hulls of `tips` ([V, 3] m each, body frames), the
+        """Return the taxels moved along their normals onto the convex hulls of `tips` ([V, 3] m each, body frames), the
         surfaces that the physics presses, so that a taxel is in an object where that surface is. Fails if one would
-        move farther than `limit` [m]: the tip then does not follow the pad. Pads beyond the tips stay.
-        """
+        move farther than `limit` [m]: the tip then does not follow the pad. Pads beyond the tips stay."""
         point = self.point.copy()
         for f, tip in enumerate(tips):
             n = self.count[f]
@@ -183,7 +182,7 @@ def neighbours(columns: int, rows: int) -> list[list[int]]:
 def tangents(
     normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The sensor's x and y directions projected on each taxel's tangent plane, unit length, [n, 3] each.
+    """Return the sensor's x and y directions projected on each taxel's tangent plane, unit length, [n, 3] each.
 
     Where a direction (nearly) is the normal, its projection is replaced by the one that is at right angles to the
     other's.
@@ -203,7 +202,7 @@ def tangents(
 
 
 def load_layout(path: str | Path, body: str, name: str | None = None, kind: str | None = None) -> dict:
-    """One pad from a CSV file: a header naming the columns, one taxel a row in index order.
+    """Return one pad from a CSV file: a header naming the columns, one taxel a row in index order.
 
     Columns: x, y, z [m]; nx, ny, nz; optional tx, ty, tz (the direction `TaxelLayout.tx`) and area [m^2]; others are
     ignored. Lines that begin with # are comments. Returns a dict for `TaxelLayout.build`.
@@ -249,9 +248,9 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
 
 
 def hand_layout(hand: Hand) -> TaxelLayout | None:
-    """The taxels of a hand's pads, pad f on finger f, then its skin's; None where it has none. Mirrored and scaled as
-    the hand is: a mirrored pad keeps its y axis, its x axis turns round, so that taxel frames stay right-handed. Raises
-    UserError."""
+    """Return the taxels of a hand's pads, pad f on finger f, then its skin's; None where it has none. Mirrored and
+    scaled as the hand is: a mirrored pad keeps its y axis, its x axis turns round, so that taxel frames stay
+    right-handed. Raises UserError."""
     if not hand.touches:
         return None
     pads = []
@@ -281,7 +280,8 @@ def touch_shape(hand: Hand) -> tuple[int, int]:
 
 
 def tip_layout(hand: Hand) -> TaxelLayout:
-    """One point a fingertip, its end, as if it were a pad: for what a reward must know of a hand without touch."""
+    """Return one point a fingertip, its end, as if it were a pad: for what a reward must know of a hand without
+    touch."""
     return TaxelLayout.build([
         {"name": f.name, "body": f.body, "kind": "finger", "point": [f.position], "normal": [f.normal]}
         for f in hand.fingers

@@ -100,8 +100,8 @@ class PadConfig:
 
 
 def pad_configs(value: Mapping[str, Any]) -> dict[str, PadConfig]:
-    """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is
-    allowed."""
+    """Check `tactile.pads`; return a PadConfig by name of pad. Raises UserError naming the setting, its value and what
+    is allowed."""
     typed.convert({"tactile": {"pads": _plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")
     return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
 
@@ -114,7 +114,7 @@ def _plain(node: object) -> object:
 
 
 def _pad(where: str, entry: Mapping) -> PadConfig:
-    """entry: checked against `Pad`."""
+    """Check an entry against `Pad`."""
     entry = {k: v for k, v in entry.items() if v is not None}
     params = {
         k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in PAD_COLUMNS if k in entry
@@ -139,7 +139,7 @@ def _pad(where: str, entry: Mapping) -> PadConfig:
 
 
 def value_range(where: str, value: object, unit: str, low: float, high: float) -> Range:
-    """The range (low, high) of a number, [low, high] or {value, low, high}; UserError starting with `where`."""
+    """Return the range (low, high) of a number, [low, high] or {value, low, high}; UserError starting with `where`."""
     allowed = f"allowed: {low:g} to {high:g}{'' if unit == '1' else ' ' + unit}"
     if isinstance(value, Mapping):
         if set(value) - {"value", "low", "high"} or "value" not in value:
@@ -163,13 +163,13 @@ def value_range(where: str, value: object, unit: str, low: float, high: float) -
 
 
 def _number(x: object) -> float | None:
-    """x as a finite float, None where it is none (YAML reads 1e-3 as text: that is accepted)."""
+    """Return x as a finite float, None where it is none (YAML reads 1e-3 as text: that is accepted)."""
     number = typed.real(x)
     return number if math.isfinite(number) else None
 
 
 def _index(where: str, k: object) -> int:
-    """A taxel's number; keys of a checkpoint's config are text."""
+    """Return a taxel's number; keys of a checkpoint's config are text."""
     number = _number(k)
     if number is None or number != int(number) or number < 0:
         raise UserError(f"{where}: '{k}' is no taxel; taxels are counted from 0")

@@ -40,8 +40,8 @@ class Skin:
 def skin_of(
     layout: TaxelLayout, pad: int, columns: int, rows: int, tip: np.ndarray | None = None, fine: int = 6
 ) -> Skin:
-    """The pad's skin, interpolated bicubically between its lattice of columns x rows taxels, `fine` times finer; moved
-    along its normals onto the convex hull of `tip` [V, 3] (body frame) where given: what the physics presses."""
+    """Return the pad's skin, interpolated bicubically between its lattice of columns x rows taxels, `fine` times finer;
+    moved along its normals onto the convex hull of `tip` [V, 3] (body frame) where given: what the physics presses."""
     from scipy.interpolate import RectBivariateSpline
 
     p = layout.point[pad, : layout.count[pad]].reshape(columns, rows, 3)
@@ -110,7 +110,7 @@ def presses(
     count: int,
     tilt: float = np.radians(10.0),
 ) -> Iterator[Press]:
-    """`count` random presses of a shape (of `dexsim.assets.objects`) at each of the depths.
+    """Return `count` random presses of a shape (of `dexsim.assets.objects`) at each of the depths.
 
     A point of the object's surface, by area, meets a point of the skin, by area, with normals opposed up to `tilt`
     [rad] and any spin; the object then moves along the skin's normal until the skin's deepest point is at each depth.
@@ -156,7 +156,7 @@ def _chord(p: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _onto(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A rotation that takes unit vector a to b, with random spin about b."""
+    """Return a rotation that takes unit vector a to b, with random spin about b."""
 
     def frame(z: np.ndarray, x: np.ndarray) -> np.ndarray:
         x = x - (x @ z) * z

@@ -115,8 +115,8 @@ def taxel_force(
 
 
 def spread(force: float, d: np.ndarray, area: np.ndarray, reach: float) -> np.ndarray:
-    """The solver's force over taxels at distances d: by area times squared depth under the level
-    max(min d + reach, 0)."""
+    """Share the solver's force among taxels at distances d: by area times squared depth under the level max(min d +
+    reach, 0)."""
     w = area * np.maximum(np.maximum(d.min() + reach, 0.0) - d, 0.0) ** 2
     return force * w / w.sum()
 

@@ -45,8 +45,8 @@ class Sensors:
 
     @cached_property
     def lifted(self) -> TaxelLayout:
-        """The taxels on the surfaces that the physics presses; where they are where a tip does not follow its pad, as
-        with `tactile.lift=false`. Only with touch."""
+        """Return the taxels on the surfaces that the physics presses; where they are where a tip does not follow its
+        pad, as with `tactile.lift=false`. Only with touch."""
         try:
             return self._pads.lifted(tip_skins(self.hand))
         except UserError:
@@ -66,7 +66,7 @@ class Sensors:
         return _gabriel(self._pads.point[pad, : self._pads.count[pad]])
 
     def mixing(self, pad: int) -> np.ndarray:
-        """[K, K]: a taxel's force shared equally by the taxels beside it (rows: who feels it)."""
+        """Return the shares [K, K] of a taxel's force shared equally by the taxels beside it (rows: who feels it)."""
         beside = self.beside(pad)
         out = np.zeros((len(beside), len(beside)))
         for k, others in enumerate(beside):
@@ -74,7 +74,7 @@ class Sensors:
         return out
 
     def middle(self, pad: int) -> int:
-        """The taxel in a pad's middle."""
+        """Return the taxel in a pad's middle."""
         lattice = self.lattice(pad)
         if lattice is not None:
             columns, rows = lattice
@@ -83,7 +83,7 @@ class Sensors:
         return int(np.argmin(np.linalg.norm(p - self._pads.centre()[pad], axis=1)))
 
     def skin(self, pad: int, fine: int) -> Skin:
-        """A pad's surface, `fine` times finer than its lattice; its lifted taxels where there is none."""
+        """Return a pad's surface, `fine` times finer than its lattice; its lifted taxels where there is none."""
         lattice = self.lattice(pad)
         if lattice is not None and min(lattice) >= 4:  # as many as the bicubic surface needs
             return skin_of(self._pads, pad, *lattice, self.tips[pad], fine=fine)

@@ -82,8 +82,8 @@ KEPT = 2
 
 
 def _laid_out(shapes: list[Felt], device: str) -> _LaidOut:
-    """By the identity of each grid (variants of one shape share it) where its cells begin, the grid and what bounds its
-    surface; the number of cells; all of them on the device, not to be written to."""
+    """Lay out, by the identity of each grid (variants of one shape share it) where its cells begin, the grid and what
+    bounds its surface; the number of cells; all of them on the device, not to be written to."""
     key = (device, *(id(s.grid) for s in shapes))
     if key in _kept:
         return _kept[key][1]
@@ -120,7 +120,7 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     # it.
 
     def block(first: np.ndarray, size: int, last: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Of the planes `near`, those that can be highest in the block of `size` samples from `first` on."""
+        """Return those of the planes `near` that can be highest in the block of `size` samples from `first` on."""
         value = near[:, :3] @ (low + spacing * (first + last - 1) / 2) + near[:, 3]
         return near[value >= value.max() - np.sqrt(3.0) * size * spacing]
 
@@ -169,7 +169,7 @@ def _checked(shape: Felt) -> Grid:
 
 
 def _cells(d: np.ndarray) -> np.ndarray:
-    """The corners of each cell [2 C, 4], as `dexsim.tactile.sdf.Shapes.data` has them."""
+    """Return the corners of each cell [2 C, 4], as `dexsim.tactile.sdf.Shapes.data` has them."""
     n = tuple(k - 1 for k in d.shape)
     out = np.empty((*n, 2, 2, 2), dtype=np.float32)
     for x, y, z in np.ndindex(2, 2, 2):

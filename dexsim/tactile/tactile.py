@@ -241,7 +241,7 @@ class Tactile:
         return self.params[:, self.columns.index(name)]
 
     def randomize(self, mask: torch.Tensor, generator: torch.Generator | None = None) -> None:
-        """Where mask [N] (bool) holds: draw the per-world parameters anew from their configured ranges."""
+        """Draw the per-world parameters anew from their configured ranges where mask [N] (bool) holds."""
         stored = self.params.T  # as the kernels have it
         torch.where(mask, self._fixed, stored, out=stored)
         for name in self.columns:
@@ -261,15 +261,15 @@ class Tactile:
                 self.by_pad.randomize(mask, generator, m.episode, m.gain)
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Where mask [N] (bool) holds: forget the past (hysteresis, shear anchors, delayed readings)."""
+        """Forget the past (hysteresis, shear anchors, delayed readings) where mask [N] (bool) holds."""
         m = self._m
         if m is not None:
             args = [wp.from_torch(mask), m.state, m.anchor, m.stamps, m.last]
             wp.launch(forget, dim=self.engine.n, inputs=args, device=self.device)
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """What a reading leaves to the next and what randomization draws, live. Whole numbers with their lowest and
-        highest."""
+        """Return what a reading leaves to the next and what randomization draws, live. Whole numbers with their lowest
+        and highest."""
         out: dict = {"params": self.params, "shape_size": self.shape_size}
         out["shape_id"] = self.shape_id, -1, len(self.shapes.names) - 1
         m, most = self._m, 2**31 - 1
@@ -335,7 +335,7 @@ def _link_shapes(links: Sequence[tuple[str, np.ndarray]]) -> list[TouchShape]:
 
 
 def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
-    """The layout on the device, with its taxels where `felt` has them."""
+    """Return the layout on the device, with its taxels where `felt` has them."""
     centre, radius = felt.bound()
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
@@ -357,7 +357,7 @@ def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
 
 
 def _law(cfg: TactileConfig, layout: TaxelLayout, needed: bool) -> Law:
-    """needed: whether any force comes from springs; else no stiffness is asked for."""
+    """Return the law of contact. needed: whether any force comes from springs; else no stiffness is asked for."""
     out = Law()
     stiffness = stiffness_of(cfg, layout.kinds) if needed else [1.0] * layout.pads
     out.stiffness = wp.array(np.array(stiffness, dtype=np.float32), dtype=float)
