@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 
 import mujoco
 import numpy as np
 import pytest
+import test_gap
 
 from dexsim.actuator.table import ServoTable
 from dexsim.cli import main as cli
@@ -15,6 +17,7 @@ from dexsim.gap import command
 from dexsim.gap.audit import main, renewed
 from dexsim.gap.plant import information
 from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read import Run, agreement, inputs
 from dexsim.recording.mechanism import mechanism
 
@@ -176,6 +179,40 @@ def test_more_of_the_same_motion_tells_more():
     for a, b in zip(one, four, strict=True):
         if a.possible:
             assert b.steps == pytest.approx(a.steps / 2, rel=0.3)
+
+
+@pytest.mark.slow
+def test_the_predicted_precision_holds_over_repeats():
+    """Fits of every figure that is told, to recordings that differ by their noise alone, scatter by less than was
+    predicted for each (one reading in a tenth of a second counts, of ten) and by no less than a tenth of that."""
+    clean = [test_gap.plant_run(f"r{k}", k, 6.0, {}, seed=k, noisy=False) for k in (0, 1, 3)]
+    rng, fits, noise = np.random.default_rng(48), [], 4e-4
+    for _ in range(6):
+        runs = [dataclasses.replace(r, q=r.q + rng.normal(0, noise, r.q.shape), qs=None, noises=None) for r in clean]
+        for r in runs:
+            r.smooth()
+        case = build(test_gap.model(), runs)[0]
+        told = [x for x in information.informed(case) if x.possible and x.figure.column != "backlash"]
+        plant, x = case.plant, np.zeros(len(told))
+        base, windows = plant.base(), plant.windows(information.WINDOW)
+        change = [t.figure.step * base[..., INDEX[t.figure.column]] if t.figure.relative
+                  else information.own_step(t.figure, case) for t in told]  # fmt: skip
+
+        def row(x, told=told, base=base, change=change):
+            out = base.copy()
+            for t, by, share in zip(told, change, x, strict=True):
+                out[..., INDEX[t.figure.column]] += share * by
+            return out
+
+        for _ in range(6):  # Gauss and Newton
+            q = plant.simulate(np.array([row(x), *(row(x + 0.2 * e) for e in np.eye(len(x)))]), windows)[0]
+            J, miss = (q[1:] - q[0]).T / 0.2, plant.q[windows.sample_row] - q[0]
+            x = x + np.linalg.lstsq(J - J.mean(0), miss - miss.mean(), rcond=None)[0]
+        fits.append(x)
+    spread, predicted = np.std(fits, 0, ddof=1), np.array([t.steps for t in told])
+    names = {t.figure.words for t in told}
+    assert {"stiffness", "inertia", "dry friction", "delay"} <= names and "viscous friction" not in names
+    assert (spread < predicted).all() and (spread > 0.1 * predicted).all(), (names, predicted / spread)
 
 
 def test_the_audit_prints_stages_figures_and_what_to_record(tmp_path, capsys):

@@ -62,7 +62,7 @@ def test_a_joint_that_is_read_seldom_is_named_and_judged_by_its_readings():
         shown = held(t, q, 0.05)
         runs.append(Run(f"r{k}", ("joint",), t, q[:, None], t, shown[:, None], table, np.array([0, 0, -9.81])))
     found, out, _ = channels.inspect(runs, model(), {})
-    assert [f["effect"] for f in found] == ["bad_channel"] and "every 50 ms" in found[0]["regime"] and not out
+    assert [f.effect for f in found] == ["bad_channel"] and "every 50 ms" in found[0].regime and not out
     assert all(len(r.t) == pytest.approx(80, abs=2) for r in runs)
 
 
@@ -75,4 +75,4 @@ def test_a_drive_without_a_loop_is_told_its_torque_by_targets_far_off():
         table = ServoTable.from_dict({"joints": {"*": SERVO | {"kp": kp}}})
         far = 800.0 * np.sign(np.sin(5.0 * t))
         run = Run("r", ("joint",), t, far[:, None], t, q[:, None], table, np.array([0, 0, -9.81]))
-        assert [f["effect"] for f in channels.inspect([run], limited, {})[0]] == named
+        assert [f.effect for f in channels.inspect([run], limited, {})[0]] == named

@@ -635,10 +635,10 @@ def composed(
     # where no choice is fair to every joint, what the fairest leaves with one joint as another kind, again and again
     for _ in range(SWAPS):
         nearest, found = min(done, key=lambda d: worst(d[1]))
-        swaps = [x for j, of in by.items() for k in of if (x := nearest | {j: k}) not in [c for c, _ in done]]
-        if worst(found) <= 1 + BELIEF.tolerance or not swaps or passed():
+        further = [x for j, of in by.items() for k in of if (x := nearest | {j: k}) not in [c for c, _ in done]]
+        if worst(found) <= 1 + BELIEF.tolerance or not further or passed():
             break
-        done += zip(swaps, replayed(swaps), strict=True)
+        done += zip(further, replayed(further), strict=True)
     fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
     alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
     total = lambda d: sum(math.log(max(d[1][j], quiet[j])) - alike(d[0]) for j in by)  # noqa: E731

@@ -23,6 +23,8 @@ STILL = 8.0
 """x its noise that a joint must move in a window."""
 DOUBT = 10.0
 """Steps by which a figure is uncertain before: more is not looked at."""
+SLOPE = 0.05
+"""Of a step: over a whole one two figures of one slope differ by how they bend, and seem to be told apart."""
 ALIKE = 0.95
 """Correlation from which on two figures can only be told together."""
 
@@ -86,19 +88,21 @@ def informed(case: Case, floor: float = 0.0) -> list[Precision]:
     windows = plant.windows(WINDOW)
     if not windows.n:
         return []
-    used, guesses = [], [base]
+    used, guesses, parts = [], [base], []
     for figure in FIGURES:
         row = base.copy()
         now = row[..., INDEX[figure.column]]
-        change = figure.step * now if figure.relative else _own(figure, case)
+        change = figure.step * now if figure.relative else own_step(figure, case)
         if not np.isfinite(now).all() or not np.any(change):
             continue  # a limit that is not believed in
-        row[..., INDEX[figure.column]] = now + change
+        part = 1.0 if figure.column == "backlash" else SLOPE  # none of a play that is far below the noise shows
+        row[..., INDEX[figure.column]] = now + part * change
         used.append(figure)
+        parts.append(part)
         guesses.append(row)
     q = plant.simulate(np.array(guesses), windows)[0]
     ok = np.isfinite(q).all(0)
-    J = (q[1:, ok] - q[:1, ok]).T
+    J = (q[1:, ok] - q[:1, ok]).T / np.array(parts)
     # where a joint stands it shows its stiffness against gravity; the rest of what is simulated there is how it came
     # to stand
     shown, of = plant.q[windows.sample_row[ok]], windows.sample_window[ok]
@@ -120,7 +124,7 @@ def informed(case: Case, floor: float = 0.0) -> list[Precision]:
     return out
 
 
-def _own(figure: Figure, case: Case) -> float:
+def own_step(figure: Figure, case: Case) -> float:
     """The step of a figure that is no share of itself, in its column's unit."""
     if figure.column == "coulomb_friction":
         return figure.step * case.scales.tau

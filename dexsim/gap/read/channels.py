@@ -412,7 +412,8 @@ def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
 
 def directions(runs: Sequence[Run], targets: Sequence[Targets], joint: str) -> list[float]:
     """Of each run, 1 where the joint follows its target, -1 where it follows the target's negative, half of it where a
-    narrow band lets it seem so, 0 where it cannot tell or lacks the joint."""
+    narrow band lets it seem so, 0 where it cannot tell or lacks the joint. Of several, one
+    that cannot tell has the direction that the slowest of the others shows, and so has a much faster one."""
     out = []
     for run, at in zip(runs, targets, strict=True):
         way = 0.0
@@ -425,7 +426,26 @@ def directions(runs: Sequence[Run], targets: Sequence[Targets], joint: str) -> l
                 clear = min(along, against) < most - SIGNAL.beyond
                 way = np.sign(along - against) * (1.0 if clear else 0.5) if most > SIGNAL.against else 0.0
         out.append(way)
+    told = [k for k, w in enumerate(out) if abs(w) == 1]
+    if len(runs) < 2 or not told:
+        return out
+    # a machine has one direction, which the slowest motion shows best: the faster, the more of a turn a lag is
+    rate = {k: _rate(runs[k], joint) for k, run in enumerate(runs) if joint in run.joints}
+    slowest = min(told, key=lambda k: rate[k])
+    for k in rate:
+        if abs(out[k]) < 1 or rate[k] > FASTER * rate[slowest]:
+            out[k] = out[slowest]
     return out
+
+
+FASTER = 2.0
+"""x the speed of the slowest motion that tells of a direction: from there on another one may be a lag."""
+
+
+def _rate(run: Run, joint: str) -> float:
+    """How fast a target goes to and fro [1/s]: its speed over its size, rms."""
+    cmd = run.command_at(run.t)[:, run.joints.index(joint)]
+    return float(np.sqrt(np.mean((np.diff(cmd) / np.diff(run.t)) ** 2)) / max(float(np.std(cmd)), 1e-9))
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
