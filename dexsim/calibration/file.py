@@ -179,8 +179,11 @@ class Calibration:
         missing = ~np.isfinite(out["current_per_torque"])
         out["current_per_torque"][missing] = ASSUMED_CURRENT_PER_TORQUE
         unmeasured = ~np.isfinite(out["current_max"])
-        if unmeasured.any() and how == "paper":
-            assumed.append("current_max of some joints is not measured: current_per_torque times torque_max taken")
+        left = [j for j, e in (content.joints or {}).items() if e is not None and e.current_max == "unknown"]
+        left = [j for j, x in zip(hand.joints, unmeasured, strict=True) if x] if how == "paper" else left
+        if left:
+            names = "every joint" if len(left) == J else ", ".join(left)
+            assumed.append(f"current_max of {names} is not measured: current_per_torque times torque_max taken")
         out["current_max"] = np.where(unmeasured, out["current_per_torque"] * out["torque_max"], out["current_max"])
         sign = content.current_sign
         signs = [sign.get(j, -1) for j in hand.joints] if isinstance(sign, dict) else [sign] * J

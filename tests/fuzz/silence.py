@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import typed
 from dexsim.gap.read import Run
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
@@ -77,6 +78,8 @@ def _shifted(t: np.ndarray, x: np.ndarray, behind: float, columns: list[int]) ->
 
 def of_settings(said: Any, taken: Any, path: str = "") -> str:
     """Return the first value of a file's tree that is not, or is another, in what was taken; "" where all are there."""
+    if isinstance(said, str) and np.isfinite(typed.real(said)):  # 1e3, text to YAML, is a number, as documented
+        said = typed.real(said)
     if isinstance(said, Mapping) and isinstance(taken, (list, tuple)):  # a range
         said = [said.get("low"), said.get("high")]
     if isinstance(said, Mapping) and set(said) == {"value"} and not isinstance(taken, Mapping):
