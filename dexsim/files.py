@@ -60,13 +60,9 @@ def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) 
     try:
         with open(path, "rb") as file:
             raw = file.read(most + 1)
-        kind = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
-        try:
-            return raw[:most].decode(kind)
-        except UnicodeDecodeError:
-            if other is None:
-                raise
-            return raw[:most].decode(other)
+        with contextlib.suppress(*[UnicodeDecodeError] * (other is not None)):
+            return raw[:most].decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
+        return raw[:most].decode(other or "utf-8")
     except OSError as error:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

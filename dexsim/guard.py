@@ -7,17 +7,11 @@ arrays, dataclasses of them, a compiled `mujoco.MjModel`)::
     recording = guard.call(_read, path, remap, what=f"recording {path}", size=path.stat().st_size)
 
 What cannot leave a process (a `mujoco.MjSpec`, tensors on a device) is rehearsed there and then read here, where it
-takes the same time and memory again::
-
-    guard.rehearse(_parse, path, what=f"model {path}")
-    spec = _parse(path)
-
-The reader's own UserError comes through as it is; any other error, a signal (a fault in the library), and a limit
-passed are a UserError that begins with `what`. Files that come with dexsim are read without (`ours`).
+takes the same time and memory again. The reader's own UserError comes through as it is; any other error, a signal (a
+fault in the library), and a limit passed are a UserError that begins with `what`.
 
 The process is a fork, which costs some 10 ms and needs no imports: the readers touch no GPU, and torch works on one
-thread there, since a fork has none of its threads. Where there is no safe fork (macOS, Windows) it is spawned, once a
-call.
+thread there, since a fork has none of its threads. Where there is no safe fork it is spawned, once a call.
 """
 
 from __future__ import annotations
@@ -102,10 +96,10 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
                 child.join()
         if answer != LOCKED:  # a fork may wait for a lock that a thread of this process held; a new process does not
             break
-    if isinstance(answer, BaseException):
-        raise answer
     if isinstance(answer, tuple):
         return answer[0]
+    if isinstance(answer, BaseException):
+        raise answer
     more = f"; if you trust the file, {TRUSTED}={times * 10:g} in the environment allows ten times as much"
     ended = -(child.exitcode or 0)
     if answer:

@@ -41,22 +41,17 @@ def weight(path: Path, root: Path | None = None) -> int:
     """Return bytes of the files that a model names, and of those that these name, relative to `root` too: what reading
     it may take grows with them."""
     text = path.read_text(encoding="utf-8", errors="replace")
-    own = list(dict.fromkeys([path.parent, root or path.parent]))
-    folders = own + [f / d for f in own for d in re.findall(r'(?:mesh|asset|texture)dir="([^"]+)"', text)]
+    own = {path.parent, root or path.parent}
+    folders = [f / d for f in own for d in ("", *re.findall(r'(?:mesh|asset|texture)dir="([^"]+)"', text))]
     total = 0
-    for name in set(re.findall(r'\bfile(?:name)?="([^"]+)"', text)):
-        plain = name.removeprefix("file://")
-        if plain.startswith("package://"):
-            rest = plain.removeprefix("package://")
-            tries = [p / r for p in path.parents for r in (rest, rest.partition("/")[2])]
-        else:
-            tries = [f / plain for f in folders]
-        there = next((f for f in tries if os.path.isfile(f)), None)  # not Path's, which raises for a long name
-        if there is not None and there != path:
-            about = there.stat()
-            more = there.suffix in (".xml", ".mjcf") and root is None  # one level of files that are included
-            total += files.stored(about)
-            total += weight(there, path.parent) if more and about.st_size < files.MAX_FILE else 0
+    for package, name in set(re.findall(r'\bfile(?:name)?="(?:file://|(package://))?([^"]+)"', text)):
+        rest = name, name.partition("/")[2]
+        tries = [p / r for p in path.parents for r in rest] if package else [f / name for f in folders]
+        there = next((f for f in tries if os.path.isfile(f)), path)  # not Path's, which raises for a long name
+        if there != path:
+            total += files.stored(about := there.stat())
+            if there.suffix in (".xml", ".mjcf") and root is None and about.st_size < files.MAX_FILE:
+                total += weight(there, path.parent)  # one level of files that are included
     return min(total, MAX_BESIDE)
 
 
@@ -96,8 +91,7 @@ def _physical(m: mujoco.MjModel, where: str) -> None:
     ):  # fmt: skip
         rows = np.atleast_2d(np.asarray(values, float).T).T
         bad = np.flatnonzero(~((rows >= low) & (rows <= high)).all(1))
-        if len(bad):
-            k = int(bad[0])
+        for k in bad[:1].tolist():
             name = f" of '{whose(k).name or k}'" if whose else ""
             said = " ".join(f"{x:g}" for x in rows[k])
             raise UserError(f"{where}: {what}{name} is {said}: must be numbers from {low:g} to {high:g}")

@@ -108,10 +108,9 @@ def _named(data: Any, kind: Any, message: str, place: str) -> str:
     """The place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
     parts = place.split(".")
     for k, part in enumerate(parts):
-        if not part.startswith("*"):
-            continue
-        node = _at(data, parts[:k])
-        for key in list(node) if isinstance(node, dict) else ():
+        node = _at(data, ".".join(parts[:k])) if part.startswith("*") else None
+        node = node if isinstance(node, dict) else {}
+        for key in list(node):
             alone = _with(data, parts[:k], {key: node[key]})
             try:
                 msgspec.convert(alone, kind, dec_hook=_instance)
@@ -119,17 +118,16 @@ def _named(data: Any, kind: Any, message: str, place: str) -> str:
                 if str(error) == message:
                     data, parts[k] = alone, str(key) + part[1:]
                     break
-        else:
-            return place
     return ".".join(parts)
 
 
-def _at(node: Any, parts: list[str]) -> Any:
-    for part in ".".join(parts).replace("[", ".[").split("."):
-        if part:
-            node = node[int(part[1:-1])] if part.startswith("[") else next((v for k,
-                                                                            v in node.items() if str(k) == part),
-                                                                            None) if isinstance(node, dict) else None
+def _at(node: Any, place: str) -> Any:
+    """The value at a place that msgspec names (a.b[3].c); None where it cannot be told."""
+    for part in filter(None, place.replace("[", ".[").split(".")):
+        try:
+            node = node[int(part[1:-1])] if part.startswith("[") else {str(k): v for k, v in node.items()}[part]
+        except (AttributeError, KeyError, IndexError, TypeError, ValueError):
+            return None
     return node
 
 
@@ -195,15 +193,6 @@ def finite(node: Any, source: object, fix: str = "", place: str = "") -> None:
 
 
 def _shown(data: Any, place: str) -> str:
-    """The value at a place that msgspec names (a.b[3].c), shortened; '?' where it cannot be told."""
-    node = data
-    for part in place.replace("[", ".[").split("."):
-        try:
-            if part.startswith("["):
-                node = node[int(part[1:-1])]
-            elif part:
-                node = node[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return "?"
-    text = " ".join(repr(node).split())
+    """The value at a place, shortened."""
+    text = " ".join(repr(_at(data, place)).split())
     return text if len(text) <= 60 else text[:57] + "..."

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from dexsim.errors import UserError
-from dexsim.typed import number
+from dexsim.typed import convert
 
 MODELS = ("MLPModel", "RNNModel", "CNNModel")
 PARTS = ("actor", "critic", "student", "teacher")
@@ -25,8 +27,10 @@ ALLOWED: dict[str, tuple[str, ...]] = {
 LEAVES = ("class_name", "data_augmentation_func", "logger", "_target_")
 """Last parts of the settings that rsl-rl, or Hydra, turns into code, wherever they stand."""
 
-MOST_LAYERS, MOST_UNITS, MOST_WEIGHTS = 32, 16_384, 1 << 27
+MOST_LAYERS, MOST_WEIGHTS = 32, 1 << 27
 """Of a network."""
+Units = Annotated[int, msgspec.Meta(ge=1, le=16_384)]
+"""Of a layer."""
 
 Typed = frozenset[tuple[str, Any]]
 """Settings (whole dotted name, value) that the user typed on the command line."""
@@ -51,25 +55,22 @@ def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: s
                         f" agent.{key}={text} on the command line")
 
 
-def check_sizes(agent: dict[str, Any], where: str = "agent") -> None:
-    """Raise UserError where a part would be no network, or one that no memory holds. where: before the key."""
-    for part in PARTS:
-        group, key = agent.get(part), f"{where}.{part}"
-        if not isinstance(group, dict):
-            continue
-        sizes = group.get("hidden_dims") or [1]
-        if not isinstance(sizes, list) or not len(sizes) <= MOST_LAYERS or group.get("hidden_dims") == []:
-            raise UserError(
-                f"{key}.hidden_dims={group['hidden_dims']}: must be a list of 1 to {MOST_LAYERS} whole numbers,"
-                " e.g. [512,256,128]"
-            )
-        for size in sizes:
-            number(f"{key}.hidden_dims", size, 1, MOST_UNITS, exact=True)
-        for name, most in (("rnn_hidden_dim", MOST_UNITS), ("rnn_num_layers", MOST_LAYERS)):
-            if group.get(name) is not None:
-                number(f"{key}.{name}", group[name], 1, most, exact=True)
+class Network(msgspec.Struct):
+    """What of a part's settings makes its size."""
+
+    hidden_dims: Annotated[list[Units], msgspec.Meta(min_length=1, max_length=MOST_LAYERS)] | None = None
+    rnn_hidden_dim: Units | None = None
+    rnn_num_layers: Annotated[int, msgspec.Meta(ge=1, le=MOST_LAYERS)] | None = None
+
+
+def check_sizes(agent: dict[str, Any], where: str = "settings") -> None:
+    """Raise UserError where a part would be no network, or one that no memory holds. where: whose settings."""
+    parts = {part: agent[part] for part in PARTS if isinstance(agent.get(part), dict)}
+    for part, network in convert({"agent": parts}, dict[str, dict[str, Network]], where)["agent"].items():
+        sizes = network.hidden_dims or []
         if (weights := sum(a * b for a, b in pairwise(sizes))) > MOST_WEIGHTS:
-            raise UserError(f"{key}.hidden_dims={sizes}: {weights:,.0f} weights; at most {MOST_WEIGHTS:,} are learned")
+            text = f"{weights:,.0f} weights; at most {MOST_WEIGHTS:,} are learned"
+            raise UserError(f"{where}: agent.{part}.hidden_dims={sizes}: {text}")
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -33,7 +33,7 @@ def agent_config(
     if not isinstance(agent, dict):
         raise UserError(f"{where}: agent is {type(agent).__name__}, must be a group of settings")
     names.check(agent, typed, where)
-    names.check_sizes(agent, "agent" if where == "agent settings" else f"{where}: agent")
+    names.check_sizes(agent, where)
     if isinstance(agent.get("teacher"), dict):
         agent["teacher"].pop("checkpoint", None)
     agent["seed"], agent["save_interval"] = cfg["seed"], cfg["save_interval"]
