@@ -72,7 +72,7 @@ def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
     if blind:
         runs, _ = inputs.free_air(runs, [], inputs.merged_spans(blind), notes, "", "", (0.0, 0.0), inputs.SHORTEST)
     told = {(f.topic, f.kind) for f in r.findings if f.severity != "info"}
-    told |= {(topic, "channel") for f in found for topic in f["where"]["topics"]} | {("", "pause") for _ in blind}
+    told |= {(topic, "channel") for f in found for topic in f.topics} | {("", "pause") for _ in blind}
     for word, topic in (("position", STATES), ("command", COMMANDS)):
         told |= {(topic, n) for n in notes if word in n}
     return r, runs, told
