@@ -406,7 +406,7 @@ def test_file_round_trip_and_meaning(tmp_path):
         ({"jonts": {}}, "jonts"),
         ({"joints": {"elbow": {}}}, "elbow"),
         ({"joints": {"mid_joint1": {"current_max": -1}}}, "current_max"),
-        ({"normalization": "x"}, "matched, paper"),
+        ({"normalization": "x"}, "matched or paper"),
         ({"touch": {"gain": {"mid": [1, 2]}}}, "120"),
         ({"touch": {"dead": {"mid": [120]}}}, "mid: no taxel 120; a pad has 120"),
         ({"touch": {"axis_sign": [1, 2, 3]}}, "axis_sign"),
@@ -521,7 +521,7 @@ def test_another_hand_is_calibrated_from_its_own_presses(tmp_path, capsys):
         (["simulate=maybe"], "true or false"),
         (["levels=2", "simulate=true"], "levels=2"),
         (["out=x"], "say what to calibrate"),
-        (["normalization=z"], "matched, paper"),
+        (["normalization=z"], "matched or paper"),
     ],
 )
 def test_command_errors_are_one_line(arguments, says, tmp_path):

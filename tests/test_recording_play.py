@@ -225,7 +225,7 @@ def test_an_unknown_current_constant_is_fitted_and_said():
 
 
 @pytest.mark.parametrize("argv, text", [
-    (["replay=x.mcap", "episodes=3"], "does not go with replay=FILE"),
+    (["replay=x.mcap", "episodes=3"], "expected key=value with one of the keys replay, model"),
     (["replay=x.mcap", "servo=idael"], "must be a servo.yaml file, or one of ideal"),
     (["replay=x.mcap", "timestep=1"], "from 0.0001 to 0.02"),
     (["replay=x.mcap", "hold=still"], "hold=still: must be recorded or limp"),

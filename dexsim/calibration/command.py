@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -313,29 +312,21 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
 
 def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     out, meta = dict(defaults), {}
-    for argument in argv:
-        key, equals, text = argument.partition("=")
-        if equals and key.startswith(("meta.", "units.")):
+    for key, text in typed.settings(argv, defaults, ("meta.", "units.")).items():
+        if key not in defaults:
             meta[key.removeprefix("meta.")] = text
             continue
-        if not equals or key not in defaults:
-            near = difflib.get_close_matches(key, defaults, 1)
-            hint = f"; did you mean {near[0]}=" if near else ""
-            valid = ", ".join((*defaults, "meta.KEY", "units.QUANTITY"))
-            raise UserError(f"'{argument}': no such setting{hint}; settings: {valid}")
         if text == "null":
             out[key] = None
         elif isinstance(defaults[key], bool):
-            if text not in ("true", "false"):
-                raise UserError(f"{key}={text}: must be true or false")
-            out[key] = text == "true"
+            out[key] = typed.truth(key, text)
         elif isinstance(defaults[key], (int, float)) or key in ("area",):
             least = {"levels": 4, "seed": 0, "stretch_max": 1.01}.get(key, 1e-12)
             out[key] = typed.number(key, text, least, exact=key in ("levels", "seed"))
         else:
             out[key] = text
-        if key in CHOICES and out[key] not in CHOICES[key]:
-            raise UserError(f"{key}={text}: must be one of {', '.join(CHOICES[key])}")
+        if key in CHOICES:
+            typed.one_of(key, text, CHOICES[key])
     return out, meta
 
 

@@ -32,7 +32,6 @@ KEYS = (
     "object_friction",
 )
 RESULTS = ("metrics.json", "simulated.mcap", "position.png", "effort.png", "force.png", "video.mp4")
-USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE, units.QUANTITY=UNIT"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
@@ -42,24 +41,14 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
     from dexsim.recording.arguments import read_arguments
     from dexsim.recording.mechanism import stated_hand
 
-    own: dict[str, str] = {}
-    rest: list[str] = []
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if equals and key in KEYS:
-            own[key] = value
-        elif equals and key.partition(".")[0] in ("remap", "meta", "units"):
-            rest.append(argument)
-        else:
-            raise UserError(f"'{argument}' does not go with replay=FILE; {USAGE}")
+    own = typed.settings(argv, KEYS, ("remap.", "meta.", "units."))
+    rest = [f"{key}={own.pop(key)}" for key in [*own] if key not in KEYS]
     _, remap, meta = read_arguments([own["replay"], *rest])
     for key in ("video", "hand_mirror"):
-        if own.get(key, "true") not in ("true", "false"):
-            raise UserError(f"{key}={own[key]}: must be true or false")
+        typed.truth(key, own.get(key, "true"))
     if own.get("model") and ("hand" in own or "hand_mirror" in own):
         raise UserError(f"model={own['model']}: is not simulated beside hand=; say one of them")
-    if own.get("hold", "recorded") not in ("recorded", "limp"):
-        raise UserError(f"hold={own['hold']}: must be recorded or limp")
+    typed.one_of("hold", own.get("hold", "recorded"), ("recorded", "limp"))
 
     def seconds(key: str, low: float, high: float) -> float | None:
         return typed.number(key, own[key], low, high, "s") if key in own else None
