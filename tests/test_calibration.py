@@ -406,7 +406,7 @@ def test_file_round_trip_and_meaning(tmp_path):
         ({"jonts": {}}, "jonts"),
         ({"joints": {"elbow": {}}}, "elbow"),
         ({"joints": {"mid_joint1": {"current_max": -1}}}, "current_max"),
-        ({"normalization": "x"}, "matched or paper"),
+        ({"normalization": "x"}, "matched, paper"),
         ({"touch": {"gain": {"mid": [1, 2]}}}, "120"),
         ({"touch": {"dead": {"mid": [120]}}}, "mid: no taxel 120; a pad has 120"),
         ({"touch": {"axis_sign": [1, 2, 3]}}, "axis_sign"),
