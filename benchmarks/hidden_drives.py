@@ -8,10 +8,10 @@ play, dry friction or elasticity between that drive and its joints. Two drives m
 another. The effect alone changes the drive's motions by 16 to 32 times the noise of the readings. Of the three kinds,
 those that cannot do so with a drive that still moves are not drawn (a light finger winds up no spring). The hand is C
 MuJoCo's model with all of its coupled joints, which the diagnosis does not simulate; its loop reads the motor, the
-recording has the joint; its gains, limits and friction are each up to 3 % off what is believed; readings come as a bus
-gives them (rate, jitter, counts, milliamperes). seed: a number, or `source`: read off the sources. Named: the first
-finding is this effect of this drive and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case,
-and one of JSON.
+recording has the joint and the motor's current, whose scale is known (`dexsim calibrate` measures it); its gains,
+limits and friction are each up to 3 % off what is believed; readings come as a bus gives them (rate, jitter, counts,
+milliamperes). seed: a number, or `source`: read off the sources. Named: the first finding is this effect of this drive
+and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case, and one of JSON.
 """
 
 from __future__ import annotations
@@ -93,13 +93,13 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
     from dexsim.recording import write
     from dexsim.recording.excitation import plan
     from dexsim.recording.mechanism import drive, of_hand, recorded
-    from dexsim.recording.realistic import realistic
+    from dexsim.recording.realistic import CURRENT_PER_TORQUE, realistic
     from dexsim.recording.schema import COMMANDS, Series
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     hand = load_hand(which)
-    servo = of_hand(hand).table.to_dict() | {"loop_encoder": "motor"}
+    servo = of_hand(hand).table.to_dict() | {"loop_encoder": "motor", "current_per_torque": CURRENT_PER_TORQUE}
     believed, true = of_hand(hand, servo), of_hand(hand, servo)
     hidden = str(rng.choice(drives(hand)))
     others = [j for j in hand.joints if j != hidden]
@@ -111,6 +111,7 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
                 true.table.set(joint, column, value * (1 + rng.uniform(-OFF, OFF)))
     k = hand.joints.index(hidden)
     folder.mkdir(parents=True, exist_ok=True)
+    believed.table.save(folder / "servo.yaml")
     plans = [plan(believed, moved, kinds, seed=int(rng.integers(1 << 30))) for kinds in RECORDINGS.values()]
     least = float(rng.uniform(*LARGE)) * NOISE
     for kind in rng.permutation(list(KINDS)).tolist():  # a light finger shows no spring in its tendon: then another
@@ -152,7 +153,7 @@ def diagnosed(folder: Path, truth: dict[str, Any], limit: int) -> dict[str, Any]
     """Return the score of `dexsim diagnose` on a folder of recordings, as a user would run it."""
     fit, held = [[str(folder / f"{n}.mcap") for n in names] for names in (list(RECORDINGS)[:-1], list(RECORDINGS)[-1:])]
     words = [f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", f"hand={truth['hand']}",
-             f"out={folder / 'diagnosis'}", "next=false", f"limit={limit}"]  # fmt: skip
+             f"servo={folder / 'servo.yaml'}", f"out={folder / 'diagnosis'}", f"limit={limit}", "next=false"]
     began = time.perf_counter()
     with open(folder / "log.txt", "w", encoding="utf-8") as log:
         subprocess.run([sys.executable, "-m", "dexsim", "diagnose", *words], stdout=log, stderr=subprocess.STDOUT,

@@ -79,6 +79,10 @@ def test_how_far_a_drive_goes_before_its_follower_is_at_a_limit():
     assert (low, high) == pytest.approx((-0.4, 0.4), abs=0.02) and follower == "second0"
     with pytest.raises(UserError, match="'second0' follows 'first0' beyond its limits, wherever"):
         ties.reach(_tied(_0="3 0.5 0 0 0"), [0], "model")
+    held = '<equality><joint joint1="second0" polycoef="1.2 0 0 0 0"/></equality>'
+    m = mujoco.MjModel.from_xml_string(jaws(ranges=((-0.5, 1.5), (-1.0, 1.0)), after=held))
+    with pytest.raises(UserError, match="'second0' is held at 1.2, beyond its limits -1 to 1"):
+        ties.reach(m, [0], "model")
 
 
 def test_a_drive_that_its_follower_stops_short_is_said_and_poses_stay_within(tmp_path):

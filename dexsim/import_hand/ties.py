@@ -139,9 +139,17 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
     """Return, by id of a driven joint, how far it goes before a joint that follows it meets a limit, and which one;
     only of those that do not reach both of their own.
 
-    Raises UserError where a follower is beyond its limits wherever the driven joint stands.
+    Raises UserError where a follower is beyond its limits wherever the driven joint stands, or is held there.
     """
     laws, out = _laws(m), {}
+    for e in range(m.neq):
+        if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] < 0:
+            j = int(m.eq_obj1id[e])
+            stands, (low, high) = float(m.qpos0[m.jnt_qposadr[j]] + m.eq_data[e, 0]), m.jnt_range[j]
+            if not low - SLACK * (high - low) <= stands <= high + SLACK * (high - low):
+                raise UserError(
+                    f"{where}: joint '{m.joint(j).name}' is held at {stands:g}, beyond its limits {low:g} to {high:g}"
+                )
     for leader in leaders:
         q = np.linspace(m.jnt_range[leader, 0], m.jnt_range[leader, 1], GRID)
         places, most = {leader: q}, (0.0, leader)
