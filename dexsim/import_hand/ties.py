@@ -143,8 +143,8 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
     """
     laws, out = _laws(m), {}
     for e in range(m.neq):
-        if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] < 0:
-            j = int(m.eq_obj1id[e])
+        j = int(m.eq_obj1id[e])
+        if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] < 0 and m.jnt_limited[j]:
             stands, (low, high) = float(m.qpos0[m.jnt_qposadr[j]] + m.eq_data[e, 0]), m.jnt_range[j]
             if not low - SLACK * (high - low) <= stands <= high + SLACK * (high - low):
                 raise UserError(
@@ -156,7 +156,7 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
         free = np.ones(GRID, bool)
         for _ in laws:
             for law in laws:
-                if law[1] not in places or law[0] in places:
+                if law[1] not in places or law[0] in places or not m.jnt_limited[law[0]]:
                     continue
                 at = places[law[0]] = _follows(m, law, places[law[1]])
                 low, high = m.jnt_range[law[0]]
