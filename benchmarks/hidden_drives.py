@@ -5,13 +5,14 @@
 
 Each case draws a hand, a drive that other joints follow (by mimic, equality or tendon; any drive where none does), and
 play, dry friction or elasticity between that drive and its joints. Two drives move, the one with the effect and
-another. The effect alone changes the drive's motions by 16 to 32 times the noise of the readings. Of the three kinds,
-those that cannot do so with a drive that still moves are not drawn (a light finger winds up no spring). The hand is C
-MuJoCo's model with all of its coupled joints, which the diagnosis does not simulate; its loop reads the motor, the
-recording has the joint and the motor's current, whose scale is known (`dexsim calibrate` measures it); its gains,
-limits and friction are each up to 3 % off what is believed; readings come as a bus gives them (rate, jitter, counts,
-milliamperes). seed: a number, or `source`: read off the sources. Named: the first finding is this effect of this drive
-and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case, and one of JSON.
+another, and the diagnosis is asked about these. The effect alone changes the drive's motions by 16 to 32 times the
+noise of the readings. Of the three kinds, those that cannot do so with a drive that still moves are not drawn (a light
+finger winds up no spring). The hand is C MuJoCo's model with all of its coupled joints, which the diagnosis does not
+simulate; its loop reads the motor, the recording has the joint and the motor's current, whose scale is known (`dexsim
+calibrate` measures it); its gains, limits and friction are each up to 3 % off what is believed; readings come as a bus
+gives them (rate, jitter, counts, milliamperes). seed: a number, or `source`: read off the sources. Named: the first
+finding is this effect of this drive and of no other. Resumable: what is in out=/seed_N is read. Prints a line a case,
+and one of JSON.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def sized(true: Any, hidden: str, kind: str, least: float, p: Any, span: float) 
     """Return the column of the servo that has the effect, and its value; empty where the largest one tried does less
     than `least`. It grows by halves from a hundredth of the drive's range (play), of its torque limit (friction), or of
     the deflection that the loop's own gain allows at a torque (elasticity) to MOST of it, until the motions of `hidden`
-    in a plan `p` differ by `least` rad or m (rms) from those without."""
+    in a plan `p` differ from those without by `least` rad or m (standard deviation)."""
     from dexsim.recording.mechanism import drive
     from dexsim.recording.schema import Series
 
@@ -79,7 +80,7 @@ def sized(true: Any, hidden: str, kind: str, least: float, p: Any, span: float) 
         return drive(true, commands, true.joints, float(commands.t[-1]), initial=p.home, timestep=0.002).position[:, k]
 
     plain, value = moved(0.0), 0.01 * unit
-    while np.sqrt(np.mean((moved(value) - plain) ** 2)) < least:
+    while np.std(moved(value) - plain) < least:  # a gap that a load never leaves is an offset, and nothing else
         value *= 1.5
         if value > MOST[kind] * unit:
             true.table.set(hidden, column, before)
@@ -153,7 +154,8 @@ def diagnosed(folder: Path, truth: dict[str, Any], limit: int) -> dict[str, Any]
     """Return the score of `dexsim diagnose` on a folder of recordings, as a user would run it."""
     fit, held = [[str(folder / f"{n}.mcap") for n in names] for names in (list(RECORDINGS)[:-1], list(RECORDINGS)[-1:])]
     words = [f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", f"hand={truth['hand']}",
-             f"servo={folder / 'servo.yaml'}", f"out={folder / 'diagnosis'}", f"limit={limit}", "next=false"]
+             f"joints=[{','.join(truth['moved'])}]", f"servo={folder / 'servo.yaml'}", f"limit={limit}",
+             f"out={folder / 'diagnosis'}", "next=false"]  # fmt: skip
     began = time.perf_counter()
     with open(folder / "log.txt", "w", encoding="utf-8") as log:
         subprocess.run([sys.executable, "-m", "dexsim", "diagnose", *words], stdout=log, stderr=subprocess.STDOUT,

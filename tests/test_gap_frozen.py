@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -109,3 +110,24 @@ def test_a_run_without_the_joint_and_two_joints():
     two.q[200:330, 1] = two.q[200, 1]
     assert channels.repeated_stretches([*runs, two], "other") == [[], [], []]
     assert [len(x) for x in channels.repeated_stretches([*runs, two], "joint")] == [0, 0, 1]
+
+
+def test_a_joint_that_rests_until_its_target_steps_is_not_frozen():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="joint" range="-2 2" limited="true"/><geom size="0.1" mass="0.1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    rng = np.random.default_rng(0)
+    sizes = np.where(np.arange(17) % 4 == 3, 0.1, 0.012) * rng.choice([-1, 1], 17)
+    target = np.repeat(np.cumsum(sizes), 42)[: len(T)]
+    target = np.r_[target, np.full(len(T) - len(target), target[-1])]
+    there = np.r_[np.full(2, target[0]), target[:-2]]  # it starts at once, and dry friction stops it at once
+    quick = 0.6 * there + 0.3 * np.r_[there[:1], there[:-1]] + 0.1 * np.r_[there[:2], there[:-2]]
+    found, _, _ = channels.inspect([run("steps", target, quick)], model, {})
+    assert [f for f in found if f.regime.startswith("stale")] == []
+    chirp = 0.4 * np.sin(2 * np.pi * 0.5 * T)
+    old = chirp.copy()
+    for at in (100, 205, 310, 415):
+        old[at : at + 12] = old[at]
+    found, _, _ = channels.inspect([run("chirp", chirp, old)], model, {})
+    assert [f.joints for f in found if f.regime.startswith("stale")] == [["joint"]]

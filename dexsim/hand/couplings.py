@@ -184,6 +184,32 @@ class Couplings:
         return out
 
 
+    def dragged(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions [n, nq] along a motion of the driven joints, and how every dof moves with each of them
+        [n, nv, J]. A joint that a tendon holds with slack stays where it is until the tendon drags it (a play
+        operator); of joints that tendons share, `complete` tells, and the middle of the motion how they move."""
+        m, q = self.model, self.placed(qpos)
+        moves = np.repeat(self.motion(q[len(q) // 2])[None], len(q), 0)
+        if not self._rows or self._sweeps != 1:
+            return q, moves
+        for at in self._free:
+            joint = _joint(m, at)
+            dof, mine = int(m.jnt_dofadr[joint]), [row for row in self._rows if row[0][at]]
+            ends = [np.sort((np.array(row[1:]) - (q @ row[0] - row[0][at] * q[:, at])[:, None]) / row[0][at], 1)
+                    for row in mine]  # fmt: skip
+            low, high = (pick.reduce([x[:, k] for x in ends]) for k, pick in ((0, np.maximum), (1, np.minimum)))
+            if m.jnt_limited[joint]:
+                low, high = (np.clip(x, *m.jnt_range[joint]) for x in (low, high))
+            for k in range(1, len(q)):
+                q[k, at] = min(max(q[k - 1, at], low[k]), high[k])
+            moving = np.diff(q[:, at], prepend=q[0, at]) != 0
+            moves[:, dof] = 0.0
+            for (row, *_), x in zip(mine, ends, strict=True):
+                pulled = moving & (np.isclose(q[:, at], x[:, 0]) | np.isclose(q[:, at], x[:, 1]))
+                moves[pulled, dof] = -row[self.address] / row[at]
+        return q, moves
+
+
 def _one_dof(m: mujoco.MjModel, j: int) -> bool:
     return int(m.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import mujoco
 import mujoco.batch
 import numpy as np
-import torch
 
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.lines import on_lines
@@ -81,12 +80,15 @@ def along(
     if ties.tied:  # what follows moves along: inertia and forces as the drives feel them
         every = np.tile(model.qpos0, (n, 1))
         every[:, qadr] = q
-        every = ties.complete(torch.as_tensor(every)).numpy()
-        moves = ties.motion(every[n // 2])  # [nv, J]; of laws that bend, at the middle of the run
-        seen = _evaluated(model, np.arange(model.nq), np.arange(model.nv), every, v @ moves.T)
-        full = moves.T @ _full(model, seen["M"]) @ moves
+        every, moves = ties.dragged(every)
+        across = moves.transpose(0, 2, 1)  # [n, J, nv]
+        speed = (moves @ v[:, :, None])[:, :, 0]
+        seen = _evaluated(model, np.arange(model.nq), np.arange(model.nv), every, speed)
+        full = across @ _full(model, seen["M"]) @ moves
         total, diag = (full @ a[:, :, None])[:, :, 0], full[:, np.arange(J), np.arange(J)]
-        bias, passive = seen["qfrc_bias"] @ moves, seen["qfrc_spring"] @ moves
+        drag = model.dof_damping * speed + model.dof_frictionloss * np.sign(speed)
+        drag[:, dadr] = 0.0  # a driven joint's own is no load
+        bias, passive = ((across @ x[:, :, None])[:, :, 0] for x in (seen["qfrc_bias"] + drag, seen["qfrc_spring"]))
     else:
         seen = _evaluated(model, qadr, dadr, q, v)
         full = _full(model, seen["M"])

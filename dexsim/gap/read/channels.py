@@ -36,6 +36,7 @@ SPOILS = ("joint_order", "wrap", "unit")
 LAGS = np.arange(0.0, 0.201, 0.02)  # s by which a joint may follow its target
 SLUGGISH, LONG_LAGS = 0.8, np.arange(0.0, 0.501, 0.02)  # and where it goes less far than so much of its target's way
 EDGE, EDGES = 0.3, 3  # s before and after an edge of a target that are looked at, and edges that tell
+REACTS = 0.06  # s within which a joint follows a step of its target, at the latest
 PAUSE = 1.0  # s without a sample, over which no lag is measured
 STEP, BEFORE, AFTER = 0.005, 120, 80  # s of the grid on which a lag is measured, and steps of it on either side
 TURN = 180 / np.pi
@@ -129,7 +130,9 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                 text = f"{joint} is read every {1e3 * beat[joint]:.3g} ms only; the samples between repeat it"
                 add("stale", text, run, joint, [STATES], whole)
                 continue
-            repeated, said, lost = _repeated(*run.readings(j), joint, long[joint][i])
+            t, q = run.readings(j)
+            seen = np.stack([run.command_at(t - lag)[:, j] for lag in (0.0, REACTS)])
+            repeated, said, lost = _repeated(t, q, seen, joint, long[joint][i])
             if lost:
                 blind.setdefault(run.name, []).extend(lost)
             for text, spans in said:
@@ -155,11 +158,11 @@ def _on_rows(run: Run, j: int, on: np.ndarray) -> np.ndarray:
 
 
 def _repeated(
-    t: np.ndarray, q: np.ndarray, joint: str, long: Sequence[tuple[int, int]]
+    t: np.ndarray, q: np.ndarray, targets: np.ndarray, joint: str, long: Sequence[tuple[int, int]]
 ) -> tuple[np.ndarray, list[tuple[str, Spans]], Spans]:
     """(samples [S] that repeat an old reading, what is said of them with its stretches [s], those of the `long`
     stretches that are too long to know the motion over)."""
-    held, single = _held(t, q), repeated_samples(t, q)
+    held, single = _held(t, q, targets), repeated_samples(t, q)
     for a, b in long:
         held[a + 1 : b + 1] = True
     lost = [(float(t[a]), float(t[b])) for a, b in long if t[b] - t[a] > SIGNAL.blind]
@@ -537,9 +540,10 @@ def _holds(run: Run, j: int, end: int) -> float:
     return max((float(np.median(error[max(b - 2, a) : b + 1])) for a, b in stood), default=0.0)
 
 
-def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S] readings that repeat the one before and end in a jump that a joint of this speed cannot make in one
-    sample."""
+def _held(t: np.ndarray, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the readings [S] that repeat the one before and end in a jump that a joint of this speed cannot make in
+    one sample. targets [2, S]: in force at each reading, and REACTS s before; a joint whose target stood with it, and
+    then stepped, was at rest."""
     step = np.abs(np.diff(q))
     out = np.zeros(len(q), bool)
     edge = np.flatnonzero(np.diff(np.concatenate([[False, False], step == 0, [False]]).astype(np.int8)))
@@ -550,12 +554,25 @@ def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         return out
     usual = float(np.percentile(moving, 90))
     stood = zip(first[long].tolist(), end[long].tolist(), strict=True)
-    jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual]
+    now, before = targets
+
+    def woken(a: int, b: int) -> bool:
+        stepped = abs(now[b] - before[b - 1]) > 0.5 * step[b - 1]
+        return bool(stepped) and t[b - 1] - t[a] > REACTS and _way(t, before, a, b) < 0.2 * step[b - 1]
+
+    jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual and not woken(a, b)]
     # a joint at rest may start with a jump: at least two must have been moving when they froze
     if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > SIGNAL.moving * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
             out[a:b] = True
     return out
+
+
+def _way(t: np.ndarray, before: np.ndarray, first: int, end: int) -> float:
+    """Return how far the target went that a joint could follow while its readings `first` to `end` stood. before [S]:
+    the target REACTS s before each reading."""
+    seen = before[first:end][t[first:end] - REACTS >= t[first]]
+    return float(np.ptp(seen)) if len(seen) else 0.0
 
 
 def _keep(run: Run, on: np.ndarray) -> None:
@@ -601,11 +618,12 @@ def repeated_stretches(
     for k, long in stood.items():
         run, j = runs[k], runs[k].joints.index(joint)
         on = slice(None) if run.read is None else run.read[:, j]
-        cmd = (Targets(run) if targets is None else targets[k]).before()[on, j]
-        size = pulses(*run.readings(j))
+        cmd = (Targets(run) if targets is None else targets[k]).before(REACTS)[on, j]
+        t, q = run.readings(j)
+        size = pulses(t, q)
         spans.append(float(np.ptp(cmd)))
         for a, b in long:
-            seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
+            seen.append((k, a, b, float(size[b]), _way(t, cmd, a, b + 1)))
             size[b] = 0.0
         pulse.append(size)
     usual = float(max(x.max() for x in pulse))
