@@ -129,7 +129,7 @@ def frozen(stands: int = 8, jump: float = 4.0, before: float = 1.0) -> bool:
         steps[a : a + stands] = 0.0
         steps[a + stands] = jump
     q = np.cumsum(steps)
-    return bool(channels._held(STEP * np.arange(len(q)), q).any())
+    return bool(channels._held(STEP * np.arange(len(q)), q, np.zeros((2, len(q)))).any())
 
 
 def test_readings_that_stand_while_a_joint_moves_are_old_ones():

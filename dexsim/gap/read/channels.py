@@ -569,10 +569,12 @@ def _held(t: np.ndarray, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 
 def _way(t: np.ndarray, before: np.ndarray, first: int, end: int) -> float:
-    """Return how far the target went that a joint could follow while its readings `first` to `end` stood. before [S]:
-    the target REACTS s before each reading."""
+    """Return how far the target went while a joint's readings `first` to `end` stood, that it could follow: what it
+    does in the last REACTS s is left out, and the rest counted as if it went on. before [S]: the target REACTS s before
+    each reading."""
     seen = before[first:end][t[first:end] - REACTS >= t[first]]
-    return float(np.ptp(seen)) if len(seen) else 0.0
+    stood = t[end - 1] - t[first]
+    return float(np.ptp(seen)) * stood / (stood - REACTS) if len(seen) > 1 else 0.0
 
 
 def _keep(run: Run, on: np.ndarray) -> None:
