@@ -44,7 +44,8 @@ class Decor:
         names = ("push", "taxels", "taxel_point", "taxel_normal", "gravity")
         self._arrays = {k: arrays[k] for k in names if k in arrays}
         self._bodies = [model.body(name).id for name in bodies]
-        self._object = model.body("object").id if "object" in [model.body(b).name for b in range(model.nbody)] else -1
+        named = {model.body(b).name: b for b in range(model.nbody)}
+        self._object, self._table = named.get("object", -1), "table" in named
         self._roots = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0 and not model.body_dofnum[b]]
         self._pos, self._quat = model.body_pos.copy(), model.body_quat.copy()
 
@@ -69,12 +70,15 @@ class Decor:
 
     def draw(self, scene: Any, data: Any, k: int) -> None:
         """Add the geoms of frame k to a scene; data: after the forward kinematics of that frame."""
-        floor = np.array([0.03, 0.0, -0.13])
-        self._add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, [0.45, 0.004, 0.0], floor, np.eye(3), TABLE)
+        if not self._table:
+            floor = np.array([0.03, 0.0, -0.13])
+            self._add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, [0.45, 0.004, 0.0], floor, np.eye(3), TABLE)
         if self._object >= 0:  # a hand that stands in the world's middle, fingers along its x axis
             frame = turn_down(self._arrays["gravity"][k]) if "gravity" in self._arrays else np.eye(3)
+            if self._model.body_dofnum[1]:  # on a base that moves
+                frame = data.xmat[1].reshape(3, 3)
             along = frame @ np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]).T
-            middle = frame @ np.array([-0.16, 0.0, -0.02])
+            middle = data.xpos[1] * bool(self._model.body_dofnum[1]) + frame @ np.array([-0.16, 0.0, -0.02])
             self._add(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, [0.03, 0.12, 0.0], middle, along, ARM)
         if self._colours and self._object >= 0:
             self._faces(scene, data)

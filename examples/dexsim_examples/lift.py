@@ -14,7 +14,7 @@ class Lift(Task):
     """Lift objects from a table with a moving hand, and hold them up against pushes."""
 
     scene = Scene(base=Base(palm="down", travel=0.15, turn=0.5), table=Table(top=TOP, centre=(0.05, 0.0)))
-    camera = {"lookat": [0.04, 0.0, -0.07], "distance": 0.6, "azimuth": 130.0, "elevation": -20.0}
+    camera = {"lookat": [0.04, 0.0, -0.02], "distance": 0.75, "azimuth": 130.0, "elevation": -20.0}
     settings = {
         "episode_s": 6.0,
         "objects": {
