@@ -234,6 +234,37 @@ def test_a_diagnosis_takes_the_inertia_that_the_drive_feels():
     assert values[0, k, SERIES_INDEX["inertia"]] == pytest.approx(moves @ full @ moves, rel=1e-4)
 
 
+def test_a_slack_tendon_drags_its_follower_only_when_it_is_taut():
+    text = CHAIN.format(
+        '<tendon><fixed name="t" range="-0.1 0.1"><joint joint="b" coef="1"/><joint joint="a" coef="-0.5"/></fixed>'
+        "</tendon><equality><joint joint1=\"c\" polycoef=\"0 0 0 0 0\"/></equality>"
+    )
+    m = mujoco.MjModel.from_xml_string(text)
+    a = np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0, 101)[1:]])
+    q, moves = Couplings(m, ["a"]).dragged(np.stack([a, 0 * a, 0 * a], 1))
+    np.testing.assert_allclose(q[:101, 1], np.maximum(0.5 * a[:101] - 0.1, 0), atol=1e-9)
+    np.testing.assert_allclose(q[101:, 1], np.minimum(0.4, 0.5 * a[101:] + 0.1), atol=1e-9)  # it stays, then returns
+    taut = np.r_[False, np.abs(np.diff(q[:, 1])) > 1e-9]
+    np.testing.assert_allclose(moves[:, 1, 0], np.where(taut, 0.5, 0.0), atol=1e-9)
+    assert 0.35 < taut.mean() < 0.75
+
+
+def test_a_diagnosis_feels_the_damping_of_what_follows():
+    from dexsim.gap.plant.columns import SERIES_INDEX
+    from dexsim.gap.plant.mechanics import along
+
+    text = CHAIN.format('<equality><joint joint1="b" joint2="a" polycoef="0 0.5 0 0 0"/><joint joint1="c"/></equality>')
+    m = mujoco.MjModel.from_xml_string(text)
+    t = np.linspace(0, 2, 401)
+    q, v = 0.5 * t[:, None], np.full((401, 1), 0.5)
+    run = SimpleNamespace(t=t, fine=None, qs=q, vs=v, as_=0 * v, gravity=np.zeros(3), smooth=lambda: None)
+    loads = []
+    for damping, friction in ((0.0, 0.0), (0.2, 0.03)):
+        m.dof_damping[1], m.dof_frictionloss[1] = damping, friction
+        loads.append(along(m, run, ("a",), added=False)[1][0, :, SERIES_INDEX["rest"]])
+    np.testing.assert_allclose(loads[1] - loads[0], 0.5 * (0.2 * 0.25 + 0.03), rtol=1e-6)
+
+
 def test_a_joint_without_a_name_is_one_that_nobody_drives():
     m = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><joint name="a"/><geom size=".1"/><body><joint/><geom size=".1"/></body></body>'
