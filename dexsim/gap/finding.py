@@ -57,6 +57,26 @@ class Finding:
         } | ({"hint": True} if self.hint else {})
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """The one word of a diagnosis, the findings behind it (hints last), the error that it goes by (`held_out`; None: of
+    nothing), the share of the gap that is left, and what the rest depends on."""
+
+    word: str
+    findings: tuple[Finding, ...]
+    error: dict[str, Any] | None = None
+    fraction: float | None = None
+    depends_on: tuple[str, ...] = ()
+
+    def into(self, data: dict[str, Any]) -> None:
+        """Write it into what diagnosis.json holds; regimes that are not judged stay there."""
+        data["verdict"], data["findings"] = self.word, [f.to_json() for f in self.findings]
+        data["unexplained"]["depends_on"] = list(self.depends_on)
+        if self.error is not None:
+            beside = {k: v for k, v in data["held_out"].items() if k == "not_judged"}
+            data["held_out"], data["unexplained"]["fraction_of_gap"] = self.error | beside, self.fraction
+
+
 def chances(rivals: Sequence[tuple[str, float]]) -> tuple[dict[str, Any], ...]:
     """Return the first three rivals (effect, share) as `alternatives`."""
     return tuple({"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3])

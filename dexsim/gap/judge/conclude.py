@@ -18,7 +18,7 @@ from dexsim.gap import locate
 from dexsim.gap.effects import Effect
 from dexsim.gap.effects.body import add_armature
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry, modelled
-from dexsim.gap.finding import Finding
+from dexsim.gap.finding import Finding, Verdict
 from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
@@ -523,15 +523,26 @@ def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
 
 
 def decide(d: Diagnosis) -> None:
-    """Which findings are hints, the verdict with the error that it goes by, how much of the gap is left and the
-    sentence: the last step, after everything was found of signals, joints, pushes and touch. Nothing else decides any
-    of these."""
-    data, felt = d.data, d.touch
+    """The verdict and its sentence: the last step, after everything was found of signals, joints, pushes and touch."""
+    verdict = _decided(d)
+    verdict.into(d.data)
+    d.findings = list(verdict.findings)
+    if d.touch is not None:  # in their own order
+        settled = {(f.effect, *f.taxels): f for f in d.findings}
+        d.touch.findings = [settled[f.effect, *f.taxels] for f in d.touch.findings]
+    if verdict.word != "unusable":
+        d.sentence = sentence(d.data, d, _floor(d)) + _unjudged(d.data, d.judged)
+
+
+def _decided(d: Diagnosis) -> Verdict:
+    """Which findings are hints, the verdict with the error that it goes by, and how much of the gap is left. Nothing
+    else decides any of these."""
+    felt = d.touch
     mine, of_touch = held_out.settle(d.findings), [] if felt is None else held_out.settle(felt.findings)
     joints, error = ("unusable", None) if d.judged is None else _of_joints(mine, d.judged, _floor(d))
     if joints == "none":
         mine = [held_out.whispered(f) if f.held_out and not f.hint and not _by_torque(f) else f for f in mine]
-    depends = [] if joints in ("none", "explained") else list(data["unexplained"]["depends_on"])
+    depends = [] if joints in ("none", "explained") else list(d.data["unexplained"]["depends_on"])
     word, touch = joints, None if felt is None else _of_touch(felt, of_touch)
     if touch == "none" and felt is not None and felt.before is not None:
         of_touch = [f if f.hint else held_out.whispered(f) for f in of_touch]
@@ -542,18 +553,10 @@ def decide(d: Diagnosis) -> None:
         felt_alone = not named and (joints == "none" or any(not f.hint for f in of_touch)) and touch != "none"
         if joints == "unusable" or (felt_alone and felt.before is not None):
             error = _error_of_touch(felt)
-    if felt is not None:
-        felt.findings = of_touch
     of_touch = sorted(of_touch, key=lambda f: -f.confidence)
-    d.findings = sorted([*mine, *of_touch], key=lambda f: f.hint)
-    data["verdict"], data["findings"] = word, [f.to_json() for f in d.findings]
-    data["unexplained"]["depends_on"] = depends
-    if error is not None:
-        beside = {k: v for k, v in data["held_out"].items() if k == "not_judged"}
-        data["held_out"] = error | beside
-        data["unexplained"]["fraction_of_gap"] = _left_of_gap(d, error)
-    if word != "unusable":
-        d.sentence = sentence(data, d, _floor(d)) + _unjudged(data, d.judged)
+    findings = tuple(sorted([*mine, *of_touch], key=lambda f: f.hint))
+    left = None if error is None else _left_of_gap(d, error)
+    return Verdict(word, findings, error, left, tuple(depends))
 
 
 def _unjudged(data: dict[str, Any], by: Judged | None) -> str:
