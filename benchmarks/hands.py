@@ -250,9 +250,10 @@ it names none. No file of these hands is in the repository.
 
 
 def page(rows: Sequence[dict[str, Any]], out: Path, path: Path) -> None:
-    """Write the page, and its sheet of pictures beside it."""
+    """Write the page, and its sheet of pictures beside it; its later sections stay."""
     sheet(rows, out, path.parent / "media" / "hands.png")
-    path.write_text(PAGE.format(train=" ".join(TRAIN[:-1]), table=table(rows)), encoding="utf-8")
+    _, more, rest = (path.read_text(encoding="utf-8") if path.is_file() else "").partition("\n## ")
+    path.write_text(PAGE.format(train=" ".join(TRAIN[:-1]), table=table(rows)) + more + rest, encoding="utf-8")
 
 
 if __name__ == "__main__":
