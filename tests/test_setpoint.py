@@ -13,12 +13,15 @@ import yaml
 from dexsim.actuator.columns import COLUMNS
 from dexsim.actuator.reference import Step, setpoint
 from dexsim.cli import start
+from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions, inputs
 from dexsim.gap.search.search import JointSearch
 from dexsim.paths import CONFIGS
-from dexsim.recording import read
-from dexsim.recording.mechanism import mechanism
+from dexsim.recording import read, write
+from dexsim.recording.mechanism import drive, mechanism, recorded
+from dexsim.recording.realistic import Hardware, realistic
+from dexsim.recording.schema import COMMANDS, Series
 from dexsim.tasks import make_env
 
 
@@ -99,14 +102,11 @@ def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
     assert best.fit.value("setpoint_profile.speed") == pytest.approx(3.1, rel=0.05)
 
 
-def drive_in_training(folder, profile):
+def drive_in_training(servo):
     """Return the speeds [6, 4] rad/s of a joint of a hand in training whose target moves at 3.3 rad/s."""
-    table = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text())
-    table["joints"].setdefault("index_joint1", {}).update(profile)
-    (folder / "servo.yaml").write_text(yaml.safe_dump(table))
-    cfg = start.for_train(["task=grasp", "device=cpu", f"servo_file={folder / 'servo.yaml'}"], CONFIGS).cfg
+    cfg = start.for_train(["task=grasp", "device=cpu", f"servo_file={servo}"], CONFIGS).cfg
     env = make_env(cfg, 4, "cpu", 0, "mujoco")
-    j, q, action = env.hand.joints.index("index_joint1"), [], torch.zeros(4, 12)
+    j, q, action = env.hand.joints.index(JOINT), [], torch.zeros(4, 12)
     action[:, j] = 1.0
     for _ in range(7):
         env.step(action)
@@ -114,12 +114,48 @@ def drive_in_training(folder, profile):
     return torch.stack(q).diff(dim=0) / (env.decimation * env.engine.mjm.opt.timestep)
 
 
+JOINT, TIMES = "index_joint1", np.arange(0, 6, 0.01)
+
+
+def servo_with(profile, path):
+    """Return a path to the believed servo of the hand with a profile of one joint."""
+    table = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text())
+    table["joints"].setdefault(JOINT, {}).update(profile)
+    path.write_text(yaml.safe_dump(table))
+    return path
+
+
 def test_a_fitted_profile_is_what_the_drive_in_training_has(tmp_path):
     """A servo.yaml with `profile_speed` as a diagnosis writes it, with its interval, given to training: no joint goes
     faster than its profile, each world by one within the interval; without it the joint follows."""
-    fast = drive_in_training(tmp_path, {})
-    slow = drive_in_training(tmp_path, {"profile_speed": {"value": 0.6, "low": 0.5, "high": 0.7}})
-    assert fast[-1].min() > 2.5 and slow.max() < 0.75
+
+    def speeds(profile):
+        return drive_in_training(servo_with(profile, tmp_path / "servo.yaml"))
+
+    slow = speeds({"profile_speed": {"value": 0.6, "low": 0.5, "high": 0.7}})
+    assert speeds({})[-1].min() > 2.5 and slow.max() < 0.75
     assert slow[-1].median() > 0.4 and slow[-1].std() > 0.02  # it moves, each world at a speed of its own
-    held = drive_in_training(tmp_path, {"profile_speed": {"value": 0.6, "low": 0.6, "high": 0.6}})
-    assert held[-1].max() < 0.62
+    assert speeds({"profile_speed": {"value": 0.6, "low": 0.6, "high": 0.6}})[-1].max() < 0.62
+
+
+@pytest.mark.slow
+def test_a_profile_in_recordings_of_a_hand_reaches_its_training(tmp_path):
+    """Recordings of a hand whose firmware moves one joint's setpoint at 1.4 rad/s: `diagnose` names that, and training
+    with the servo.yaml that it writes drives the joint at that speed."""
+    true, t, paths = mechanism(None, str(servo_with({"profile_speed": 1.4}, tmp_path / "true.yaml"))), TIMES, []
+    steps = np.repeat([0.2, 1.3, 0.5, 1.5, 0.1, 0.9], 100)
+    for k, way in enumerate((steps, 0.8 + 0.6 * np.sin(4 * t), np.roll(steps, 250) * 0.9, 0.7 + 0.5 * np.sin(6 * t))):
+        sent = Series(t, way[:, None], COMMANDS, t.copy())
+        made = realistic(recorded(drive(true, sent, [JOINT], 6.0, timestep=0.001), true, sent, [JOINT]), seed=k,
+                         hardware=Hardware())  # fmt: skip
+        made.meta["servo"] = ""  # what is hidden is not told
+        paths.append(tmp_path / f"m{k}.mcap")
+        write(paths[-1], made)
+    d = diagnose(Settings(paths, tmp_path / "out", joints={JOINT}, next_recording=False), say=lambda _: None)
+    save(d, tmp_path / "out")
+    first = d.data["findings"][0]
+    assert first["effect"] == "setpoint_profile" and first["where"]["joints"] == [JOINT], d.sentence
+    assert first["parameters"]["speed"]["value"] == pytest.approx(1.4, rel=0.05)
+    files = (CONFIGS / "servo" / "xhand.yaml", tmp_path / "out" / "servo.yaml")
+    believed, found = (drive_in_training(x)[-1] for x in files)
+    assert believed.min() > 2.5 and 1.1 < found.median() < 1.5 and found.max() < 1.7

@@ -54,6 +54,12 @@ FILES = {
     "rows.json": json.dumps({"kp": 200, "entries": ROWS}).encode(),
     "rows.jsonl": text(map(json.dumps, ROWS)),
     "lists.json": json.dumps(BY_NAME).encode(),
+    "stamps.jsonl": text(json.dumps({"stamp": {"sec": 7 + int(round(100 * t) // 100), "nanosec": round(1e9 * (t % 1))},
+                                     "name": ["elbow"], "position": [q], "command": [c]})
+                         for t, c, q in zip(np.round(T, 2), GOAL, SHOWN, strict=True)),
+    "dates.csv": text(table(("Datum", "target.elbow", "actual.elbow"), (
+        [f"03.11.2026 09:00:{t:06.3f}".replace(".", ",", 9).replace(",", ".", 2) for t in T], GOAL, SHOWN),
+        separator=";")),
     "records.npz": {"log": RECORDS},
     "step.npz": {"dt": 0.01, "q_cmd": GOAL, "q": SHOWN},
     "fps.npz": {"fps": 100, "q_cmd": GOAL[:, None], "q": SHOWN[:, None]},
@@ -85,6 +91,10 @@ def test_a_table_is_read_as_it_was_written(tmp_path, name):
         "t_cmd": ("time", "command", ""), "t": ("time", "", ""), "timestamps": ("time", "", ""),
         "tau_abs.j2": ("effort", "j2", ""), "Present_Position_3": ("position", "3", ""),
         "id3_goal_position": ("command", "id3", ""), "goal_current": None, "goal_velocity": None,
+        "goal_velocity.a": None, "desired_torque.a": None, "measured_torque.a": ("effort", "a", ""),
+        "target_positions.a": ("command", "a", ""), "joint_positions.a": ("position", "a", ""),
+        "cmd_pos_0": ("command", "0", ""), "pos_0": ("position", "0", ""), "observation.a": ("position", "a", ""),
+        "current_position_elbow": ("position", "elbow", ""), "observation.velocity.a": ("velocity", "a", ""),
     }.items(),
 )  # fmt: skip
 def test_a_columns_name_says_what_it_is(column, role):
@@ -99,6 +109,12 @@ def test_arrays_without_names_take_those_that_are_stated(tmp_path):
     text_ = text(table(("time", "command.joint1", "position.joint1")))
     (tmp_path / "b.csv").write_bytes(text_)
     assert read(tmp_path / "b.csv", meta={"joint_names": "joint1,joint2"}).joints == ("joint1",)  # names, no numbers
+
+
+def test_a_table_without_positions_says_so(tmp_path):
+    (tmp_path / "a.csv").write_bytes(text(table(("time", "command.elbow", "seen_elbow"))))
+    (f,) = [f for f in read(tmp_path / "a.csv").findings if f.kind == "missing_topic"]
+    assert f.severity == "error" and "no positions" in f.text and "remap.position.JOINT" in f.text
 
 
 def test_a_large_effort_of_no_stated_kind_is_asked_about(tmp_path):
@@ -116,6 +132,7 @@ def test_a_large_effort_of_no_stated_kind_is_asked_about(tmp_path):
         ("a.json", b"{", "is not JSON"), ("a.json", b"[1, 2]", "no list of mappings"),
         ("a.jsonl", b'{"t": 0}\n{', "is not JSON"), ("a.txt", b"\0\1\2", "no text file"),
         ("a.txt", b"hello\nworld\n", "no comma, semicolon, tab or blank"),
+        ("a.csv.gz", b"\x1f\x8b\x08\0", "packed: unpack it first, `gunzip a.csv.gz`"),
     ],
 )  # fmt: skip
 def test_what_is_no_table_is_one_line(tmp_path, name, content, says):

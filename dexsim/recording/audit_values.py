@@ -71,6 +71,9 @@ def commanded(r: Recording) -> Iterator[Finding]:
             "diagnose and replay cannot use this recording")  # fmt: skip
         text = f"no commands: {use}; {COMMANDS_FIX}"
         yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if felt else "error")
+    if len(r.commands) and not np.isfinite(r.states.position.value).any():
+        text = "no positions: nothing says where the joints went; name their columns with remap.position.JOINT=COLUMN"
+        yield Finding("missing_topic", STATES, NAN, 0, f"{text}, or their topic with remap.{STATES}=TOPIC", "error")
 
 
 def order(r: Recording) -> Iterator[Finding]:

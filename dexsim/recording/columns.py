@@ -30,33 +30,21 @@ from dexsim.recording.units import UNITS
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".npz", ".json", ".jsonl")
 EPOCHS = {"ms": 1e11, "us": 1e14, "ns": 1e17}
 """From where on a time since 1970 is in a unit: 1973, and for 3000 years on."""
+_PLACES = ("position", "pos", "angle", "joint_position", "joint_pos", "joint_angle", "dof_pos", "q")
+
+
+def _both(of: Iterable[str]) -> tuple[str, ...]:
+    """Words of a position before each of `of` and after it: `target_pos`, `pos_target`."""
+    return tuple(name for a in of for p in _PLACES for name in (f"{a}_{p}", f"{p}_{a}"))
+
+
+_SEEN = ("measured", "present", "actual", "current", "feedback", "state")
+_ASKED = ("command", "cmd", "commanded", "target", "setpoint", "reference", "ref", "desired", "des", "goal")
 QUANTITIES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "timestamp", "timestamps", "stamp", "t", "host_time", "zeit", "temps", "tiempo"),
-    "command": (
-        "command",
-        "cmd",
-        "target",
-        "setpoint",
-        "reference",
-        "desired",
-        "goal",
-        "goal_position",
-        "target_position",
-        "command_position",
-        "position_command",
-        "commanded_position",
-        "desired_position",
-        "q_des",
-        "q_cmd",
-        "target_value",
-        "des_dof_pos",
-        "target_joint_pos",
-        "commanded",
-    ),
-    "position": (
-        "position", "pos", "angle", "measured", "measured_position", "measured_value", "present_position", "q",
-        "actual", "actual_position", "encoder", "qpos", "dof_pos", "joint_pos", "state_joint_pos",
-    ),
+    "time": ("time", "timestamp", "stamp", "t", "host_time", "date", "datetime", "zeit", "datum", "temps", "tiempo"),
+    "command": tuple(x for x in _ASKED if x not in ("ref", "des")) + _both(_ASKED) + ("target_value",),
+    "position": ("measured", "measured_value", "actual", "encoder", "qpos", *_PLACES,
+                 *_both(_SEEN)),
     "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel", "dof_vel"),
     "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
     "temperature": ("temperature", "temp", "present_temperature"),
@@ -70,7 +58,7 @@ _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=
 
 def _patterns(word: str) -> tuple[re.Pattern[str], ...]:
     """A column that is a word alone, that begins with it, and that ends with it, the joint beside it."""
-    inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
+    inner = r"[\s_-]*".join(map(re.escape, word.split("_"))) + ("s?" if len(word) > 3 else "")
     # one letter is a quantity only beside a mark no word has inside
     between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"
     forms = rf"[_\W]*{inner}[_\W]*", rf"\W*{inner}{between}(.+?)[\])}}]*", rf"\W*(.+?){between}{inner}[\])}}]*"
@@ -85,6 +73,11 @@ _CLOCKS = ("elapsed", "epoch", "timestamp", "time", "stamp", "datetime", "date")
 _NAMED = ("joint", "joint_name", "name", "motor", "motor_name", "servo", "joint_id", "motor_id", "servo_id")
 """Columns that say which joint a line is of."""
 _NOT_POSITIONS = {w for q in ("velocity", "effort", "duty") for w in QUANTITIES[q]} | {"force", "acceleration"}
+_OTHER = re.compile(
+    rf"({'|'.join((*_ASKED, *_SEEN))})[\s_.]+({'|'.join(sorted(_NOT_POSITIONS, key=len, reverse=True))})([^a-z].*)?",
+    re.I,
+)
+"""A target of another kind than a position, or another measured value."""
 _OWN = ("ticks", "counts", "raw", "register", "registers", "value", "abs", "filtered")
 """Ends of a column's name that say no more than that its numbers are the drive's own."""
 _CLOCK_STEP = 0.5  # s between samples from which on a time without a unit is not believed to be in seconds
@@ -157,8 +150,8 @@ def of_columns(
     named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
     if not raw:
         raise UserError(f"recording {path}: holds no column of numbers")
-    raw = _lines_of_joints(raw)
-    roles = _roles(path, list(raw), named)
+    raw = _lines_of_joints(_stamped(raw))
+    roles, said = _roles(path, list(raw), named), _names_in(raw)
     raw, told = _numbers(path, raw, roles, findings, set(named.values()))
     roles = {c: r for c, r in roles.items() if c in raw}
     if not any(r[0] == "time" for r in roles.values()):
@@ -170,7 +163,7 @@ def of_columns(
     joints: list[str] = []
     effort: set[str] = set()
     si: set[tuple[str, str]] = set()
-    of = schema.joint_names(meta.get("joint_names", ""))
+    of = schema.joint_names(meta.get("joint_names", "")) or said
     listed = {j for q, j, _, _ in roles.values() if q not in ("time", "supply_voltage") and j}
     place = lambda x: x.removeprefix("joint").removeprefix("_")  # noqa: E731
     if of and not listed & set(of) and all(place(x).isdecimal() and int(place(x)) < len(of) for x in listed):
@@ -241,6 +234,28 @@ def of_columns(
         quantity, joint = roles[column][:2]
         lines.setdefault(quantity, {})[joint or joints[0]] = on
     return Table(joints, time, value, stated, start, findings, nameless, si, lines)
+
+
+def _stamped(raw: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Columns as they are, seconds and nanoseconds of one stamp as one time."""
+    for column in raw if "time" not in raw else ():
+        found = re.fullmatch(r"(|.*[._])secs?", column)
+        if found is None:
+            continue
+        rest = next((c for x in ("nanosec", "nsec", "nsecs", "nanosecs") if (c := found[1] + x) in raw), None)
+        if rest is not None:
+            whole, part = (_floats(x)[0] if isinstance(x, list) else np.asarray(x) for x in (raw[column], raw[rest]))
+            return {"time": whole + 1e-9 * part} | {k: v for k, v in raw.items() if k not in (column, rest)}
+    return raw
+
+
+def _names_in(raw: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of joints that stand in columns `name.0`, `name.1` ..., as messages have them, the same in all lines."""
+    for word in ("name", "names", "joint_names"):
+        columns = [raw[f"{word}.{k}"] for k in range(len(raw)) if f"{word}.{k}" in raw]
+        if columns and all(isinstance(x, list) and x[0].strip() and len(set(x)) == 1 for x in columns):
+            return tuple(x[0].strip() for x in columns)
+    return ()
 
 
 def _lines_of_joints(raw: Mapping[str, Any]) -> dict[str, Any]:
@@ -359,7 +374,13 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
     if name.lstrip("/").startswith("joint_commands/"):  # topics as plotting tools write them out
         name = re.sub(r"^/?joint_commands/(.+)/position$", r"command.\1", name)
     name = re.sub(r"^observation[./]state[./]", "", name)  # LeRobot's names
+    if (seen := re.fullmatch(r"observation[./](.+)", name)) is not None:
+        name = seen[1] if _known(seen[1]) else f"position.{seen[1]}"
     name = re.sub(r"^action[./](.+?)([./]pos)?$", r"command.\1", name)
+    if (other := _OTHER.fullmatch(name)) is not None:  # a target, or a measured value, that is no position
+        if other[1].lower() in _ASKED:
+            return None
+        name = other[2] + (other[3] or "")
     if (clock := re.fullmatch(r"t[_.](\w+)|(\w+)[_.]t", name, re.I)) is not None:  # t_cmd, pos_t
         plain = (clock[1] or clock[2]).lower()
         whose = next((q for q, words in QUANTITIES.items() if q != "time" and plain in words), None)
@@ -585,6 +606,8 @@ def _dates(cells: list[str]) -> tuple[np.ndarray, int]:
     out, bad = np.full(len(cells), np.nan), 0
     for i, cell in enumerate(cells):
         text = cell.strip().replace(",", ".")
+        if (day := re.match(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+", text)) is not None:
+            text = f"{day[3]}-{int(day[2]):02d}-{int(day[1]):02d}T{text[day.end() :]}"
         try:
             if re.match(r"\d{1,2}:\d\d(:|$)", text):
                 parts = [float(x) for x in text.split(":")]

@@ -28,6 +28,9 @@ from dexsim.errors import UserError
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
 ZSTD = b"\x28\xb5\x2f\xfd"
+PACKED = {b"\x1f\x8b": "gunzip", ZSTD: "zstd -d", b"\xfd7zXZ": "unxz", b"BZh": "bunzip2", b"PK\3\4": "unzip",
+          b"7z\xbc\xaf": "7z x"}  # fmt: skip
+"""How packed files begin, and what unpacks them."""
 BAGS = ("*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
 """What the files of a bag's folder are called."""
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -75,6 +78,8 @@ def open_container(path: Path) -> Container:
         hint = (
             f"; it is a bag of ROS 1: `rosbags-convert --src {path.name} --dst {path.stem}` makes one of ROS 2"
             if data[:8] == b"#ROSBAG "
+            else f"; it is packed: unpack it first, `{packed} {path.name}`"
+            if (packed := next((tool for magic, tool in PACKED.items() if data[:6].startswith(magic)), ""))
             else "; numbers in named columns are read from .csv, .json, .npz and the like"
         )
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
