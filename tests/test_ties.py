@@ -164,6 +164,14 @@ def test_a_pulled_tendon_goes_as_far_as_its_commands_or_its_limits():
     assert _pulls('<position name="p" tendon="t" kp="2"/>', 'actuatorfrcrange="-0.7 0.7"').effort == {"p": 0.7}
 
 
+def test_delays_of_actuators_and_joints_in_the_parents_frame_are_taken():
+    late = '<position joint="{joint}" kp="3" delay="0.02" nsample="5"/>'
+    found = drives.read(mujoco.MjSpec.from_string(jaws(actuators=late)))
+    assert set(found.delay.values()) == {0.02} and len(found.delay) == 6
+    found = drives.read(mujoco.MjSpec.from_string(jaws(actuators='<motor jointinparent="{joint}" ctrlrange="-1 1"/>')))
+    assert found.notes == [] and set(found.effort.values()) == {1.0}
+
+
 def test_two_actuators_on_one_tendon_are_one_drive():
     found = _pulls('<position name="p" tendon="t" kp="2"/><velocity name="d" tendon="t" kv="0.3"/>')
     assert [p.name for p in found.pulls] == ["p"] and (found.kp, found.kd) == ({"p": 2.0}, {"p": 0.3})

@@ -25,12 +25,13 @@ class Pull:
 @dataclass
 class Drives:
     """By joint, or by name of a pull: effort [N m], kp [N m/rad], kd [N m s/rad], at the joint (N, N/m, N s/m of a
-    slide); notes: what of the actuators was not used, a line each. pulls: actuators that pull a tendon; moved: joints
-    that have a drive."""
+    slide), delay [s]; notes: what of the actuators was not used, a line each. pulls: actuators that pull a tendon;
+    moved: joints that have a drive."""
 
     effort: dict[str, float] = field(default_factory=dict)
     kp: dict[str, float] = field(default_factory=dict)
     kd: dict[str, float] = field(default_factory=dict)
+    delay: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     pulls: list[Pull] = field(default_factory=list)
     moved: set[str] = field(default_factory=set)
@@ -64,6 +65,8 @@ def read(spec: mujoco.MjSpec) -> Drives:
             continue
         else:
             out.moved.add(at)
+        if a.delay > 0:
+            out.delay[at] = float(a.delay)
         gear = float(a.gear[0])
         gain, bias = np.array(a.gainprm, float), np.array(a.biasprm, float)
         affine = a.biastype == mujoco.mjtBias.mjBIAS_AFFINE

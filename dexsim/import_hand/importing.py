@@ -515,7 +515,7 @@ def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
         value = {key: float(f"{own[key] or guess[key]:.3g}") for key in guess}
         joints[j["name"]] = {
             "kp": value["kp"], "kd": value["kd"], "torque_limit": j["effort"], "no_load_speed": j["speed"],
-            "delay": 0.01, "coulomb_friction": value["coulomb_friction"],
+            "delay": said.delay.get(j["name"], 0.01), "coulomb_friction": value["coulomb_friction"],
         }  # fmt: skip
     rules = {
         "kp": f"full torque at {SWEEP:g} rad of error", "kd": "a fortieth of kp",
@@ -523,8 +523,9 @@ def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
     }  # fmt: skip
     text = "; ".join(f"{key} of {guessed[key]} joints ({rule})" for key, rule in rules.items() if guessed[key])
     head = (
-        f"# The drives of {name}. Guesses, until a diagnosis of the real hand replaces them: delay (100 Hz)"
-        f"{'; ' + text if text else ''}.\n# All else is from the model's file and from hand.yaml.\n"
+        f"# The drives of {name}. Guesses, until a diagnosis of the real hand replaces them: delay of"
+        f" {len(joints) - len(set(joints) & set(said.delay))} joints (100 Hz){'; ' + text if text else ''}.\n"
+        "# All else is from the model's file and from hand.yaml.\n"
     )
     data = {
         "drive": "torque",
