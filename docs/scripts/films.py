@@ -1,6 +1,6 @@
 """Makes the films and pictures of the documentation from the included policies, on a CPU.
 
-    python docs/scripts/films.py grasp | rotate | fingertips | touch | gap [out=docs/media]
+    python docs/scripts/films.py grasp | rotate | fingertips | touch | gap | overview [out=docs/media]
 
 Each is played with seeds that nobody chose by how they look, on C MuJoCo, and cut to what happens. Needs OpenGL for
 offscreen rendering (EGL or OSMesa).
@@ -185,7 +185,57 @@ def gap(out: Path) -> None:
     fig.savefig(out / "gap.png", dpi=110)
 
 
-FILMS = {"grasp": grasp, "rotate": rotate, "fingertips": fingertips, "touch": touch, "gap": gap}
+def overview(out: Path) -> None:
+    """Join the films of the rotation, of the grasp and of a report page, and draw a still of the three."""
+    import imageio.v2 as imageio
+    import matplotlib
+    from PIL import ImageDraw, ImageFont
+
+    font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans-Bold.ttf", 30)
+    dark = (24, 28, 36)
+
+    def titled(picture: Image.Image, title: str) -> np.ndarray:
+        frame = Image.new("RGB", (1280, 780), dark)
+        frame.paste(picture.convert("RGB").resize((1280, 720)), (0, 60))
+        ImageDraw.Draw(frame).text((20, 12), title, font=font, fill="white")
+        return np.asarray(frame)
+
+    def save(name: str, frames: list[np.ndarray]) -> None:
+        flags = ["-crf", "30", "-preset", "veryslow", "-movflags", "+faststart"]
+        with imageio.get_writer(out / name, fps=24, macro_block_size=4, output_params=flags) as writer:
+            for frame in frames:
+                writer.append_data(frame)
+
+    page = Image.open(out / "diagnosis_page.png").convert("RGB")
+    tall = page.resize((1280, page.height * 1280 // page.width))
+    part = np.clip((np.arange(140) - 40) / 80, 0, 1)
+    tops = (part**2 * (3 - 2 * part) * (tall.height - 720)).astype(int)
+    pages = [tall.crop((0, y, 1280, y + 720)) for y in tops]
+    save("diagnosis_page.mp4", [np.asarray(p) for p in pages])
+    turning = [Image.fromarray(x) for x in imageio.get_reader(out / "rotate.mp4")]
+    holding = [Image.fromarray(x) for x in imageio.get_reader(out / "grasp.mp4")][30:140]
+    titles = "1  Train: a policy turns a cube", "2  Feel: 600 taxels, a push", "3  Diagnose: your own machine"
+    parts = zip((turning, holding, pages), titles, strict=True)
+    save("dexsim.mp4", [titled(x, title) for frames, title in parts for x in frames])
+
+    still = Image.new("RGB", (1284, 440), dark)
+    touched, scale = Image.open(out / "touch.png").convert("RGB"), page.width / 891
+    bars, hand = (page.crop([int(v * scale) for v in box]) for box in ((360, 275, 845, 405), (40, 270, 350, 605)))
+    still.paste("white", (860, 56, 1284, 440))
+    for picture, (x, y, width, height) in (
+        (turning[60].crop((140, 50, 640, 518)), (0, 56, 424, 384)),
+        (touched.crop((400, 150, 800, 460)), (430, 56, 424, 328)),
+        (touched.crop((0, 555, 1280, 720)), (430, 385, 424, 55)),
+        (bars, (866, 62, 412, 118)),
+        (hand, (966, 182, 236, 256)),
+    ):
+        still.paste(picture.resize((width, height), Image.Resampling.LANCZOS), (x, y))
+    for k, title in enumerate(titles):
+        ImageDraw.Draw(still).text((430 * k + 10, 10), title.split(":")[0], font=font, fill="white")
+    still.quantize(256).save(out / "dexsim.png", optimize=True)
+
+
+FILMS = {"grasp": grasp, "rotate": rotate, "fingertips": fingertips, "touch": touch, "gap": gap, "overview": overview}
 
 
 def main(argv: list[str]) -> int:
