@@ -188,7 +188,8 @@ def test_presses_from_outside_are_found_without_commands():
 
 
 def test_presses_in_percent_and_milliamperes_are_the_same_presses(tmp_path):
-    """`units.position=percent units.effort=mA` of `dexsim calibrate`, along the hand's own ranges."""
+    """`units.position=percent units.effort=mA` of `dexsim calibrate`, along the hand's own ranges, of a
+    joint of another name."""
     from dexsim.calibration.command import _settings
 
     plain = pushed()
@@ -196,21 +197,25 @@ def test_presses_in_percent_and_milliamperes_are_the_same_presses(tmp_path):
     share = 100 * (plain.commands.value - low) / (high - low)
     current = Series(plain.states.effort.t, 1000 * plain.states.effort.value, STATES)
     t = plain.commands.t
-    other = replace(plain, commands=Series(t, share, COMMANDS), states=States(Series(t, share, STATES), None, current))
     write(tmp_path / "si.mcap", plain)
+    a = current_half(tmp_path / "si.mcap", None)
+    ours = next(iter(a.fits))
+    theirs = tuple("zeige" if j == ours else j for j in plain.joints)
+    states = States(Series(t, share, STATES), None, current)
+    other = replace(plain, joints=theirs, commands=Series(t, share, COMMANDS), states=states)
     write(tmp_path / "own.mcap", other)
-    _, meta = _settings(["units.position=percent", "units.effort=mA", "meta.robot=mine"], {"real": None})
-    assert meta == {"units.position": "percent", "units.effort": "mA", "robot": "mine"}
-    a = current_half(tmp_path / "si.mcap", {})
-    b = current_half(tmp_path / "own.mcap", meta)
+    said = ["units.position=percent", "units.effort=mA", "meta.robot=mine", f"remap.{ours}=zeige"]
+    _, reading = _settings(said, {"real": None})
+    assert reading["meta"] == {"units.position": "percent", "units.effort": "mA", "robot": "mine"}
+    b = current_half(tmp_path / "own.mcap", reading)
     assert a.fits and a.fits.keys() == b.fits.keys()
     for joint, fit in a.fits.items():
         assert b.fits[joint].ratio == pytest.approx(fit.ratio, rel=1e-3)
 
 
-def current_half(path, meta):
+def current_half(path, reading):
     """Return the fits of one recording of currents."""
-    return current.half([path], "current_A", HAND, meta)
+    return current.half([path], "current_A", HAND, reading)
 
 
 # -- rubber

@@ -29,15 +29,15 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(program.words(_help(file)), end="")
         return 0 if argv else 2
-    s, meta = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
+    s, reading = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
     if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate", "simulate_touch")):
         raise UserError(
             "say what to calibrate: real=, sim=, simulate=true, touch=, simulate_touch=true or curve= (--help)"
         )
-    return run(s, meta)
+    return run(s, reading)
 
 
-def run(s: dict[str, Any], meta: dict[str, str]) -> int:
+def run(s: dict[str, Any], reading: dict[str, dict[str, str]]) -> int:
     """Return the everything that the settings ask for."""
     from dexsim import outputs
     from dexsim.calibration import simulate
@@ -71,14 +71,16 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
             rolled = simulate.make_rolled(stage / "pads", hand, True, int(s["seed"]), s["faults"])
         s["touch"] = s["touch"] or str(out / rolled.relative_to(stage))
     with outputs.staged(out) as stage:
-        assumed = _fits(s, meta, stage, report, hand)
+        assumed = _fits(s, reading, stage, report, hand)
     for text in assumed:
         print(f"note     {text}")
     print(f"yaml     {out / 'calibration.yaml'}")
     return 0
 
 
-def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any], hand: Hand) -> list[str]:
+def _fits(
+    s: dict[str, Any], reading: dict[str, dict[str, str]], out: Path, report: dict[str, Any], hand: Hand
+) -> list[str]:
     """Return all fits and their plots, calibration.yaml; returns what is assumed in it."""
     from dexsim.calibration import charts, current
     from dexsim.calibration.file import Calibration, save
@@ -88,7 +90,7 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
         if not s[key]:
             continue
         half = current.half(
-            current.files_of(s[key], key), effort_is, hand, meta if key == "real" else None, int(s["seed"])
+            current.files_of(s[key], key), effort_is, hand, reading if key == "real" else None, int(s["seed"])
         )
         report["source"][key] = s[key] if len(s[key]) < 200 else str(Path(s[key].split(",")[0]).parent)
         _print_half(half, key, symbol)
@@ -108,7 +110,7 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
     if real and real.lsb:  # alpha is in the newtons that these counts were taken for
         touch["lsb"] = real.lsb
     if s["touch"]:
-        touch |= _touch(s, meta, out, hand)
+        touch |= _touch(s, reading, out, hand)
     if s["curve"]:
         touch |= _curve(s, out)
     if touch:
@@ -182,7 +184,7 @@ def _print_ratio(joints: dict[str, Any]) -> None:
     )
 
 
-def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> dict[str, Any]:
+def _touch(s: dict[str, Any], reading: dict[str, dict[str, str]], out: Path, hand: Hand) -> dict[str, Any]:
     """Return the threshold, dead and swapped taxels, gains of every pad."""
     from dexsim.calibration import charts, current, taxels
     from dexsim.calibration.simulate import pads_of
@@ -198,7 +200,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> di
     loads: list[np.ndarray] = []
     unit, lsb, measured = "count", None, True
     for path in current.files_of(s["touch"], "touch"):
-        r = read(path, meta=meta, audit=False, hand=hand)
+        r = read(path, **reading, audit=False, hand=hand)
         if r.tactile is None:
             raise UserError(f"{path}: has no /tactile")
         if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):
@@ -310,9 +312,12 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
     return result
 
 
-def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    out, meta = dict(defaults), {}
-    for key, text in typed.settings(argv, defaults, ("meta.", "units.")).items():
+def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, str]]]:
+    out, remap, meta = dict(defaults), {}, {}
+    for key, text in typed.settings(argv, defaults, ("meta.", "units.", "remap.")).items():
+        if key.startswith("remap."):
+            remap[key.removeprefix("remap.")] = text
+            continue
         if key not in defaults:
             meta[key.removeprefix("meta.")] = text
             continue
@@ -327,7 +332,7 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
             out[key] = text
         if key in CHOICES:
             typed.one_of(key, text, CHOICES[key])
-    return out, meta
+    return out, {"remap": remap, "meta": meta}
 
 
 def _help(file: Path) -> str:
@@ -342,6 +347,8 @@ def _help(file: Path) -> str:
         [
             *lines,
             "  meta.KEY=VALUE                     metadata that wins over what real= and touch= recordings say",
+            "  units.QUANTITY=UNIT                units of real= and touch=, as `dexsim audit` takes them",
+            "  remap.OURS=THEIRS                  names of topics, joints or columns there",
             "",
         ]
     )

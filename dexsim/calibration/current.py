@@ -60,14 +60,14 @@ def files_of(where: str | Sequence[str], key: str) -> list[Path]:
 
 
 def half(
-    paths: Sequence[Path], effort_is: str, hand: Hand, meta: dict[str, str] | None = None, seed: int = 0
+    paths: Sequence[Path], effort_is: str, hand: Hand, reading: dict[str, dict[str, str]] | None = None, seed: int = 0
 ) -> Half:
     """Read presses and fit each joint: from the recording that was made for it (notes say `press: joint=NAME`), else
     from the one in which it works hardest. Raises UserError if none shows a press."""
     out = Half(UNIT[effort_is], hand.joints)
     score: dict[str, tuple[bool, float]] = {}
     for path in paths:
-        r = read(path, meta=meta, hand=hand)
+        r = read(path, **(reading or {}), hand=hand)
         if r.effort_is != effort_is:
             raise UserError(
                 f"{path}: its effort is {r.effort_is}, expected {effort_is}; correct it with meta.effort_is=...,"
