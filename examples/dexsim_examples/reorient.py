@@ -33,11 +33,6 @@ class Reorient(Task):
     reached = memory(dtype=torch.bool)
     home = memory(3)  # m, where the cube lay
 
-    def prepare_task(self):
-        q = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 4)
-        q = q[(q.abs().sum(1) == 1) | (q.abs().sum(1) == 2) | (q.abs().sum(1) == 4)]
-        self.alike = (q / q.norm(dim=1, keepdim=True)).to(self.device)  # turns that put a cube onto itself, each twice
-
     def begin(self, mask):
         pose, m = self.hold(mask), mask[:, None]
         self.home = torch.where(m, pose[:, :3], self.home)
@@ -72,15 +67,13 @@ class Reorient(Task):
 
     @observe("1", noise=0.02, delay=(0.0, 0.05))
     def to_goal(self):
-        """6D of the turn from the cube to its goal, palm frame, from a camera"""
-        return rotation.six(rotation.multiply(self.goal, rotation.conjugate(self.object_pose[:, 3:])))
+        """6D of the turn from the cube to its goal, from a camera"""
+        return rotation.six(rotation.multiply(rotation.conjugate(self.object_pose[:, 3:]), self.goal))
 
-    @observe("1", noise=0.02, delay=(0.0, 0.05))
-    def cube_turn(self):
-        """6D of how the cube lies, whichever face is up: of 24 orientations alike the one next to the palm's"""
-        q = self.object_pose[:, 3:]
-        alike = (q @ rotation.conjugate(self.alike).T).argmax(1)
-        return rotation.six(rotation.multiply(q, self.alike[alike]))
+    @observe("1")
+    def goal_turn(self):
+        """6D of the goal, palm frame"""
+        return rotation.six(self.goal)
 
     @observe("m", noise=0.002, delay=(0.0, 0.05))
     def cube_position(self):
