@@ -4,7 +4,8 @@ that jitter, one dead taxel board), with the same seeds and objects.
 
     python -m benchmarks.xhand_bus checkpoint=checkpoints/grasp.pt episodes=20 seconds=6 seed=5000 out=FILE.json
 
-way: direct, bus (virtual time), process (in real time, the driver's child process with it). noise: of the actions, over
+way: direct, bus (virtual time), process (in real time, the driver's child process with it), child (that process alone:
+its cycles, and how soon it lets go when it is asked to, and when the loop falls silent). noise: of the actions, over
 that of training. camera: s that what is seen of the object is older than in training; ahead: s that the loop carries it
 on for that (`dexsim deploy ahead=`).
 """
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +28,11 @@ from dexsim import export, intervals
 from dexsim.calibration.file import Calibration
 from dexsim.console.ending import guard
 from dexsim.deploy import bundle
-from dexsim.deploy.driver import Clock, VirtualClock
+from dexsim.deploy.driver import PASSIVE, Clock, HandCommand, VirtualClock
+from dexsim.deploy.fake_xhand import FakeXHand, Faults
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.simulated_hand import SimulatedXHand, faked
+from dexsim.deploy.vendor import VendorXHand
 
 FAULTS = "crc=0.005,board=2"
 DEFAULTS = {"checkpoint": "checkpoints/grasp.pt", "episodes": "20", "seconds": "6", "seed": "5000", "out": "",
@@ -83,10 +87,52 @@ def episode(
             "goals": int(report.counts["goals_reached"]), "counts": dict(report.counts)}  # fmt: skip
 
 
+def child(seconds: float) -> dict[str, np.ndarray]:
+    """Times [ms] of the process that holds the bus, in real time, on joints that lag: of its cycles, from `relax` until
+    that is on the wire, and from the loop's last word until the process lets go by itself."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log"
+        faults = Faults(outlier=0.0, log=str(log))
+        d = VendorXHand("auto", Clock(), partial(FakeXHand, faults=faults), side="right")
+        d.open()
+        out: dict[str, list[float]] = {"relax": [], "silent": []}
+
+        def drive(until: float) -> float:
+            while (last := time.monotonic()) < until:
+                time.sleep(0.01)
+                d.read()
+                d.send(HandCommand(np.full(12, 0.3), np.full(12, 300)))
+            return last
+
+        def let_go(since: float) -> float:
+            rows = [line.split() for line in log.read_text().splitlines()]
+            return 1e3 * (min(float(t) for t, mode, _ in rows if float(t) > since and int(mode) == PASSIVE) - since)
+
+        begun = time.monotonic()
+        drive(begun + seconds)
+        rows = np.array([float(line.split()[0]) for line in log.read_text().splitlines()])
+        cycles = 1e3 * np.diff(rows[rows > begun])
+        for k in range(20):
+            at = drive(time.monotonic() + 0.2 + 0.003 * k)
+            if k % 2:
+                at = time.monotonic()
+                d.relax()
+            time.sleep(0.4)
+            out["relax" if k % 2 else "silent"].append(let_go(at))
+            d.relax()
+        d.close()
+    return {"cycle": cycles} | {k: np.array(v) for k, v in out.items()}
+
+
 def main(argv: list[str]) -> int:
     """Prints a line a way, and writes all episodes."""
     given = options(argv, DEFAULTS)
     torch.set_num_threads(1)
+    if given["ways"] == "child":
+        for name, ms in child(float(given["seconds"])).items():
+            print(f"{name:<8} {len(ms)} times: median {np.median(ms):.2f} ms, 99 % within {np.percentile(ms, 99):.2f},"
+                  f" largest {ms.max():.2f}", flush=True)  # fmt: skip
+        return 0
     n, first = int(given["episodes"]), int(given["seed"])
     with tempfile.TemporaryDirectory() as folder:
         b = bundle.load(export.export(given["checkpoint"], Path(folder) / "bundle", steps=2))

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import yaml
 from bundles import make_checkpoint
 
 from dexsim import export
@@ -101,12 +102,17 @@ def test_the_lowest_current_is_the_one_that_moves_it(tmp_path):
 
 
 @pytest.mark.parametrize("dead", [pytest.param(-1, marks=pytest.mark.slow), 37])
-def test_the_calibration_of_touch_finds_a_dead_taxel(tmp_path, monkeypatch, dead):
+def test_the_calibration_finds_a_dead_taxel_and_the_force_of_a_current(tmp_path, monkeypatch, dead):
     monkeypatch.setattr(first_hour, "PRESSES", 30)
-    _, found, _, said = walk(tmp_path, LaggingHand, ["taxels", "calibrate"], dead=dead)
+    more = {"joints": "index_joint1"}
+    _, found, _, said = walk(tmp_path, LaggingHand, ["taxels", "calibrate"], more, dead=dead)
     step, right = found["steps"]["calibrate"], "0 dead" if dead < 0 else f"dead: [{dead}]"
     assert (tmp_path / "calibration" / "calibration.yaml").is_file(), said
     assert all(right in text for text in step["figures"]["pads"].values()), said
+    of = yaml.safe_load((tmp_path / "calibration" / "calibration.yaml").read_text())["joints"]["index_joint1"]
+    assert of["alpha"]["value"] == pytest.approx(12, rel=0.05), "six taxels of 0.02 counts a mA, of 0.1 N"
+    lever = of["beta"]["value"]
+    assert step["figures"]["A_per_Nm"]["index_joint1"] == pytest.approx(lever / 12, rel=0.1), said
 
 
 @pytest.mark.parametrize("fault", [{"refuse_s": 3.0}, {"freeze_s": 3.0}, {"silent_s": 3.0}])

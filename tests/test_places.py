@@ -48,6 +48,23 @@ def test_a_working_folder_that_is_gone_and_an_output_that_is_full_are_one_line(t
     assert second.startswith("error: the disk is full, or what the output goes to")
 
 
+@pytest.mark.slow
+def test_a_policy_is_exported_and_deployed_where_there_is_no_home_and_no_temporary_folder(tmp_path):
+    (tmp_path / "añ b").mkdir()
+    policy, bundle = tmp_path / "chéck pünkt.pt", tmp_path / "öut (1)"
+    policy.write_bytes((ROOT / "checkpoints" / "rotate_proprioception.pt").read_bytes())
+    env = os.environ | {"PYTHONPATH": str(ROOT), "HOME": "/proc", "TMPDIR": "/nowhere/x"}
+    patient = ["seconds=0.2", "home_speed=10", "wait=0", "late=1", "stale=1", "hang=2", "overruns=1000"]
+    for arguments in (
+        ["export", f"checkpoint={policy}", f"out={bundle}", "steps=2"],
+        ["deploy", f"bundle={bundle}", f"record={tmp_path}/añ b/ü c.mcap", *patient],
+        ["deploy", f"bundle={bundle}", "driver=xhand", "port=fake", "record=none", *patient],
+    ):
+        done = subprocess.run([sys.executable, "-m", "dexsim", *arguments], env=env, capture_output=True, text=True)
+        assert done.returncode == 0 and "Traceback" not in done.stderr, (arguments, done.stdout, done.stderr)
+    assert (tmp_path / "añ b" / "ü c.mcap").stat().st_size > 1000
+
+
 @pytest.mark.parametrize("path", ["/a b/ü c.pt", "it's", "/x/[y] (2)", "C:\\a b\\", "a#b;c"])
 def test_a_path_is_taken_as_it_was_typed(path):
     (override,) = settings.parse([f"resume={path}"], CONFIGS).values

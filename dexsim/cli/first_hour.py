@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import typed
+from dexsim import typed, yaml_text
+from dexsim.calibration.file import ASSUMED_LSB
 from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState, VirtualClock
 from dexsim.deploy.readings import copied, implausible
 from dexsim.errors import UserError
@@ -69,6 +70,8 @@ SHORT = 0.1
 """rad before an end of its range at which a joint counts as stopped."""
 PRESSES, PRESS_S = 60, 0.3
 """Of a pad while it is calibrated; s of each."""
+LEADS, HOLD = np.arange(1, 9) * 0.02, 0.5
+"""rad by which the target of a joint that is held runs ahead of it; s of each."""
 LATENCY_STEP, LATENCY_TRIES = 0.12, 5
 
 
@@ -444,8 +447,9 @@ class Hour:
         return step
 
     def calibrate(self) -> Step:
-        """See: press the pad that is named all over with something blunt, as hard as you would hold a cup."""
-        step, names = Step("calibrate", "Taxels under load: dead, swapped, threshold"), self.hand.finger_names
+        """See: press the pad that is named all over with something blunt, as hard as you would hold a cup; then hold
+        something hard to the fingertip that is named, which presses it harder and harder."""
+        step, names = Step("calibrate", "Taxels and currents under load"), self.hand.finger_names
         if hand_layout(self.hand) is None:
             return Step("calibrate", step.title, "skipped", ["this hand feels nothing"])
         press = getattr(self.s.driver, "press", None)
@@ -460,17 +464,47 @@ class Hour:
         finally:
             self.s.recorder.close(120.0)
             self.s.recorder = whole
-        done = _dexsim("calibrate", f"touch={self.out / 'touch.mcap'}", f"out={self.out / 'calibration'}",
+        joints = [self.hand.joints[j] for j in self.joints if self.hand.finger_of_joint[j] >= 0]
+        self._presses(joints)
+        done = _dexsim("calibrate", f"touch={self.out / 'touch.mcap'}", f"real={self.out / 'press.mcap'}",
+                       "simulate=true", f"joints={','.join(joints)}", f"meta.tactile_lsb={ASSUMED_LSB}",
+                       f"out={self.out / 'calibration'}",
                        f"hand_mirror={str(self.hand.mirror).lower()}")  # fmt: skip
         said = [line[9:] for line in done.stdout.splitlines() if line.startswith("touch    ")]
-        step.figures = {"status": done.returncode, "pads": dict(line.split(": ", 1) for line in said)}
-        step.text = [*said, "calibration/calibration.yaml, for deploy and export calibration=; N a count and A per N.m"
-                     " need a scale or a load cell: docs/tutorials/real_hand.md, 2"]  # fmt: skip
         if done.returncode:
-            step.verdict, step.text = "look", [f"not calibrated: {(done.stderr.strip() or done.stdout)[-300:]}"]
-        elif any("0 dead; 0 swapped pairs; 0 not pressed" not in line for line in said):
+            text = f"not calibrated: {(done.stderr.strip() or done.stdout)[-300:]}"
+            return Step("calibrate", step.title, "look", [text], {"status": done.returncode})
+        file = self.out / "calibration" / "calibration.yaml"
+        entries = yaml_text.load(file, "calibration").get("joints", {})
+        ratios = {n: entries.get(n, {}).get("current_per_torque", {}).get("value") for n in joints}
+        step.figures = {"status": 0, "pads": dict(x.split(": ", 1) for x in said), "A_per_Nm": ratios}
+        known = ", ".join(f"{n} {x:.2f}" for n, x in ratios.items() if x) or "of no joint"
+        step.text = [*said, f"A per N.m: {known}, if a count is {ASSUMED_LSB:g} N (a scale tells that);"
+                     " calibration/calibration.yaml, for deploy and export calibration="]  # fmt: skip
+        if any("0 dead; 0 swapped pairs; 0 not pressed" not in x for x in said) or not all(ratios.values()):
             step.verdict = "look"
         return step
+
+    def _presses(self, joints: Sequence[str]) -> None:
+        """Record in press.mcap joints that press against what is held to their fingertip, at rising currents."""
+        block = getattr(self.s.driver, "block", lambda joint: None)
+        self.s.recorder, whole = self.given["recorder"]("press.mcap"), self.s.recorder
+        try:
+            for name in joints:
+                j = self.hand.joints.index(name)
+                self.say(f"  hold something hard to the fingertip that {name} moves, so that it cannot close")
+                self.s.move(_still(self.middle), 3.0 if self.s.asks else 1.0, self.amps)
+                block(j)
+                assert self.s.state is not None
+                for lead in LEADS:
+                    goal = self.middle.copy()
+                    goal[j] = self.s.state.position[j] + lead
+                    self.s.move(_still(goal), HOLD, self.most, speed=3.0)
+                block(-1)
+                self.s.move(_still(self.middle), 0.5, self.amps)
+        finally:
+            self.s.recorder.close(120.0)
+            self.s.recorder = whole
 
     def bundle(self) -> Step:
         """See: nothing moves."""
@@ -511,6 +545,12 @@ class Hour:
         step.figures["drives"] = table
         step.text += others or (["the fitted drives lie within what training drew"] if table else
                                 ["gains and limits were not fitted: take the step excite too"])  # fmt: skip
+        here_a = self.found["calibrate"].figures.get("A_per_Nm", {}) if "calibrate" in self.found else {}
+        theirs = dict(zip(b.hand.joints, map(float, c.current_per_torque), strict=True))
+        off = [f"{n} {x:.2f} for {theirs[n]:.2f}" for n, x in here_a.items() if x and abs(x / theirs[n] - 1) > 0.2]
+        step.figures["A_per_Nm"] = {n: [x, theirs[n]] for n, x in here_a.items() if x}
+        if off:
+            step.text.append(f"A per N.m is not what the bundle takes ({'; '.join(off)}): export it with calibration=")
         reached = self.found["signs"].figures if "signs" in self.found else {}
         low, high = (dict(zip(b.hand.joints, b.manifest["action"][k], strict=True)) for k in ("low", "high"))
         short = [f"{n} {r['reached_rad'][0]:.2f} to {r['reached_rad'][1]:.2f} rad for {low[n]:.2f} to {high[n]:.2f}"
@@ -521,7 +561,7 @@ class Hour:
         noise, quiet = here.get("jitter_rad"), b.config["task"].get("sensors", {}).get("joint_noise", 0.0)
         if noise is not None:
             step.text.append(f"encoders at rest {noise:.4f} rad, in training {quiet:g}")
-        if slow or stiff or others or short or (noise or 0.0) > quiet:
+        if slow or stiff or others or short or off or (noise or 0.0) > quiet:
             step.verdict = "look"
             step.text.append("train with servo_file=servo.yaml, which holds what was measured here")
         return step

@@ -138,6 +138,7 @@ class FakeXHand:
         self._slip = -self.hand.time
         self.firmware: list[tuple[float, int]] = []  # when it was asked to go to which EtherCAT state
         self.closed: list[float] = []
+        self.blocked = -1, float("nan")  # a joint that something hard is held to, and where
         self.opened, self.pressed, self.presses = 0, (-1, 0.0), [0] * BOARDS
         # when a command went over the wire, and what, by hand; of the first
         self.by_hand: list[list[tuple[float, tuple]]] = [[] for _ in self.hands]
@@ -158,8 +159,11 @@ class FakeXHand:
         return out
 
     def handle(self, what: int) -> None:
-        """The object is held out (1) or let go (2), in the simulated world; somebody presses finger k (3 + k)."""
-        if what > 2:
+        """The object is held out (1) or let go (2), in the simulated world; somebody presses finger k (3 + k), holds
+        something hard to joint j (101 + j), or no longer (100)."""
+        if what >= 100:
+            self.blocked = (what - 101, float("nan")) if what > 100 else (-1, float("nan"))
+        elif what > 2:
             self.pressed = what - 3, self.clock.now()
             self.presses[what - 3] += 1
         elif hasattr(self.hand, "present"):
@@ -388,6 +392,7 @@ class _Control:
         integer = (lambda x: int(round(x)) & 0xFFFF) if unsigned else (lambda x: int(round(x)))
         frame = self._zeros()
         speed = s.velocity if s.velocity is not None else np.zeros(JOINTS)
+        self._hold(s, hand)
         noise = f.jitter * fake.rng.standard_normal(JOINTS)
         for i, j in enumerate(frame.finger_state):
             j.id, j.position, j.torque = i, float(np.float32(s.position[i] + noise[i])), integer(s.current[i])
@@ -419,6 +424,20 @@ class _Control:
             board.temperature = (30 + (fake.rng.random(20) < 0.5)).tolist()
             board.calc_temperature = 30
         return frame
+
+    def _hold(self, s: HandState, hand: int) -> None:
+        """A joint that something is held to stays; it draws 3 A a rad that its target is ahead, and presses."""
+        j, at = self._fake.blocked
+        if j < 0:
+            return
+        self._fake.blocked = j, (at := float(s.position[j]) if np.isnan(at) else at)
+        c = self._held[hand].last.finger_command[j]
+        push = min(max(3e3 * (c.position - at), 0.0), c.tor_max) if c.mode == POSITION and c.kp else 0.0
+        s.position, s.current, s.tactile = np.array(s.position), np.array(s.current), np.array(s.tactile)
+        s.position[j] = min(s.position[j], at)
+        s.current[j] = -push
+        board = int(np.searchsorted((3, 6, 8, 10), j, side="right"))
+        s.tactile[board, 60:66, 2] += int(0.02 * push)
 
     def _store(self, frame: SimpleNamespace, held: _Kept) -> None:
         """The package's thread writes the cache: now, or, of a torn frame, to its end in 1.5 ms."""

@@ -62,7 +62,8 @@ class Body(Protocol):
         """The object [9]: place [3] m, its time [s], orientation [4] w x y z, its time [s]; NaN where none."""
 
     def handle(self, what: int) -> None:
-        """The object is held out (1), or let go (2); finger k is pressed (3 + k)."""
+        """The object is held out (1), or let go (2); finger k is pressed (3 + k); joint j is blocked (101 + j), or
+        none any more (100)."""
 
     def close(self) -> None:
         """Disconnect."""
@@ -205,6 +206,10 @@ class BusDriver:
         """A fingertip is pressed, where somebody simulates that."""
         self._handle(3 + finger)
         self.relax()
+
+    def block(self, joint: int) -> None:
+        """Something hard is held before a joint (-1: no longer), where somebody simulates that."""
+        self._handle(101 + joint)
 
     def close(self) -> None:
         """Let go, wait until it is known whether the hand is limp, disconnect. Where the process had died, a new one
