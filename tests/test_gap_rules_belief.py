@@ -10,7 +10,8 @@ import numpy as np
 from dexsim.gap.effects import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
-from dexsim.gap.plant.case import misfit, quiet_noise, usual_noise
+from dexsim.gap.plant.case import quiet_noise, usual_noise
+from dexsim.gap.read.noise import misfit
 from dexsim.gap.search import hypotheses
 from dexsim.gap.search.fit import disbelief
 

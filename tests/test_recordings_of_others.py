@@ -8,7 +8,8 @@ import recordings
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dexsim.gap.plant.case import noise_of, refined_cases
+from dexsim.gap.plant.case import refined_cases
+from dexsim.gap.read.noise import noise_of
 from dexsim.gap.read import inputs
 from dexsim.recording import read
 from dexsim.recording.audit import audit
