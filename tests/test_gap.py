@@ -23,9 +23,9 @@ from dexsim.gap.judge import held_out
 from dexsim.gap.plant import case as case_of_joint
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build
-from dexsim.gap.read.noise import noise
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.read import Run, conditions, inputs, stage_tests
+from dexsim.gap.read.noise import noise
 from dexsim.gap.search.search import JointSearch
 from dexsim.gap.touch import judge
 from dexsim.recording import read, write

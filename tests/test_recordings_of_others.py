@@ -9,8 +9,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dexsim.gap.plant.case import refined_cases
-from dexsim.gap.read.noise import noise_of
 from dexsim.gap.read import inputs
+from dexsim.gap.read.noise import noise_of
 from dexsim.recording import read
 from dexsim.recording.audit import audit
 from dexsim.recording.mechanism import mechanism
