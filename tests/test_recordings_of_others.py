@@ -162,6 +162,17 @@ def test_values_without_names_are_said_and_found_where_another_joint_follows_the
     assert np.allclose(right.commands.value[:, k], follow(right.commands.t, 2, 0.0), atol=1e-6)
 
 
+def test_an_array_for_some_of_the_joints_takes_the_names_that_are_stated(tmp_path):
+    """A controller of one joint of three, whose commands are arrays of one value."""
+    made = bag(tmp_path / "bag", [*states(("a", "b", "c")), *commands((1,))])
+    (f,) = [f for f in read(made).findings if f.kind == "malformed"]
+    assert "meta.joint_names=a,b,..." in f.text
+    r = read(made, meta={"joint_names": "b"})
+    sent = r.commands.value[:, r.joints.index("b")]
+    assert np.allclose(sent, follow(r.commands.t, 1, 0.0), atol=1e-6) and set(r.joints) == {"a", "b", "c"}
+    assert np.isfinite(r.states.position.value).all() and not [f for f in r.findings if f.kind == "malformed"]
+
+
 def test_joints_that_move_alike_are_not_taken_for_one_another(tmp_path):
     r = read(bag(tmp_path / "bag", [*states(("a", "b")), *commands((0, 1))]))
     assert not [f for f in r.findings if f.kind == "joint_order"]

@@ -424,10 +424,11 @@ class _Reading:
         sign = schema.per_joint_sign(stated["effort_sign"], tuple(theirs), str(self.path))
         source = {int(c): i for i, c in reversed(list(enumerate(column)))}
         stated["effort_sign"] = ",".join(f"{int(sign[source[k]]):+d}" for k in range(len(ours)))
+        listed = len(schema.joint_names(stated.get("joint_names", "")))
         stated["joint_names"] = ",".join(ours)
 
         self._unnamed(theirs, commands, states, "joint_names" in given)
-        place = _Placer(theirs, column, len(ours))
+        place = _Placer(theirs, column, len(ours), listed)
         command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place)
         if command is not None:
             command.lines = lines
@@ -601,7 +602,8 @@ class _Reading:
                     topic,
                     float(t[bad[0]]),
                     len(bad),
-                    f"{name}: as many values as names are expected; samples left out",
+                    f"{name}: as many values as names are expected (of messages without names, as joints are known: "
+                    "meta.joint_names=a,b,... states whose they are); samples left out",
                     "error",
                     end=float(t[bad[-1]]),
                 )
@@ -841,24 +843,22 @@ def _placed(
 
 
 class _Placer:
-    """Where the values of a message go: by its names, or by the recording's order where it has none."""
+    """Where the values of a message go: by its names, or where it has none by the recording's order: of all joints, or
+    of the first `stated`, which `joint_names` lists."""
 
-    def __init__(self, theirs: Sequence[str], column: np.ndarray, count: int):
-        self.theirs, self.column, self.count = list(theirs), column, count
+    def __init__(self, theirs: Sequence[str], column: np.ndarray, count: int, stated: int):
+        self.theirs, self.column, self.count, self.stated = list(theirs), column, count, stated
         self._at = {name: i for i, name in reversed(list(enumerate(self.theirs)))}
         self._known: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def __call__(self, names_: Sequence[str], size: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(which values to take, their columns), or None where names and values do not fit."""
-        key = tuple(names_)
+        key = tuple(names_) or tuple(self.theirs[: self.stated] if size == self.stated else self.theirs)
         if key not in self._known:
-            index = np.array([self._at[n] for n in key], int) if key else np.arange(len(self.theirs))
-            columns = self.column[index]
+            columns = self.column[np.array([self._at[n] for n in key], int)]
             keep = np.flatnonzero(columns >= 0)
             self._known[key] = keep, columns[keep]
-        if size != (len(key) if key else len(self.theirs)):
-            return None
-        return self._known[key]
+        return self._known[key] if size == len(key) else None
 
 
 def _is_topic(name: str) -> bool:
