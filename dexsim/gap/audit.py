@@ -248,6 +248,8 @@ def renewed(t: np.ndarray, x: np.ndarray) -> float:
     change = np.flatnonzero(np.diff(x) != 0) + 1
     if len(change) < FEW:
         return 0.0
+    if (period := channels.rhythm(t, x)) > 0:  # as a diagnosis takes it
+        return period
     size = np.abs(x[change] - x[change - 1])
     leaps = size > LEAP * size.min()
     both = leaps[1:] & leaps[:-1]  # from one leap to the next: between them it moves, and stands in the log
