@@ -200,7 +200,7 @@ def _touch(s: dict[str, Any], reading: dict[str, dict[str, str]], out: Path, han
     loads: list[np.ndarray] = []
     unit, lsb, measured = "count", None, True
     for path in current.files_of(s["touch"], "touch"):
-        r = read(path, **reading, audit=False, hand=hand)
+        r = read(path, reading["remap"], reading["meta"], audit=False, hand=hand)
         if r.tactile is None:
             raise UserError(f"{path}: has no /tactile")
         if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):

@@ -67,7 +67,7 @@ def half(
     out = Half(UNIT[effort_is], hand.joints)
     score: dict[str, tuple[bool, float]] = {}
     for path in paths:
-        r = read(path, **(reading or {}), hand=hand)
+        r = read(path, (reading or {}).get("remap"), (reading or {}).get("meta"), hand=hand)
         if r.effort_is != effort_is:
             raise UserError(
                 f"{path}: its effort is {r.effort_is}, expected {effort_is}; correct it with meta.effort_is=...,"
