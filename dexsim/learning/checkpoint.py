@@ -149,15 +149,13 @@ def _whole(path: Path) -> None:
     """Tell a truncated, damaged or pickled file from a checkpoint, and read it."""
     with open(path, "rb") as file:
         head = file.read(2)
-    if head[:1] == b"\x80":  # first byte of a raw pickle
-        raise UserError(f"{path}: refused, it is a raw pickle, which can run code; a dexsim checkpoint holds only"
-                        " tensors, numbers and text")
     another = "use another checkpoint of its run folder"
     try:
         with zipfile.ZipFile(path) as archive:
             bad = archive.testzip()
     except Exception:  # a damaged archive fails anywhere
-        what = "truncated" if head == b"PK" else "empty" if not head else "not a checkpoint"
+        pickled = "refused, it is a raw pickle that can run code" if head[:1] == b"\x80" else "not a checkpoint"
+        what = "truncated" if head == b"PK" else pickled
         raise UserError(f"{path}: {what} ({path.stat().st_size} bytes); {another}") from None
     if bad:
         raise UserError(f"{path}: damaged, its part {bad} fails its checksum; {another}")

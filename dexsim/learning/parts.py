@@ -95,14 +95,10 @@ def check(data: dict[str, Any], path: object) -> None:
     again = "use another checkpoint of its run folder"
     typed.convert(data, Train if data["kind"] == "train" else Policy, f"{path}: damaged checkpoint", again)
     for name, tensor in tensors(data):
-        if tensor.layout != torch.strided or tensor.is_quantized or tensor.device.type == "meta":
-            kind = "quantized" if tensor.is_quantized else "meta" if tensor.is_meta else str(tensor.layout)
-            raise UserError(f"{path}: damaged checkpoint, {name} is a {kind} tensor, must be a plain one; {again}")
-        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
-            raise UserError(
-                f"{path}: damaged checkpoint, {name} is said to have the shape {list(tensor.shape)}, which is more than"
-                f" was stored; {again}"
-            )
+        plain = tensor.layout == torch.strided and not tensor.is_quantized and not tensor.is_meta
+        if not plain or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            what = "all of whose numbers are stored (none that is sparse, quantized or expanded)"
+            raise UserError(f"{path}: damaged checkpoint, {name} must be a plain tensor, {what}; {again}")
     for group in ("actor", "critic"):
         for name, tensor in data.get(group, {}).items():
             if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
