@@ -195,25 +195,19 @@ class FakeXHand:
 
 
 class _FingerCommand:
-    """A struct of the binding: fields of a type, others are refused."""
+    """A struct of the binding: 16-bit integers and a float; others are refused."""
 
-    _INTS = {"id": (0, 65535), "kp": (-32768, 32767), "ki": (-32768, 32767), "kd": (-32768, 32767),
-             "tor_max": (-32768, 32767), "mode": (0, 65535), "res0": (0, 65535), "res1": (0, 65535),
-             "res2": (0, 65535), "res3": (0, 65535)}  # fmt: skip
-    __slots__ = (*_INTS, "position")
+    __slots__ = ("id", "kp", "ki", "kd", "position", "tor_max", "mode", "res0", "res1", "res2", "res3")
 
     def __init__(self, other: _FingerCommand | None = None) -> None:
         for name in self.__slots__:
-            object.__setattr__(self, name, getattr(other, name, 0.0 if name == "position" else 0))
+            setattr(self, name, getattr(other, name, 0))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name == "position":
-            if not isinstance(value, (int, float)):
-                raise TypeError(f"position: {type(value).__name__} is no float")
-        else:
-            low, high = self._INTS[name]
-            if isinstance(value, float) or not low <= int(value) <= high:
-                raise TypeError(f"{name}: {value!r} is no integer of {low} to {high}")
+        low = -32768 if name in ("kp", "ki", "kd", "tor_max") else 0
+        good = isinstance(value, (int, float) if name == "position" else int)
+        if not good or (name != "position" and not low <= value < low + 65536):
+            raise TypeError(f"{name}: {value!r} is no number of its type")
         object.__setattr__(self, name, value)
 
 
