@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -285,3 +287,10 @@ def test_the_diagnosis_that_the_audit_ends_with_runs(tmp_path, monkeypatch, caps
     words = shlex.split(line.removeprefix("next: dexsim "))
     assert cli.main([*words, "limit=5", "replay=none"]) == 0
     assert (tmp_path / "out" / "diagnosis" / "diagnosis.json").exists()
+
+
+def test_an_audit_begins_without_torch_and_warp():
+    """They take two seconds to import, which reading a recording has no use for."""
+    code = "import dexsim.gap.audit, sys; print({'torch', 'warp', 'scipy.interpolate'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
