@@ -8,6 +8,7 @@ import recordings
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from dexsim.gap.audit import main
 from dexsim.gap.plant.case import refined_cases
 from dexsim.gap.read import inputs
 from dexsim.gap.read.noise import noise_of
@@ -148,7 +149,7 @@ def commands(order, seconds=6.0):
     return [("/joint_commands", t, array([follow(t, k, 0.0) for k in order])) for t in np.arange(0, seconds, 0.01)]
 
 
-def test_values_without_names_are_said_and_found_where_another_joint_follows_them(tmp_path):
+def test_values_without_names_are_said_and_found_where_another_joint_follows_them(tmp_path, capsys):
     made = bag(tmp_path / "bag", [*states(("a", "b", "c")), *commands((0, 2, 1))])
     r = read(made)
     said = {f.kind: f for f in r.findings if f.topic == "/joint_commands"}
@@ -156,6 +157,7 @@ def test_values_without_names_are_said_and_found_where_another_joint_follows_the
     found = [f for f in r.findings if f.kind == "joint_order"]
     assert {f.joint for f in found} == {"b", "c"} and all(f.severity == "error" for f in found)
     assert all(f.text.endswith("meta.joint_names=a,c,b") for f in found)
+    assert main([str(made)]) == 1 and "meta.joint_names=a,c,b out=" in capsys.readouterr().out  # what to run next
     right = read(made, meta={"joint_names": "a,c,b"})
     assert not [f for f in right.findings if f.kind == "joint_order" or f.severity == "warning" and "order" in f.text]
     k = right.joints.index("c")

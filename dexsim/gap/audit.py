@@ -9,6 +9,7 @@ commands agree, by motion; and the command to run next.
 from __future__ import annotations
 
 import copy
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -236,6 +237,8 @@ def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
     return text
 
 
+NAMES = re.compile(r"(meta\.joint_names=[^.\s]+)$")
+"""The order of joints that a finding states."""
 LEAP, FEW = 3.0, 8
 """Smallest steps of a signal by which a new value leaps, and new values that tell how often they come."""
 
@@ -363,6 +366,7 @@ def main(argv: Sequence[str]) -> int:
     joints = tuple(dict.fromkeys(j for _, r in recordings for j in r.joints))
     runs: list[Run] = []
     said: dict[str, list[Finding]] = {}
+    cures: dict[str, None] = {}  # settings that findings ask for
     if joints and any(len(r.commands) and len(r.states.position) for _, r in recordings):
         runs, said = findings([r for _, r in recordings], known or of_names(joints))
     for path, recording in recordings:
@@ -371,13 +375,14 @@ def main(argv: Sequence[str]) -> int:
         print(summary(recording) + "\n")
         print(table(_gathered(found)) + "\n")
         worst = max(worst, int(any(f.severity == "error" for f in found)))
+        cures |= {x[1]: None for f in found if f.kind == "joint_order" and (x := NAMES.search(f.text))}
     if runs:
         print(carries([r for _, r in recordings], runs) + "\n")
         believed = beliefs(runs, known) if known is not None and own.get("servo") else ""
         for text in ("\n".join(rates([r for _, r in recordings])), delays(runs), believed):
             if text:
                 print(text + "\n")
-        options = [a for a in rest if a not in given]
+        options = [a for a in rest if a not in given] + list(cures)
         xhand = own.get("model") is None and set(joints) <= set(load_hand().joints)
         if own.get("out") and not xhand:
             begin(Path(own["out"]).expanduser(), joints, own)
