@@ -143,8 +143,10 @@ fitted: {index_joint1: {kp: 1.9}}
 
 
 @pytest.mark.slow
-def test_a_hand_is_held_against_what_a_bundle_was_trained_for(tmp_path):
-    """Slower by 60 ms, softer by its fitted drive, and short of its range by half a radian: each is said."""
+def test_a_hand_is_held_against_what_a_bundle_was_trained_for(tmp_path, monkeypatch):
+    """Slower by 60 ms, softer by its fitted drive, short of its range by half a radian, of another force for a
+    current: each is said."""
+    monkeypatch.setattr(first_hour, "PRESSES", 30)
 
     class Short(Sticky):
         def advance(self, t):
@@ -154,7 +156,8 @@ def test_a_hand_is_held_against_what_a_bundle_was_trained_for(tmp_path):
     made = export.export(str(make_checkpoint(tmp_path / "policy.pt")), tmp_path / "bundle", steps=2)
     (tmp_path / "servo.yaml").write_text(SERVO)
     given = {"bundle": str(made), "joints": "index_joint1"}
-    _, found, _, said = walk(tmp_path, partial(Short, dead=0.06), ["cycles", "signs", "latency", "bundle"], given)
+    steps = ["cycles", "signs", "latency", "taxels", "calibrate", "bundle"]
+    _, found, _, said = walk(tmp_path, partial(Short, dead=0.06), steps, given)
     step = found["steps"]["bundle"]
     assert step["verdict"] == "look" and "your hand is slower than what this policy was trained for" in said
     assert step["figures"]["latency_ms"] - step["figures"]["trained_ms"] > 30
@@ -162,6 +165,10 @@ def test_a_hand_is_held_against_what_a_bundle_was_trained_for(tmp_path):
     assert "index_joint1: delay is 0.05 s, training drew 0.01 to 0.025" in said
     assert "the policy's targets go farther than the hand: index_joint1" in said and "short of their range" in said
     assert "encoders at rest 0.0014 rad, in training 0.003" in said
+    here, trained = step["figures"]["A_per_Nm"]["index_joint1"]
+    assert here == found["steps"]["calibrate"]["figures"]["A_per_Nm"]["index_joint1"]
+    assert (abs(here / trained - 1) > 0.2) == (f"index_joint1 {here:.2f} for {trained:.2f}" in said), said
+    assert abs(here / trained - 1) > 0.2, "the fake's force of a current is another than the bundle's"
 
 
 @pytest.mark.slow

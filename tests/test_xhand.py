@@ -635,6 +635,8 @@ def test_another_package_behind_the_command(b, tmp_path, faults):
          "record=none", "seconds=5", "home_speed=3", "late=1", "stale=1", "hang=2", "overruns=1000"],
         env=env, capture_output=True, text=True, cwd=tmp_path)  # fmt: skip
     assert "serial 012R3202601010001" in done.stdout and "sdk 1.4.3" in done.stdout, done.stderr
+    said = "[xhand] port opened" in done.stdout + done.stderr
+    assert said == (faults == "cable=6"), "what the package prints is not the loop's output, but for its last words"
     if faults[0] == "c" and "cable" not in faults:
         assert done.returncode == 0 and "ended    done" in done.stdout
     else:

@@ -50,6 +50,7 @@ class XHandControl:
 
     def open_serial(self, port_name: str, baud_rate: int) -> ErrorStruct:
         self.port, self.zero = port_name, now()
+        os.write(1, b"[xhand] port opened\n")  # as a native library prints
         return ErrorStruct(0 if port_name.startswith("/dev/ttyACM") and baud_rate == 3000000 else 1501001)
 
     def close_device(self) -> None:
