@@ -97,7 +97,8 @@ class Nodes:
         sh("ip", "link", "set", f"{self.bridge}p{node}", "down")
 
     def sent(self) -> list[int]:
-        """Bytes that each node has sent to others so far; of nodes that are not apart, what the loopback carried."""
+        """Return bytes that each node has sent to others so far; of nodes that are not apart, what the loopback
+        carried."""
         out = []
         for name in self.names:
             where = ("ip", "netns", "exec", name) if self.apart else ()
@@ -109,7 +110,8 @@ class Nodes:
 
     def start(self, node: int, ranks: int, argv: Sequence[str], devices: Sequence[str] = (), nodes: int | None = None,
               program: Sequence[str] = ("-m", "dexsim", "train")) -> subprocess.Popen:
-        """torchrun on a node, of `nodes` (default: all) with `ranks` processes each. devices: CUDA devices of it."""
+        """Return torchrun on a node, of `nodes` (default: all) with `ranks` processes each. devices: CUDA devices of
+        it."""
         nodes = self.count if nodes is None else nodes
         where = ["ip", "netns", "exec", self.names[node]] if self.apart else []
         run = ["-m", "torch.distributed.run", f"--nnodes={nodes}", f"--nproc_per_node={ranks}",
@@ -129,7 +131,7 @@ class Nodes:
 
 
 def trained(folder: Path) -> dict[str, float]:
-    """Medians over the iterations after the first FIRST: seconds of collecting and learning, steps a second."""
+    """Return medians over the iterations after the first FIRST: seconds of collecting and learning, steps a second."""
     with open(folder / "progress.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     late = rows[min(FIRST, len(rows) - 1):]
@@ -139,7 +141,7 @@ def trained(folder: Path) -> dict[str, float]:
 
 
 def measure(nodes: Nodes, each: int, settings: Sequence[str], devices: Sequence[str], end: float) -> dict[str, object]:
-    """One training on all nodes with `each` ranks; its rates and its traffic."""
+    """Return one training on all nodes with `each` ranks; its rates and its traffic."""
     before, began = nodes.sent(), time.perf_counter()
     started = [
         nodes.start(k, each, settings, devices[k * each: (k + 1) * each]) for k in range(nodes.count)

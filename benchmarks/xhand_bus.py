@@ -61,7 +61,7 @@ class Later:
 def episode(
     b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, noise: float, camera: float, ahead: float
 ) -> dict:
-    """One run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
+    """Return one run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
     c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
     objects, grip = b.config["task"]["objects"], b.manifest.get("grip")
     shapes = [*objects["train"], *objects["held_out"]]

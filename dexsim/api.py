@@ -42,7 +42,7 @@ def read_recording(
     joints: Sequence[str] | None = None,
     audit: bool = True,
 ) -> Recording:
-    """A recording out of an MCAP file or a ROS 2 bag folder.
+    """Return a recording out of an MCAP file or a ROS 2 bag folder.
 
     Args:
         remap: our name of a topic or joint -> theirs, {"/joint_states": "/xhand/state"}.
@@ -75,7 +75,8 @@ def write_recording(path: File, recording: Recording) -> Path:
 def replay_recording(
     recording: Recording, model: File | None = None, servo: File | None = None, timestep: float = 5e-4
 ) -> Recording:
-    """What the simulator makes of a recording's commands, from its first measured position on, without any correction.
+    """Return what the simulator makes of a recording's commands, from its first measured position on, without any
+    correction.
 
     Args:
         model: MuJoCo or URDF file of the mechanism; None: the xHand.
@@ -100,7 +101,7 @@ def replay_recording(
 def demo_recordings(
     folder: File, effect: str = "command_delay", seed: int = 0
 ) -> tuple[list[Path], Path, Path, dict[str, float]]:
-    """Four short recordings of one simulated joint that hides an effect, to try things on.
+    """Return four short recordings of one simulated joint that hides an effect, to try things on.
 
     Args:
         effect: what is hidden; a wrong name is answered with those there are.
@@ -189,7 +190,7 @@ def diagnose(
 
 
 def settings(task: Task = "grasp", overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Every setting of a training with the value it would have, as a plain nested dict (`dexsim train --cfg`).
+    """Return every setting of a training with the value it would have, as a plain nested dict (`dexsim train --cfg`).
 
     Args:
         overrides: "key=value" each, as on the command line: ["worlds=64", "servo=ideal", "agent.algorithm.gamma=0.98"].
@@ -211,7 +212,8 @@ def make_env(
     kept_out: Sequence[File] | None = None,
     rewards: Mapping[str, float] | None = None,
 ) -> HandEnv:
-    """Many simulated hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it gymnasium's).
+    """Simulate many hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it
+    gymnasium's).
 
     Args:
         task: a name (`dexsim tasks` lists them), "module:Class", or a class derived from `dexsim.tasks.Task`.
@@ -244,7 +246,7 @@ def make_env(
 
 
 def load_policy(checkpoint: File, env: HandEnv) -> Policy:
-    """The trained actor of a checkpoint, deterministic: observations of `env` -> actions [N, A].
+    """Return the trained actor of a checkpoint, deterministic: observations of `env` -> actions [N, A].
 
     Raises:
         UserError: no checkpoint, a damaged one, or one of another layout of observations than the environment's.
@@ -355,7 +357,7 @@ def _start(
     settings: Sequence[str],
     checkpoint: File | None = None,
 ) -> Any:
-    """The start of a run (`dexsim.cli.start.Start`) from named arguments and settings."""
+    """Return the start of a run (`dexsim.cli.start.Start`) from named arguments and settings."""
     from dexsim.cli import start
 
     if isinstance(settings, str):
@@ -380,7 +382,7 @@ def _things(
     kept_out: Sequence[File] | None,
     rewards: Mapping[str, float] | None,
 ) -> list[str]:
-    """Keywords as settings."""
+    """Return keywords as settings."""
     out = [_setting(k, v) for k, v in (("hand", hand), ("servo_file", servo)) if v is not None]
     for key, names in (("objects", objects), ("kept_out", kept_out)):
         if names is not None:
@@ -389,14 +391,14 @@ def _things(
 
 
 def _named(task: Task) -> str:
-    """A task as the command line has it; a class that is given may be used."""
+    """Return a task as the command line has it; a class that is given may be used."""
     from dexsim.tasks import registry
 
     return task if isinstance(task, str) else registry.name_class(registry.where_of(task), task)
 
 
 def _setting(key: str, path: File) -> str:
-    """A path as a setting, quoted so that no character of it is taken for syntax."""
+    """Return a path as a setting, quoted so that no character of it is taken for syntax."""
     text = str(path).replace("\\", "\\\\").replace("'", "\\'")
     return f"{key}='{text}'"
 

@@ -37,7 +37,7 @@ def take(argv: Sequence[str]) -> list[str]:
 
 
 def installed(group: str) -> dict[str, EntryPoint]:
-    """Entry points of a group by name, and what was typed as such."""
+    """Return entry points of a group by name, and what was typed as such."""
     out = {point.name: point for point in entry_points(group=group)}
     for text in os.environ.get(TYPED, "").split():
         kind, _, where = text.partition("=")
@@ -48,12 +48,13 @@ def installed(group: str) -> dict[str, EntryPoint]:
 
 
 def is_named(text: str) -> bool:
-    """Whether a text is spelled "module:Class"."""
+    """Return whether a text is spelled "module:Class"."""
     return bool(NAMED.fullmatch(text))
 
 
 def load(where: str, about: str) -> Any:
-    """What "module:Name" names; the current folder is looked in too. Raises UserError, which begins with `about`."""
+    """Return what "module:Name" names; the current folder is looked in too. Raises UserError, which begins with
+    `about`."""
     module, _, name = where.partition(":")
     here = str(Path.cwd())
     if here not in sys.path and "" not in sys.path:
@@ -79,7 +80,7 @@ def load(where: str, about: str) -> Any:
 
 
 def _failure(error: Exception) -> str:
-    """An error and the line of the file in which it arose, in one line."""
+    """Return an error and the line of the file in which it arose, in one line."""
     line = getattr(error, "lineno", None)
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:

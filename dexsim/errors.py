@@ -29,5 +29,5 @@ def _plain(text: str) -> str:
 
 
 def _short(text: str, most: int) -> str:
-    """Its beginning and its end, where it is longer."""
+    """Return its beginning and its end, where it is longer."""
     return text if len(text) <= most else f"{text[: most * 2 // 3]}...{text[-most // 4 :]}"

@@ -97,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _current(m: Any, peaks: Any) -> str:
-    """The largest current of the simulated motions, in words."""
+    """Return the largest current of the simulated motions, in words."""
     import numpy as np
 
     from dexsim.recording.excitation import current_per_torque

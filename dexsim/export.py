@@ -152,14 +152,15 @@ def export(
 
 
 def _state(model: Any) -> dict[str, tuple[int, int]]:
-    """What a recurrent network carries from step to step, by name: layers and size; empty for any other."""
+    """Return what a recurrent network carries from step to step, by name: layers and size; empty for any other."""
     if not getattr(model, "is_recurrent", False):
         return {}
     return dict.fromkeys(("h", "c") if model.rnn_type == "lstm" else ("h",), (model.num_layers, model.hidden_size))
 
 
 def _actions(model: Any, rows: Any, begins: list[bool]) -> Any:
-    """Actions [n, A] of observations [n, D]; a recurrent network's in order, its state zero where an episode begins."""
+    """Return actions [n, A] of observations [n, D]; a recurrent network's in order, its state zero where an episode
+    begins."""
     import torch
 
     keeps = _state(model)
@@ -203,8 +204,8 @@ def _copy_hand(hand: Any, out: Path) -> None:
 
 
 def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """Inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets before
-    and after they were built from and led to, and as many random observations."""
+    """Return inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets
+    before and after they were built from and led to, and as many random observations."""
     import torch
 
     from dexsim.deploy import measure
@@ -233,7 +234,7 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
 
 
 def _with_random(kept: dict[str, list], model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """What was kept of an episode, and as many random observations, with their actions."""
+    """Return what was kept of an episode, and as many random observations, with their actions."""
     import torch
 
     rng = torch.Generator().manual_seed(seed)
@@ -248,8 +249,8 @@ def _with_random(kept: dict[str, list], model: Any, steps: int, seed: int) -> di
 
 
 def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """The same of a task of declared terms, without the noise, delay and dropout of its readings. begins: where an
-    episode does."""
+    """Return the same of a task of declared terms, without the noise, delay and dropout of its readings. begins: where
+    an episode does."""
     import torch
 
     for row in env._sensed:
@@ -275,7 +276,7 @@ def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: 
 
 
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
-    """Everything that a robot must know, as plain data."""
+    """Return everything that a robot must know, as plain data."""
     from dexsim.deploy import bundle, measure
     from dexsim.deploy.manifests import floats
     from dexsim.learning.ppo import action_noise
@@ -343,8 +344,8 @@ def _versions(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def check(path: str | Path) -> bool:
-    """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints the
-    largest differences. False where one is beyond the manifest's tolerance."""
+    """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints
+    the largest differences. False where one is beyond the manifest's tolerance."""
     import numpy as np
 
     from dexsim.deploy import bundle, measure
@@ -404,7 +405,7 @@ def check(path: str | Path) -> bool:
 
 
 def _in_order(b: Any, observation: Any, begins: list[bool]) -> Any:
-    """Actions [n, A] of observations [n, D], one after another; begins: where an episode does."""
+    """Return actions [n, A] of observations [n, D], one after another; begins: where an episode does."""
     import numpy as np
 
     out = []
@@ -416,7 +417,7 @@ def _in_order(b: Any, observation: Any, begins: list[bool]) -> Any:
 
 
 def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
-    """The golden observations [n, D], built from the golden signals as the loop builds them."""
+    """Return the golden observations [n, D], built from the golden signals as the loop builds them."""
     import numpy as np
     import torch
 
@@ -438,7 +439,7 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
 
 
 def _golden_rows(file: Path) -> dict[str, Any]:
-    """The arrays of a golden file."""
+    """Return the arrays of a golden file."""
     try:
         return files.arrays(file)
     except ValueError as error:

@@ -32,8 +32,8 @@ MAX_FILE, MAX_TEXT = 256 << 20, 4 << 20
 
 
 def check(path: Path, what: str, most: int = MAX_FILE) -> int:
-    """The bytes that a file takes on its disk, without the holes of a sparse one. Raises UserError where it is missing,
-    not a plain file (a device or a pipe never ends), or larger than `most`."""
+    """Return the bytes that a file takes on its disk, without the holes of a sparse one. Raises UserError where it is
+    missing, not a plain file (a device or a pipe never ends), or larger than `most`."""
     try:
         about = os.stat(path)
     except FileNotFoundError:
@@ -54,8 +54,8 @@ def stored(about: os.stat_result) -> int:
 
 
 def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) -> str:
-    """A text file of UTF-8, of UTF-16 with its mark, or of the encoding `other` where it is neither. Raises UserError
-    as `check` does, and where it is not text."""
+    """Return a text file of UTF-8, of UTF-16 with its mark, or of the encoding `other` where it is neither. Raises
+    UserError as `check` does, and where it is not text."""
     check(path, what, most)
     try:
         with open(path, "rb") as file:
@@ -81,8 +81,8 @@ def mapping(path: Path, what: str, most: int = MAX_TEXT) -> dict[str, Any]:
 
 
 def place(text: Any) -> Path:
-    """A path as it was typed or stored, `~` being its user's folder where there is such a user. Raises UserError for a
-    text that no path can be."""
+    """Return a path as it was typed or stored, `~` being its user's folder where there is such a user. Raises UserError
+    for a text that no path can be."""
     if "\0" in str(text):
         raise UserError(f"'{text}': a path holds no zero character")
     try:
@@ -97,8 +97,8 @@ def place(text: Any) -> Path:
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a NumPy archive by name; nothing pickled is read. Raises ValueError, in one line, where it is no
-    plain file, or none that can be read within limits."""
+    """Return the arrays of a NumPy archive by name; nothing pickled is read. Raises ValueError, in one line, where it
+    is no plain file, or none that can be read within limits."""
     size = check(path, "file", 1 << 30)
     return _arrays(path) if guard.ours(path) else guard.call(_arrays, path, what="it", size=size)
 
@@ -119,7 +119,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def unfinished(path: Path) -> Path:
-    """Where what will be `path` is written first: beside it, named after this process."""
+    """Return where what will be `path` is written first: beside it, named after this process."""
     return path.with_name(f".{path.name}.{HOST}.{os.getpid()}.tmp")
 
 
@@ -164,7 +164,7 @@ def sweep(folder: Path) -> list[int]:
 
 
 def abandoned(name: str) -> bool:
-    """Whether a file of this name is what a process of this machine wrote that is no more."""
+    """Return whether a file of this name is what a process of this machine wrote that is no more."""
     found = _UNFINISHED.fullmatch(name)
     return found is not None and found["host"] == HOST and not system.lives(int(found["pid"]))
 

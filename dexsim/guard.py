@@ -53,9 +53,9 @@ _inside = False
 
 
 def call(function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0) -> T:
-    """`function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size: bytes of
-    the file, with which the limits grow; patience: multiplies the processor time, where more than reading is done.
-    Raises UserError."""
+    """Return `function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size:
+    bytes of the file, with which the limits grow; patience: multiplies the processor time, where more than reading is
+    done. Raises UserError."""
     return _run(function, args, what, size, True, patience)
 
 
@@ -65,7 +65,7 @@ def rehearse(function: Callable[..., Any], *args: Any, what: str, size: int = 0)
 
 
 def ours(path: Path) -> bool:
-    """Whether a file comes with dexsim."""
+    """Return whether a file comes with dexsim."""
     return Path(os.path.abspath(path)).is_relative_to(PACKAGE)
 
 
@@ -111,7 +111,7 @@ def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted
 
 
 def _answer(receive: Connection, pid: int, wall: float) -> Any:
-    """The child's answer in a tuple, its error, what it waits for in words, or "" where it ended without."""
+    """Return the child's answer in a tuple, its error, what it waits for in words, or "" where it ended without."""
     begun = moved = time.monotonic()
     used = -1
     while not receive.poll(0.2):

@@ -39,7 +39,7 @@ class GymEnv(gymnasium.Env):
         return (obs, info) if self._batch else (obs[0], {k: v[0] for k, v in info.items()})
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step. Of one world, the observation that ends an episode is its own last one."""
+        """Return one control step. Of one world, the observation that ends an episode is its own last one."""
         if self._batch:
             return self.vector.step(action)
         obs, reward, over, cut, info = self.vector.step(np.asarray(action)[None])
@@ -49,7 +49,7 @@ class GymEnv(gymnasium.Env):
         return (last if ended and last is not None else obs)[0], float(reward[0]), bool(over[0]), bool(cut[0]), info
 
     def render(self) -> Any:
-        """A picture [H, W, 3] uint8 of the first world, without a display."""
+        """Return a picture [H, W, 3] uint8 of the first world, without a display."""
         return None if self.render_mode is None else self.vector.env.render(0)
 
     def close(self) -> None:
@@ -58,7 +58,7 @@ class GymEnv(gymnasium.Env):
 
 
 def make_vector(task: str, num_envs: int = 1, render_mode: str | None = None, **given: Any) -> GymVectorEnv:
-    """The worlds of a task for gymnasium. given: of `dexsim.make_env` (device, seed, settings), and `group`,
+    """Return the worlds of a task for gymnasium. given: of `dexsim.make_env` (device, seed, settings), and `group`,
     `as_torch`. Raises UserError."""
     from dexsim import api
 

@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def hull_obj(points: np.ndarray) -> str:
-    """OBJ text of the convex hull of points [V, 3]."""
+    """Return OBJ text of the convex hull of points [V, 3]."""
     from dexsim.assets.objects.geometry import hull_mesh
 
     vertices, faces = hull_mesh(points)

@@ -20,8 +20,8 @@ AT_ONCE = 2_000_000
 
 
 def share(hits: int, n: int, level: float = LEVEL) -> tuple[float, float]:
-    """Interval of a share of which `hits` in n were seen (Wilson, 1927). Unlike a bootstrap's it has a width at 0 and
-    at n of n; (0, 1) where n is 0. Raises ValueError unless 0 <= hits <= n."""
+    """Return interval of a share of which `hits` in n were seen (Wilson, 1927). Unlike a bootstrap's it has a width at
+    0 and at n of n; (0, 1) where n is 0. Raises ValueError unless 0 <= hits <= n."""
     if n == 0 and hits == 0:
         return 0.0, 1.0
     found = stats.binomtest(int(hits), int(n)).proportion_ci(level, method="wilson")
@@ -58,8 +58,8 @@ def draws(samples: Sequence[np.ndarray], statistic: Callable, seed: Seed, count:
 def bootstrap(
     samples: Sequence[np.ndarray], statistic: Callable, seed: Seed, count: int = 1000, level: float = LEVEL
 ) -> np.ndarray:
-    """[2, ...] ends of the percentile interval of a statistic; see `draws`. Resamples in which it is not a number count
-    for nothing."""
+    """Return [2, ...] ends of the percentile interval of a statistic; see `draws`. Resamples in which it is not a
+    number count for nothing."""
     ends = 50 * np.array([1 - level, 1 + level])
     return np.nanpercentile(draws(samples, statistic, seed, count), ends, axis=-1)
 
@@ -107,8 +107,8 @@ def nested_means(groups: Sequence[np.ndarray], picks: np.ndarray, seed: Seed) ->
 
 
 def wins(losses: np.ndarray, index: np.ndarray, within: float) -> np.ndarray:
-    """[H] share of the resamples `index` [count, m] in which the sum of each of H losses [H, E] is the least of all;
-    those that are near it share a resample, one that is worse by `within` (relative) by 1 to e."""
+    """Return [H] share of the resamples `index` [count, m] in which the sum of each of H losses [H, E] is the least of
+    all; those that are near it share a resample, one that is worse by `within` (relative) by 1 to e."""
     sums = losses[:, index].sum(-1)
     weight = np.exp(-np.clip((sums / sums.min(0) - 1) / within, 0, 50))
     return (weight / weight.sum(0)).mean(1)

@@ -24,8 +24,8 @@ MAX_DOFS = 1000
 
 
 def read(path: Path, where: str, edit: Edit = None) -> mujoco.MjSpec:
-    """The model of an MJCF or URDF file, as `edit` changes it, which compiles. where: what the file is, for messages.
-    Raises UserError."""
+    """Return the model of an MJCF or URDF file, as `edit` changes it, which compiles. where: what the file is, for
+    messages. Raises UserError."""
     if not guard.ours(path):
         files.check(path, f"{where}:")
         for text in guard.call(_tried, path, where, edit, what=where, size=weight(path)):
@@ -56,7 +56,7 @@ def weight(path: Path, root: Path | None = None) -> int:
 
 
 def _tried(path: Path, where: str, edit: Edit) -> list[str]:
-    """MuJoCo's warnings of a model that compiles and of its first step."""
+    """Return MuJoCo's warnings of a model that compiles and of its first step."""
     try:
         with warned() as said:
             spec = parsed(path)
@@ -120,8 +120,8 @@ def parsed(path: Path) -> mujoco.MjSpec:
 
 @contextlib.contextmanager
 def warned() -> Iterator[list[str]]:
-    """What MuJoCo warns of meanwhile, a line each: else it says so on stderr without naming the file, and writes it to
-    MUJOCO_LOG.TXT in whatever folder the user is in."""
+    """Yield what MuJoCo warns of meanwhile, a line each: else it says so on stderr without naming the file, and writes
+    it to MUJOCO_LOG.TXT in whatever folder the user is in."""
     said: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: said.append(" ".join(str(text).split())))

@@ -28,8 +28,8 @@ WRITTEN = ".dexsim.json"
 
 
 def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Path] = ()) -> Path:
-    """The folder, made and writable, before the work begins. Raises UserError where it cannot be written, or where one
-    of `names` (of a file, or of a folder of files) is there and not ours, or is one of `inputs`."""
+    """Return the folder, made and writable, before the work begins. Raises UserError where it cannot be written, or
+    where one of `names` (of a file, or of a folder of files) is there and not ours, or is one of `inputs`."""
     make(folder, setting)
     recover(folder)
     read = {files.place(p).resolve() for p in inputs}
@@ -45,22 +45,22 @@ def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Pat
 
 
 def new(path: Path, setting: str) -> Path:
-    """The path, where nothing is yet. Raises UserError: recordings are never overwritten."""
+    """Return the path, where nothing is yet. Raises UserError: recordings are never overwritten."""
     if path.exists() or path.is_symlink():
         raise UserError(f"{setting}{path}: is there already, and would be overwritten: give another, or move it away")
     return path
 
 
 def ours(folder: Path, name: str) -> bool:
-    """Whether a file is there as we wrote it."""
+    """Return whether a file is there as we wrote it."""
     return _is(folder, folder / name, _known(folder).get(name, ""))
 
 
 @contextmanager
 def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
-    """A folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and noted as
-    ours. Where the block raises, `folder` stays as it was. Raises UserError where a file would go over one that is not
-    ours, or the disk is full."""
+    """Yield a folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and
+    noted as ours. Where the block raises, `folder` stays as it was. Raises UserError where a file would go over one
+    that is not ours, or the disk is full."""
     make(folder, setting)
     recover(folder)
     stage = _stage(folder)
@@ -105,12 +105,12 @@ def _move(folder: Path, stage: Path, paths: Iterable[str]) -> None:
 
 
 def _is(folder: Path, path: Path, digest: str) -> bool:
-    """Whether this is a file of that SHA-256 within the folder."""
+    """Return whether this is a file of that SHA-256 within the folder."""
     return path.is_file() and path.resolve().is_relative_to(folder.resolve()) and _sum(path) == digest
 
 
 def _stage(folder: Path) -> Path:
-    """A folder beside the results that is not there yet."""
+    """Return a folder beside the results that is not there yet."""
     for k in itertools.count():
         stage = files.unfinished(folder / (f"results{k}" if k else "results"))
         if not stage.exists():
@@ -139,7 +139,7 @@ def _refuse(folder: Path, path: Path, setting: str) -> None:
 
 
 def _known(folder: Path) -> dict[str, str]:
-    """What is ours: what was noted, and what a process was about to move and has moved."""
+    """Return what is ours: what was noted, and what a process was about to move and has moved."""
     found = _read_note(folder)
     known, pending = found.get("files"), found.get("pending")
     out = {str(k): str(v) for k, v in known.items()} if isinstance(known, dict) else {}

@@ -28,7 +28,7 @@ def _multiply_in_few(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def _to_matrix_in_few(q: torch.Tensor) -> torch.Tensor:
-    """`to_matrix` in five kernels instead of forty."""
+    """Return `to_matrix` in five kernels instead of forty."""
     _, _, products, factors, one = _tables(q.device, q.dtype)
     all_of_them = (q[..., :, None] * q[..., None, :]).flatten(-2)
     terms = all_of_them.index_select(-1, products).unflatten(-1, (9, 2))
@@ -36,7 +36,7 @@ def _to_matrix_in_few(q: torch.Tensor) -> torch.Tensor:
 
 
 def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product a b: first b, then a."""
+    """Multiply quaternions (Hamilton product a b): first b, then a."""
     if a.is_cuda and a.dtype == b.dtype:
         return _multiply_in_few(a, b)
     aw, ax, ay, az = a.unbind(-1)
@@ -50,41 +50,41 @@ def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Rotation by angle [...] rad about unit axis [..., 3]."""
+    """Return rotation by angle [...] rad about unit axis [..., 3]."""
     half = (angle / 2)[..., None]
     return torch.cat([half.cos(), axis * half.sin()], -1)
 
 
 def conjugate(q: torch.Tensor) -> torch.Tensor:
-    """The inverse rotation."""
+    """Return the inverse rotation."""
     return torch.cat([q[..., :1], -q[..., 1:]], -1)
 
 
 def normalize(q: torch.Tensor) -> torch.Tensor:
-    """Unit quaternion along q; zero becomes the identity."""
+    """Return unit quaternion along q; zero becomes the identity."""
     norm = q.norm(dim=-1, keepdim=True)
     one = torch.cat([torch.ones_like(q[..., :1]), torch.zeros_like(q[..., 1:])], -1)
     return torch.where(norm > 1e-9, q / norm.clamp(min=1e-9), one)
 
 
 def angle(q: torch.Tensor) -> torch.Tensor:
-    """Angle of the rotation [...], rad in [0, pi]; the same for q and -q. Accurate near 0, unlike arccos."""
+    """Return angle of the rotation [...], rad in [0, pi]; the same for q and -q. Accurate near 0, unlike arccos."""
     return 2 * torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0].abs())
 
 
 def error(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Angle between two orientations [...], rad in [0, pi]."""
+    """Return angle between two orientations [...], rad in [0, pi]."""
     return angle(multiply(conjugate(a), b))
 
 
 def from_vector(v: torch.Tensor) -> torch.Tensor:
-    """Rotation of the rotation vector v [..., 3], rad."""
+    """Return rotation of the rotation vector v [..., 3], rad."""
     size = v.norm(dim=-1)
     return about(v / size.clamp(min=1e-12)[..., None], size)
 
 
 def to_matrix(q: torch.Tensor) -> torch.Tensor:
-    """Rotation matrix [..., 3, 3] of a unit quaternion."""
+    """Return rotation matrix [..., 3, 3] of a unit quaternion."""
     if q.is_cuda:
         return _to_matrix_in_few(q)
     w, x, y, z = q.unbind(-1)
@@ -97,7 +97,7 @@ def to_matrix(q: torch.Tensor) -> torch.Tensor:
 
 
 def from_matrix(m: torch.Tensor) -> torch.Tensor:
-    """Quaternion of a rotation matrix by Shepperd's method: the component of largest magnitude is positive.
+    """Return quaternion of a rotation matrix by Shepperd's method: the component of largest magnitude is positive.
 
     The sign therefore jumps between orientations where another component takes the lead, as it does in what sensors and
     pose estimators report: q and -q are one rotation.
@@ -117,12 +117,12 @@ def from_matrix(m: torch.Tensor) -> torch.Tensor:
 
 
 def six(q: torch.Tensor) -> torch.Tensor:
-    """6D representation [..., 6]: the matrix's first two columns, one after the other (Zhou et al., 2019)."""
+    """Return 6D representation [..., 6]: the matrix's first two columns, one after the other (Zhou et al., 2019)."""
     return six_of_matrix(to_matrix(q))
 
 
 def six_of_matrix(m: torch.Tensor) -> torch.Tensor:
-    """`six` of matrices [..., 3, 3]."""
+    """Return `six` of matrices [..., 3, 3]."""
     return torch.cat([m[..., :, 0], m[..., :, 1]], -1)
 
 
@@ -133,15 +133,15 @@ def matrix_of_six(six: torch.Tensor) -> torch.Tensor:
 
 
 def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Vectors v [..., 3] turned by q."""
+    """Return vectors v [..., 3] turned by q."""
     u, w = q[..., 1:], q[..., :1]
     t = 2 * torch.linalg.cross(u, v)
     return v + w * t + torch.linalg.cross(u, t)
 
 
 def upright(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
-    """q with its tilt removed: the smallest turn that brings the object's own axis (+-x, +-y or +-z) nearest to the
-    unit vector `axis` [..., 3] onto it, after q."""
+    """Return q with its tilt removed: the smallest turn that brings the object's own axis (+-x, +-y or +-z) nearest to
+    the unit vector `axis` [..., 3] onto it, after q."""
     inside = rotate(conjugate(q), axis.expand_as(q[..., 1:]))
     lead = inside.abs().argmax(-1, keepdim=True)
     own = torch.zeros_like(inside).scatter(-1, lead, inside.gather(-1, lead).sign())
@@ -151,6 +151,7 @@ def upright(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
 
 
 def tilt(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
-    """Angle [...] between `axis` and the object's own axis nearest to it, rad (at most 0.955 for a cube's axes)."""
+    """Return angle [...] between `axis` and the object's own axis nearest to it, rad (at most 0.955 for a cube's
+    axes)."""
     inside = rotate(conjugate(q), axis.expand_as(q[..., 1:])).abs()
     return torch.arccos(inside.amax(-1).clamp(max=1.0))

@@ -23,8 +23,8 @@ _CRASHES = (-6, -11, 0xC0000005, 0xC0000409)  # SIGABRT, SIGSEGV; Windows: acces
 
 
 def stop_signals() -> dict[int, str]:
-    """Signals that ask a program to end, with their names: Ctrl-C, SIGTERM, and a terminal that closes (SIGHUP; on
-    Windows SIGBREAK). A SIGHUP that is ignored already (nohup) is left out."""
+    """Return signals that ask a program to end, with their names: Ctrl-C, SIGTERM, and a terminal that closes (SIGHUP;
+    on Windows SIGBREAK). A SIGHUP that is ignored already (nohup) is left out."""
     found = {int(signal.SIGINT): "Ctrl-C", int(signal.SIGTERM): "SIGTERM"}
     for name in ("SIGHUP", "SIGBREAK"):
         number = getattr(signal, name, None)
@@ -34,7 +34,8 @@ def stop_signals() -> dict[int, str]:
 
 
 def hand_signals() -> dict[int, str]:
-    """All signals that end or halt a program and that it can handle, with their names: each lets go of a hand."""
+    """Return all signals that end or halt a program and that it can handle, with their names: each lets go of a
+    hand."""
     names = "QUIT USR1 USR2 XCPU TSTP TTIN TTOU ALRM VTALRM PROF IO PWR".split()
     found = {getattr(signal, f"SIG{name}", None): f"SIG{name}" for name in names}
     found |= {getattr(signal, "SIGTSTP", None): "Ctrl-Z", getattr(signal, "SIGQUIT", None): "SIGQUIT (Ctrl-\\)"}
@@ -90,7 +91,7 @@ def stop(pid: int) -> None:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -105,7 +106,7 @@ def memory() -> tuple[int, int] | None:
 
 
 def shared_memory() -> int | None:
-    """Bytes that are free in /dev/shm, which GPUs of one machine talk through; None where there is none."""
+    """Return bytes that are free in /dev/shm, which GPUs of one machine talk through; None where there is none."""
     try:
         about = os.statvfs(SHARED)
     except (AttributeError, OSError):  # Windows; macOS, some containers
@@ -120,14 +121,14 @@ def after_fork(forget: Callable[[], None]) -> None:
 
 
 def renderers() -> tuple[str, ...]:
-    """Offscreen OpenGL to try in turn; only the one that MUJOCO_GL asks for, where this system knows it."""
+    """Return offscreen OpenGL to try in turn; only the one that MUJOCO_GL asks for, where this system knows it."""
     known = RENDERERS.get(sys.platform, RENDERERS["linux"])
     asked = os.environ.get("MUJOCO_GL", "").lower()
     return (asked,) if asked in known else known
 
 
 def renderer_environment(name: str) -> dict[str, str]:
-    """Environment of a process that renders by one of :func:`renderers`."""
+    """Return environment of a process that renders by one of :func:`renderers`."""
     return {"MUJOCO_GL": name} | ({"PYOPENGL_PLATFORM": name} if name in RENDERERS["linux"] else {})
 
 
@@ -150,7 +151,7 @@ def no_renderer() -> str:
 
 
 def start_method() -> str:
-    """How a process is begun that works for this one: as a fork of it where that is safe."""
+    """Return how a process is begun that works for this one: as a fork of it where that is safe."""
     return "fork" if sys.platform == "linux" else "spawn"
 
 
@@ -171,7 +172,7 @@ def limit(seconds: float, more: int) -> None:
 
 
 def at_work(pid: int) -> tuple[bool, int]:
-    """(whether a process sleeps, what processor time it has used), where the system tells."""
+    """Return (whether a process sleeps, what processor time it has used), where the system tells."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -21,7 +21,8 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 def real(value: Any) -> float:
-    """The number that a text or a value is (YAML reads 1e-3 as text); NaN where it is none, or no double holds it."""
+    """Return the number that a text or a value is (YAML reads 1e-3 as text); NaN where it is none, or no double holds
+    it."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)) or (isinstance(value, str) and "_" in value):
         return math.nan
     try:
@@ -31,8 +32,8 @@ def real(value: Any) -> float:
 
 
 def number(key: str, value: Any, low: float = -1e12, high: float = 1e12, unit: str = "", exact: bool = False) -> float:
-    """A number as it was typed or stands in a file; exact: a whole one. Raises UserError for what is none, and outside
-    [low, high]."""
+    """Return a number as it was typed or stands in a file; exact: a whole one. Raises UserError for what is none, and
+    outside [low, high]."""
     out = real(value)
     if not low <= out <= high or not math.isfinite(out) or (exact and out != int(out)):
         bounds = f"from {low:g} up" if high == math.inf else f"from {low:g} to {high:g}"
@@ -42,7 +43,7 @@ def number(key: str, value: Any, low: float = -1e12, high: float = 1e12, unit: s
 
 
 def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:
-    """A whole number as it was typed. Raises UserError for what is none, or lies outside [low, high]."""
+    """Return a whole number as it was typed. Raises UserError for what is none, or lies outside [low, high]."""
     try:
         value = int(text) if text.isascii() and len(text) <= 20 and "_" not in text else None
     except ValueError:
@@ -78,8 +79,8 @@ def one_of(key: str, text: str, known: Collection[str]) -> str:
 
 
 def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
-    """`data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is there and
-    what must be.
+    """Return `data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is
+    there and what must be.
 
     fix: what to do about it, appended. Instances of classes that `kind` names (tensors) pass as they are.
     """
@@ -105,7 +106,7 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
 
 
 def _named(data: Any, kind: Any, message: str, place: str) -> str:
-    """The place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
+    """Return the place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
     parts = place.split(".")
     for k, part in enumerate(parts):
         node = _at(data, ".".join(parts[:k])) if part.startswith("*") else None
@@ -122,7 +123,7 @@ def _named(data: Any, kind: Any, message: str, place: str) -> str:
 
 
 def _at(node: Any, place: str) -> Any:
-    """The value at a place that msgspec names (a.b[3].c); None where it cannot be told."""
+    """Return the value at a place that msgspec names (a.b[3].c); None where it cannot be told."""
     for part in filter(None, place.replace("[", ".[").split(".")):
         try:
             node = node[int(part[1:-1])] if part.startswith("[") else {str(k): v for k, v in node.items()}[part]
@@ -132,14 +133,14 @@ def _at(node: Any, place: str) -> Any:
 
 
 def _with(node: Any, parts: list[str], value: Any) -> Any:
-    """A copy of the data with `value` at a place of dicts."""
+    """Return a copy of the data with `value` at a place of dicts."""
     if not parts or not isinstance(node, dict):
         return value if not parts else node
     return {k: _with(v, parts[1:], value) if str(k) == parts[0] else v for k, v in node.items()}
 
 
 def _allowed(kind: Any, place: str) -> list[Any]:
-    """What a value may be there, where only some words or numbers are."""
+    """Return what a value may be there, where only some words or numbers are."""
     return [x for t in _types(kind, place) if isinstance(t, inspect.LiteralType) for x in t.values]
 
 
@@ -149,7 +150,7 @@ def _fields(kind: Any, place: str) -> list[str]:
 
 
 def _types(kind: Any, place: str) -> list[Any]:
-    """What a place may be of."""
+    """Return what a place may be of."""
     if isinstance(kind, inspect.UnionType):
         return [x for t in kind.types for x in _types(t, place)]
     if isinstance(kind, inspect.Metadata):
@@ -193,6 +194,6 @@ def finite(node: Any, source: object, fix: str = "", place: str = "") -> None:
 
 
 def _shown(data: Any, place: str) -> str:
-    """The value at a place, shortened."""
+    """Return the value at a place, shortened."""
     text = " ".join(repr(_at(data, place)).split())
     return text if len(text) <= 60 else text[:57] + "..."

@@ -41,9 +41,9 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse(text: str | bytes, source: object) -> Any:
-    """The plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the limit that
-    was passed: size, depth, number of values (aliases expanded), merge keys (<<), a key that stands twice, a value that
-    holds itself, tags of other data than plain."""
+    """Return the plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the
+    limit that was passed: size, depth, number of values (aliases expanded), merge keys (<<), a key that stands twice, a
+    value that holds itself, tags of other data than plain."""
     if len(text) <= SMALL:
         return _parse(text, source)
     return guard.call(_parse, text, source, what=str(source))
@@ -60,13 +60,14 @@ def _parse(text: str | bytes, source: object) -> Any:
 
 
 def load(path: Path, what: str) -> Any:
-    """The plain data of a YAML file of people (at most `files.MAX_TEXT` bytes); `what` it is, for the message. Raises
-    UserError."""
+    """Return the plain data of a YAML file of people (at most `files.MAX_TEXT` bytes); `what` it is, for the message.
+    Raises UserError."""
     return parse(files.text(path, what), f"{what} '{path}'")
 
 
 def _plain(node: Any, rest: list[int]) -> Any:
-    """The data, each alias a copy. Raises ValueError for more than `rest[0]` values, and for text that is none."""
+    """Return the data, each alias a copy. Raises ValueError for more than `rest[0]` values, and for text that is
+    none."""
     rest[0] -= 1
     if rest[0] < 0:
         raise ValueError(f"more than {MOST_NODES} values, aliases expanded")

@@ -90,7 +90,7 @@ def killed(work: Callable[[Shared], None], after: float, wait: bool) -> Shared:
 
 
 def takes(work: Callable[[Shared], None]) -> float:
-    """s that a work takes in a child, until it first tells that it is ready."""
+    """Return s that a work takes in a child, until it first tells that it is ready."""
     began = time.monotonic()
     killed(work, 0.0, True)
     return time.monotonic() - began

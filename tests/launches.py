@@ -63,7 +63,7 @@ def _line() -> str:
 
 @contextmanager
 def counting() -> Iterator[Counter[str]]:
-    """What is launched meanwhile, by line; Warp's kernels are counted and run."""
+    """Yield what is launched meanwhile, by line; Warp's kernels are counted and run."""
     count, launch, packed = Count(), wp.launch, Launches.__call__
 
     def counted(*args: Any, **kwargs: Any) -> Any:

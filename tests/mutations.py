@@ -438,14 +438,14 @@ def copy(folder: Path) -> None:
 
 
 def run(folder: Path, tests: list[str]) -> int:
-    """pytest's status: 0 all passed, 1 some failed, above 1 they could not be run."""
+    """Return pytest's status: 0 all passed, 1 some failed, above 1 they could not be run."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"--timeout={SECONDS}", *tests]
     env = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(command, cwd=folder, env=env, capture_output=True, check=False).returncode
 
 
 def main(words: list[str]) -> int:
-    """words: only mutations whose file or description hold them all."""
+    """Return words: only mutations whose file or description hold them all."""
     chosen = [m for m in MUTATIONS if all(w in f"{m.file} {m.breaks}" for w in words)]
     if not chosen:
         print(f"no mutation holds all of: {' '.join(words)}", file=sys.stderr)

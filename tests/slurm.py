@@ -39,7 +39,7 @@ PartitionName=all Nodes={host} Default=YES MaxTime=60 State=UP
 
 
 def here() -> bool:
-    """Whether this machine has Slurm's programs, and may start them."""
+    """Return whether this machine has Slurm's programs, and may start them."""
     programs = ("munged", "slurmctld", "slurmd", "sbatch", "sinfo")
     return os.geteuid() == 0 and all(shutil.which(p, path="/usr/sbin:/usr/bin") for p in programs)
 

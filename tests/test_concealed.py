@@ -538,7 +538,7 @@ def test_spatial_rigs_are_a_little_off_what_their_files_say(tmp_path):
         d = rigs.draw(np.random.default_rng(k), shape)
         rigs.files(tmp_path, d)
         model = mujoco.MjModel.from_xml_path(str(tmp_path / "rig.xml"))
-        assert model.njnt == d.joints == k + 2 and len(d.told.place) == d.joints
+        assert model.njnt == d.joints == k + 2 and len(d.believed_rig.place) == d.joints
         body = model.jnt_bodyid[model.joint("joint1").id]
         at = tuple(d.rig.place[1])
         np.testing.assert_allclose(model.body_pos[body], d.told.offset[at], atol=1e-5)

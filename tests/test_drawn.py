@@ -19,12 +19,12 @@ EDGE = 0.15  # of a range: as near as its ends are met
 
 
 def _pick(env) -> torch.Tensor:
-    """Which of the held poses each world began with, by its hand's joints."""
+    """Return which of the held poses each world began with, by its hand's joints."""
     return torch.cdist(env.engine.t.qpos[:, env.joint_q].float(), env.grasps.hand, p=1).argmin(1)
 
 
 def _tilt(env) -> torch.Tensor:
-    """Angle of the object's longest axis to the palm's y."""
+    """Return angle of the object's longest axis to the palm's y."""
     longest = torch.tensor([int(v.shape.extents.argmax()) for v in env.objects.scene.variants])[env.objects.variant]
     m = rotation.to_matrix(env.engine.t.qpos[:, env.object_q[3:]])
     return m[torch.arange(N), 1, longest].abs().clamp(max=1).arccos()
@@ -35,7 +35,7 @@ def _xy(env) -> torch.Tensor:
 
 
 def _extent(env) -> torch.Tensor:
-    """Largest extent of each world's object."""
+    """Return largest extent of each world's object."""
     o = env.objects
     s, kind = o.size, o.kind[o.variant]
     round_ = torch.stack([2 * s[:, 0], 2 * (s[:, 0] + s[:, 1])], 1)
@@ -125,7 +125,7 @@ def drawn(request):
 
 
 def _of_nominal(env, column: str) -> torch.Tensor:
-    """A drive's column against its nominal: times, or added to it."""
+    """Return a drive's column against its nominal: times, or added to it."""
     c = INDEX[column]
     now, nominal = env.servo.params[..., c], env.servo.nominal[:, c]
     return now / nominal if column in RELATIVE else now - nominal

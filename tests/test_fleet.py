@@ -13,7 +13,7 @@ from dexsim.gap import demo, fleet
 
 
 def diagnosis(**found: tuple[float, float, float] | None) -> dict:
-    """A diagnosis of effects EFFECT__JOINT=(value, low, high)."""
+    """Return a diagnosis of effects EFFECT__JOINT=(value, low, high)."""
     return {
         "verdict": "explained",
         "findings": [

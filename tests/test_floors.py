@@ -96,7 +96,7 @@ def imported(path: Path, known: dict[str, Path], package: str = "dexsim") -> set
 
 
 def part(module: str) -> str:
-    """"sim" of "dexsim.sim.engine"; "" of the package itself."""
+    """Return "sim" of "dexsim.sim.engine"; "" of the package itself."""
     return module.split(".")[1] if "." in module else ""
 
 

@@ -135,7 +135,7 @@ def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
 
 
 def swinging(t: np.ndarray) -> np.ndarray:
-    """rad: swings of 83 Hz in two stretches."""
+    """Return rad: swings of 83 Hz in two stretches."""
     on = ((t > 3.0) & (t < 6.0)) | ((t > 11.0) & (t < 15.0))
     return np.where(on, 0.02 * np.sin(2 * np.pi * 83.0 * t), 0.0)
 

@@ -33,8 +33,8 @@ def jaws(
     joints=("first", "second"), ranges=((-1.5, 1.5), (-1.5, 1.5)), axes=("0 1 0", "0 1 0"), joint="", kind="hinge",
     actuators="", fingers=3, base="", after="", head='<compiler angle="radian"/>',
 ) -> str:  # fmt: skip
-    """A claw's MJCF: fingers of two links around a disc, which stand up from it; closing turns them inwards, about
-    -y of their own frame."""
+    """Return a claw's MJCF: fingers of two links around a disc, which stand up from it; closing turns them inwards,
+    about -y of their own frame."""
     out = [f'<mujoco model="jaws">{head}<worldbody><body name="disc">{base}<inertial pos="0 0 0" mass="0.3" '
            'diaginertia="1e-4 1e-4 1e-4"/><geom type="cylinder" size="0.05 0.01"/>']  # fmt: skip
     for k in range(fingers):
@@ -342,7 +342,7 @@ def test_the_unit_of_a_collada_mesh_counts(tmp_path):
 
 
 def _dae(metres: str) -> str:
-    """A box of 90 x 90 x 24 units."""
+    """Return a box of 90 x 90 x 24 units."""
     box = trimesh.creation.box(extents=[90, 90, 24])
     points = " ".join(f"{x:g}" for x in box.vertices.ravel())
     faces = " ".join(str(i) for i in box.faces.ravel())

@@ -30,7 +30,7 @@ sys.exit(int(sys.argv[3]))
 
 
 def made(folder: Path, *jobs_of: tuple[tuple[str, ...], ...], resumes: bool = False) -> list[jobs.Job]:
-    """Jobs of a program that waits (s) and ends with a status: ((name, seconds, status), ...) each."""
+    """Return jobs of a program that waits (s) and ends with a status: ((name, seconds, status), ...) each."""
     (folder / "stub.py").write_text(STUB)
     program = (sys.executable, str(folder / "stub.py"))
     return [

@@ -21,7 +21,7 @@ QUICK = ("task=dummy", "device=cpu", "worlds=4", "final_episodes=0", "save_inter
 
 
 def apart() -> bool:
-    """Whether network namespaces can be made here."""
+    """Return whether network namespaces can be made here."""
     try:
         made = sh("ip", "netns", "add", "dexsim_probe", check=False).returncode == 0
         sh("ip", "netns", "del", "dexsim_probe", check=False)
@@ -52,7 +52,7 @@ def begin(nodes: Nodes, configs: Path, mode: str, *settings: str, count: int = 2
 
 
 def end(started, seconds: float = 120) -> list[int]:
-    """Their exit statuses."""
+    """Return their exit statuses."""
     limit = time.monotonic() + seconds
     try:
         return [p.wait(max(limit - time.monotonic(), 0.1)) for p in started]

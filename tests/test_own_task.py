@@ -486,7 +486,7 @@ GOLDEN = json.loads((ROOT / "tests" / "golden" / "tasks.json").read_text())
 
 
 def trace(name: str, steps: int, worlds: int = 6) -> tuple[list[str], dict]:
-    """Digests, every 50 steps, of all that a checkpoint's environment gives; and what its first step gives."""
+    """Return digests, every 50 steps, of all that a checkpoint's environment gives; and what its first step gives."""
     torch.set_num_threads(1)
     path = ROOT / "checkpoints" / f"{name}.pt"
     env = dexsim.make_env(checkpoint=path, worlds=worlds, device="cpu", seed=3,

@@ -36,7 +36,7 @@ TORCHRUN = ("--standalone", "--nproc_per_node=2")
 
 
 def torchrun(configs, folder, mode, *settings) -> subprocess.Popen:
-    """torchrun of rank_main.py in `folder`, in a process group of its own."""
+    """Return torchrun of rank_main.py in `folder`, in a process group of its own."""
     env = os.environ | {
         "OMP_NUM_THREADS": "1",
         "REPORT": str(folder / "report"),

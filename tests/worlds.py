@@ -88,7 +88,7 @@ def hand_scene(n: int, shapes=ALL, kind: str = "mujoco", scales=(1.25,), timeste
 
 
 def write(objects: Objects, mask=None, **given) -> dict[str, torch.Tensor]:
-    """objects.write with defaults for what is not given; returns what was written."""
+    """Return objects.write with defaults for what is not given; returns what was written."""
     n = objects.engine.n
     values = {
         "variant": torch.arange(n) % len(objects.scene.variants),

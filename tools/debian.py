@@ -21,7 +21,7 @@ SOURCE = Path(__file__).resolve().parents[1]
 
 
 def steps(text: str) -> list[tuple[str, str]]:
-    """(INSTRUCTION, the rest) of each line of a Dockerfile."""
+    """Return (INSTRUCTION, the rest) of each line of a Dockerfile."""
     lines = re.sub(r"\\\n\s*", " ", text).splitlines()
     return [(w[0], w[1]) for line in lines if line and not line.startswith("#") for w in [line.split(" ", 1)]]
 

@@ -40,7 +40,7 @@ def compiled(uv: str, extras: tuple[str, ...], constraints: Path | None) -> list
 
 
 def cpu_build(folder: Path, every: list[str]) -> list[str]:
-    """torch's CPU build, of the version that is locked."""
+    """Return torch's CPU build, of the version that is locked."""
     version = next(block.split(" ")[0] for block in every if block.startswith("torch=="))
     wheels = sorted(folder.glob(f"{version.replace('==', '-')}+cpu-*.whl"))
     hashes = "".join(f" \\\n    --hash=sha256:{hashlib.sha256(w.read_bytes()).hexdigest()}" for w in wheels)

@@ -377,7 +377,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
             stated = {"mass": n["mass"] + n["extra"] - believed["mass"]}
         strength = law.own if law is not None and law.own is not None else kind.own
         effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": stated,
-                        "facts": fact, **laws.told(label, law, o),
+                        "facts": fact, **laws.described(label, law, o),
                         "also": _also(kind, d, at, source),
                         "when": _when([strength(L, n, o) for L in logs])})  # fmt: skip
     if wrong:

@@ -211,7 +211,7 @@ def has_two(kind: str, p: dict) -> bool:
 
 
 def reported(kind: Kind, law: Law | None, logs: list[Shown], n: dict, o: dict) -> dict[str, float]:
-    """{key: value} as the catalogue names them: `Kind.report`, with the equivalents of a second law.
+    """Return {key: value} as the catalogue names them: `Kind.report`, with the equivalents of a second law.
 
     logs: of the recordings to fit; n, o: parameters of the joint as they are and as they are believed.
     """
@@ -225,7 +225,7 @@ def reported(kind: Kind, law: Law | None, logs: list[Shown], n: dict, o: dict) -
     return {k: float(v) for k, v in values.items()}
 
 
-def told(kind: str, law: Law | None, p: dict) -> dict[str, str]:
+def described(kind: str, law: Law | None, p: dict) -> dict[str, str]:
     """Return what the truth says of the law: "first", "second", or "only" where there is one, and in words."""
     if not has_two(kind, p):
         return {"law": "only"}

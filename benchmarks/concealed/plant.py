@@ -143,7 +143,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def soft_limit(x: np.ndarray, limit: np.ndarray | float, knee: np.ndarray | float) -> np.ndarray:
-    """x within a limit that is approached, not hit: x / (1 + |x / limit|^knee)^(1 / knee)."""
+    """Return x within a limit that is approached, not hit: x / (1 + |x / limit|^knee)^(1 / knee)."""
     limit = np.maximum(limit, 1e-9)
     return x / (1 + np.abs(x / limit) ** knee) ** (1 / np.asarray(knee))
 

@@ -30,8 +30,8 @@ COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_spee
 class Drawn:
     """A rig as it is and as it is believed to be. true, believed: parameters [J]; unit [J]: a typical torque, N.m; low,
     high [J]: where its joints may be sent, rad; voltage: whether the loop gives a duty; motor_side: whether it reads
-    the motor; hand: what recordings of a hand call it, reach [J, 2] rad: the ranges of its joints. told: the rig as its
-    file has it, None for the true one; gravity [R, 3] m/s2: of each recording, None for the rig's."""
+    the motor; hand: what recordings of a hand call it, reach [J, 2] rad: the ranges of its joints. believed_rig: as its
+    file has the rig, None for the true one; gravity [R, 3] m/s2: of each recording, None for the rig's."""
 
     rig: Rig
     shape: str
@@ -45,7 +45,7 @@ class Drawn:
     motor_side: bool
     hand: str = ""
     reach: np.ndarray | None = None
-    told: Rig | None = None
+    believed_rig: Rig | None = None
     gravity: np.ndarray | None = None
 
     @property
@@ -133,18 +133,18 @@ def _spatial(rng: np.random.Generator, shape: str) -> Drawn:
             axis[c, d] = np.eye(3)[rng.choice(3, p=[0.4, 0.4, 0.2] if d < D - 1 else [0.5, 0.5, 0.0])]
     eye, spread = np.tile(np.eye(3), (C, D, 1, 1)), np.tile(0.4 * RADIUS**2 * np.eye(3), (C, D, 1, 1))
     names = tuple(f"joint{i}" for i in range(n))
-    told = Rig(names, place, eye, offset, axis, com, spread, np.array([0, 0, -9.81]))
+    stated = Rig(names, place, eye, offset, axis, com, spread, np.array([0, 0, -9.81]))
     off = lambda size, of: size * rng.uniform(-1, 1, of)  # noqa: E731
     turned = axis + off(AXES, axis.shape)
     true = Rig(names, place, eye, offset * (1 + off(GEOMETRY, (C, D, 1))),
                turned / np.linalg.norm(turned, axis=2, keepdims=True),
                com * (1 + off(GEOMETRY, (C, D, 1))) + GEOMETRY * lengths[..., None] * rng.uniform(-1, 1, com.shape),
-               spread, told.gravity)  # fmt: skip
+               spread, stated.gravity)  # fmt: skip
     mass = rng.uniform(0.1, 0.2) * np.cumprod(np.r_[1.0, rng.uniform(0.7, 0.95, n - 1)])
-    out = _driven(rng, told, shape, mass)
-    weight = _scales(told, mass)[0]
+    out = _driven(rng, stated, shape, mass)
+    weight = _scales(stated, mass)[0]
     lean = off(TILT, 2) + off(TILT_BY_RUN, (8, 2))
-    out.rig, out.told = true, told
+    out.rig, out.believed_rig = true, stated
     out.gravity = 9.81 * np.c_[np.sin(lean), -np.cos(np.linalg.norm(lean, axis=1))]
     out.true |= {"eccentric": rng.uniform(*ECCENTRIC, n), "cable": rng.uniform(0, CABLE, n) * weight / 0.8,
                  "thermal_torque": rng.uniform(WARM_TORQUE, 0, n), "thermal_friction": rng.uniform(WARM_FRICTION, 0, n),
@@ -252,7 +252,7 @@ def files(where: Path, d: Drawn) -> list[str]:
     the settings that hand them to `diagnose.py`."""
     if d.hand == "xhand_right":
         return []
-    g, rig, b = (lambda x: "%.5g" % x), d.told or d.rig, d.believed
+    g, rig, b = (lambda x: "%.5g" % x), d.believed_rig or d.rig, d.believed
     pos = lambda v: " ".join(g(x) for x in v)  # noqa: E731
     C, D = rig.com.shape[:2]
     lines = ['<mujoco model="rig">', '  <compiler angle="radian"/>', "  <worldbody>"]

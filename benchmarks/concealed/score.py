@@ -212,7 +212,7 @@ def one(truth: dict, d: dict) -> dict:
 
 
 def rate(values: list) -> dict | None:
-    """{value, low, high, n} of a share; None without cases."""
+    """Return {value, low, high, n} of a share; None without cases."""
     values = [bool(v) for v in values]
     if not values:
         return None
@@ -221,7 +221,7 @@ def rate(values: list) -> dict | None:
 
 
 def middle(values: list, statistic: Callable) -> dict | None:
-    """{value, low, high, n} of a statistic; None without cases."""
+    """Return {value, low, high, n} of a statistic; None without cases."""
     if not values:
         return None
     low, high = bootstrap(values, statistic)

@@ -148,7 +148,7 @@ def relaxing(p: dict[str, float], x: np.ndarray) -> np.ndarray:
 
 
 def _at(x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """x [M, K] at fractional samples, the first before it begins."""
+    """Return x [M, K] at fractional samples, the first before it begins."""
     at = np.maximum(at, 0)
     i = np.minimum(np.floor(at).astype(int), len(x) - 2)
     return x[i] * (1 - (at - i))[:, None] + x[i + 1] * (at - i)[:, None]

@@ -180,7 +180,7 @@ def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _gap(model, data, q) -> float:
-    """m between the ball and the fingertip; negative: pressed in."""
+    """Return m between the ball and the fingertip; negative: pressed in."""
     for name, x in zip(("slide", "across", "press"), q, strict=True):
         data.qpos[model.joint(name).qposadr[0]] = x
     mujoco.mj_kinematics(model, data)

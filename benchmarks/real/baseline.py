@@ -215,11 +215,11 @@ def fit(
     tried: list[tuple[float, np.ndarray]] = []
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        left = missed(x, pieces)[0]
-        tried.append((float(np.mean(np.sqrt(1 + (left / WIDE) ** 2))), x))
+        error = missed(x, pieces)[0]
+        tried.append((float(np.mean(np.sqrt(1 + (error / WIDE) ** 2))), x))
         if time.monotonic() - begun > limit:
             raise TimeoutError
-        return left
+        return error
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         step = 1e-3 * scale * np.where(x + 1e-3 * scale > high, -1, 1)

@@ -428,7 +428,7 @@ def simulated(features: frozenset[str]) -> list[int]:
 
 
 def did_you_mean(name: str, valid: Iterable[object]) -> str:
-    """' Did you mean X?' for the valid name nearest to `name`, or nothing."""
+    """Return ' Did you mean X?' for the valid name nearest to `name`, or nothing."""
     near = difflib.get_close_matches(str(name), [str(v) for v in valid], n=1)
     return f" Did you mean '{near[0]}'?" if near else ""
 

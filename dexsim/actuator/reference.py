@@ -122,8 +122,8 @@ def supply_left(
 
 
 def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) -> Numbers:
-    """Setpoint [...] rad that a firmware moves towards its target [...] rad at a limited speed and acceleration: from
-    the joint's position q [...] rad, at its speed, of the first two steps; q, or the target, without either limit.
+    """Return setpoint [...] rad that a firmware moves towards its target [...] rad at a limited speed and acceleration:
+    from the joint's position q [...] rad, at its speed, of the first two steps; q, or the target, without either limit.
 
     p: columns by name. A limited setpoint stops in time: v <= a dt (sqrt(1/4 + 2 d / (a dt^2)) - 1/2) at the distance
     d, from d = a dt^2 k (k + 1) / 2 and v = a dt k."""

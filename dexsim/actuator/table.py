@@ -299,7 +299,7 @@ class ServoTable:
         return out
 
     def encoder(self, which: str, joints: Sequence[str]) -> list[str]:
-        """'joint' or 'motor' for each joint; which: 'loop' or 'position'."""
+        """Return 'joint' or 'motor' for each joint; which: 'loop' or 'position'."""
         return [_lookup(getattr(self, f"{which}_encoder"), joint) or "joint" for joint in joints]
 
 

@@ -153,7 +153,8 @@ class Calibration:
     def from_dict(
         cls, raw: Any, where: str = "calibration", torque_max: np.ndarray | None = None, hand: Hand | None = None
     ) -> Calibration:
-        """torque_max [J] N.m: what training normalised by; the file may state its own. hand: whose (the xHand)."""
+        """Return torque_max [J] N.m: what training normalised by; the file may state its own. hand: whose (the
+        xHand)."""
         hand = hand or load_hand("xhand")
         J = len(hand.joints)
         content = _content(raw, where, hand)
@@ -173,16 +174,16 @@ class Calibration:
             assumed.append(
                 f"current_per_torque of {names} is not measured: {ASSUMED_CURRENT_PER_TORQUE} A per N.m assumed"
             )
-        left = [j for j, e in (content.joints or {}).items() if e is not None and e.torque_max == "unknown"]
-        if left and how == "matched":
-            assumed.append(f"torque_max of {', '.join(left)} is unknown: what training normalised by is taken")
+        unknown = [j for j, e in (content.joints or {}).items() if e is not None and e.torque_max == "unknown"]
+        if unknown and how == "matched":
+            assumed.append(f"torque_max of {', '.join(unknown)} is unknown: what training normalised by is taken")
         missing = ~np.isfinite(out["current_per_torque"])
         out["current_per_torque"][missing] = ASSUMED_CURRENT_PER_TORQUE
         unmeasured = ~np.isfinite(out["current_max"])
-        left = [j for j, e in (content.joints or {}).items() if e is not None and e.current_max == "unknown"]
-        left = [j for j, x in zip(hand.joints, unmeasured, strict=True) if x] if how == "paper" else left
-        if left:
-            names = "every joint" if len(left) == J else ", ".join(left)
+        unknown = [j for j, e in (content.joints or {}).items() if e is not None and e.current_max == "unknown"]
+        unknown = [j for j, x in zip(hand.joints, unmeasured, strict=True) if x] if how == "paper" else unknown
+        if unknown:
+            names = "every joint" if len(unknown) == J else ", ".join(unknown)
             assumed.append(f"current_max of {names} is not measured: current_per_torque times torque_max taken")
         out["current_max"] = np.where(unmeasured, out["current_per_torque"] * out["torque_max"], out["current_max"])
         sign = content.current_sign

@@ -73,7 +73,7 @@ def check(cfg: dict[str, Any]) -> None:
 
 
 def get(cfg: dict[str, Any], key: str) -> Any:
-    """The value at a dotted key, None where the path breaks off."""
+    """Return the value at a dotted key, None where the path breaks off."""
     node: Any = cfg
     for part in key.split("."):
         if not isinstance(node, dict) or part not in node:

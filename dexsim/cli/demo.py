@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
 
 
 def _free() -> int:
-    """A port of this machine that nobody serves at: the usual one, or another."""
+    """Return a port of this machine that nobody serves at: the usual one, or another."""
     for port in (8080, 0):
         with socket.socket() as probe:
             with contextlib.suppress(OSError):

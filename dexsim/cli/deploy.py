@@ -118,7 +118,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list[Any]:
-    """A loop for each hand. Raises UserError."""
+    """Return a loop for each hand. Raises UserError."""
     from dexsim.calibration.file import Calibration
     from dexsim.deploy import bundle as bundles
     from dexsim.deploy.loop import Loop, LoopSettings
@@ -165,7 +165,7 @@ def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list
 
 
 def _two_hands(found: Sequence[tuple], hang: float) -> list[Any]:
-    """Drivers of two xHands on one bus."""
+    """Return drivers of two xHands on one bus."""
     from dexsim.deploy.vendor import VendorXHands
 
     given, b, calibration, _ = found[0]
@@ -259,7 +259,7 @@ def _ending(report: Any, recorder: Any, name: str = "hand") -> None:
 
 
 def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: Any = None) -> tuple[Any, Any]:
-    """The driver, `hand` where there is one of several on a bus, and what sees the object."""
+    """Return the driver, `hand` where there is one of several on a bus, and what sees the object."""
     import numpy as np
 
     from dexsim.deploy.measure import ORIENTATION, PLACE, of
@@ -328,8 +328,8 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
 
 
 def _own(kind: str, given: dict[str, str], b: Any, calibration: Any, place: Any) -> tuple[Any, Any]:
-    """A driver that an installed package brings (an entry point of the group `dexsim.drivers`), or that is named in
-    full: called with hand=, port= (None where none is given) and calibration=; and what sees the object."""
+    """Return a driver that an installed package brings (an entry point of the group `dexsim.drivers`), or that is named
+    in full: called with hand=, port= (None where none is given) and calibration=; and what sees the object."""
     brought = door.installed("dexsim.drivers")
     if kind not in brought and not door.is_named(kind):
         known = ", ".join(("sim", "xhand", "ros2", *brought))
@@ -355,7 +355,7 @@ def _ros2(given: dict[str, str], hand: Any) -> Any:
 
 
 def _imu(given: dict[str, str], b: Any) -> Any:
-    """The IMU in the object."""
+    """Return the IMU in the object."""
     from dexsim.deploy.imu import UdpImu
 
     how, _, ports = given.get("imu", "").partition(":")

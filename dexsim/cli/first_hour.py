@@ -117,7 +117,7 @@ class Session:
         self._fresh_at = clock.now()
 
     def read(self) -> bool:
-        """Whether there is a new reading; raises Stopped where none can be had or the driver cannot go on."""
+        """Return whether there is a new reading; raises Stopped where none can be had or the driver cannot go on."""
         now, state = self.clock.now(), self.driver.read()
         why = getattr(self.driver, "problem", str)()
         new = state is not None and (self.state is None or state.sequence != self.state.sequence)
@@ -655,7 +655,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) -> HandDriver:
-    """The driver that the settings name. Raises UserError."""
+    """Return the driver that the settings name. Raises UserError."""
     from dexsim.calibration.file import Calibration
     from dexsim.cli import settings
     from dexsim.deploy.fake_xhand import Faults
@@ -679,7 +679,7 @@ def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) ->
 def walk(
     driver: HandDriver, hand: Any, clock: Clock, names: Sequence[str], given: dict[str, Any], out: Path, say: Callable
 ) -> int:
-    """The steps with their questions, and the folder; see `main`."""
+    """Return the steps with their questions, and the folder; see `main`."""
     asks = given["yes"] != "true" and sys.stdin is not None and sys.stdin.isatty()
     say("opening the hand ...")
     info = driver.open()
@@ -738,7 +738,7 @@ def _real(given: dict[str, Any]) -> bool:
 
 
 def _still(goal: np.ndarray) -> Callable[[float], np.ndarray]:
-    """The same targets [J] rad at all times."""
+    """Return the same targets [J] rad at all times."""
     return lambda t: goal
 
 

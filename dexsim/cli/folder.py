@@ -21,7 +21,7 @@ CONFIG = "config.yaml"
 
 
 def for_run(cfg: dict[str, Any]) -> Path:
-    """The new run's folder: ``out``, else ``runs/<task>/<run>`` with date and time for a nameless run.
+    """Return the new run's folder: ``out``, else ``runs/<task>/<run>`` with date and time for a nameless run.
 
     No two starts get one folder, however close they are. What killed runs left unfinished beside it is removed.
     """
@@ -38,7 +38,7 @@ def for_run(cfg: dict[str, Any]) -> Path:
 
 
 def _new(parent: Path, stamp: str) -> Path:
-    """A folder that was not there before: making it is what claims it."""
+    """Return a folder that was not there before: making it is what claims it."""
     for k in itertools.count(1):
         folder = parent / (stamp if k == 1 else f"{stamp}_{k}")
         try:

@@ -53,7 +53,7 @@ END = """
 
 
 def text(script: str, config_dir: Path) -> str:
-    """The help page of ``train`` or ``play``."""
+    """Return the help page of ``train`` or ``play``."""
     files = ["config.yaml"] if script == "train" else ["play.yaml"]
     lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
     for file in files:
@@ -64,7 +64,7 @@ def text(script: str, config_dir: Path) -> str:
 
 
 def settings(path: Path) -> list[tuple[str, str, str]]:
-    """(dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
+    """Return (dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
     rows, owner = [], ""
     for line in path.read_text("utf-8").splitlines():
         if match := re.match(r"^(\w+):\s*$", line):

@@ -103,6 +103,6 @@ class Run:
 
 
 def beside(source: Path) -> list[Path]:
-    """The checkpoint and those in its folder, the newest first."""
+    """Return the checkpoint and those in its folder, the newest first."""
     found = sorted(source.parent.glob("*.pt"), key=lambda p: -p.stat().st_mtime)
     return [source, *(p for p in found if p.name != source.name)]

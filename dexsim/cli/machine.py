@@ -16,7 +16,8 @@ PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 
 
 def device(asked: str | None) -> str:
-    """ "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not here."""
+    """Return  "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not
+    here."""
     count = cuda_devices()
     if asked is None:
         return "cuda:0" if count else "cpu"
@@ -36,7 +37,7 @@ def device(asked: str | None) -> str:
 
 
 def cuda_devices() -> int:
-    """How many CUDA devices torch sees here."""
+    """Return how many CUDA devices torch sees here."""
     return torch.cuda.device_count() if torch.cuda.is_available() else 0
 
 
@@ -49,7 +50,7 @@ def set_threads(where: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of dexsim, Python and what it stands on, for the printout and for checkpoints."""
+    """Return versions of dexsim, Python and what it stands on, for the printout and for checkpoints."""
     found = {"dexsim": VERSION, "python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -72,7 +73,7 @@ def memory(where: str) -> str:
 
 
 def describe(where: str) -> str:
-    """A device in words, e.g. "cuda:0 (NVIDIA H200)" or "cpu (2 cores)"."""
+    """Return a device in words, e.g. "cuda:0 (NVIDIA H200)" or "cpu (2 cores)"."""
     if where.startswith("cuda"):
         return f"{where} ({torch.cuda.get_device_name(where)})"
     return f"cpu ({system.cores()} cores)"

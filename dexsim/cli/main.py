@@ -74,7 +74,7 @@ Results go into runs/ and out/ of the folder you are in, or where out= says.
 
 
 def first_screen() -> str:
-    """What `dexsim --help` prints."""
+    """Return what `dexsim --help` prints."""
 
     def lines(names: list[str]) -> str:
         return "\n".join(f"  {name:<15}{COMMANDS[name].about}" for name in names)
@@ -105,7 +105,7 @@ def dispatch(argv: list[str]) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The console command `dexsim`, `python -m dexsim` and the scripts at the top; returns the exit status."""
+    """Return the console command `dexsim`, `python -m dexsim` and the scripts at the top; returns the exit status."""
     return guard(dispatch, sys.argv[1:] if argv is None else argv)
 
 

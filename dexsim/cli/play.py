@@ -71,7 +71,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
 
 
 def results(start: Start) -> Path:
-    """``out``; else play/ beside a run's checkpoint, else out/<checkpoint> or out/<task>_<policy>."""
+    """Return ``out``; else play/ beside a run's checkpoint, else out/<checkpoint> or out/<task>_<policy>."""
     if start.play["out"] is not None:
         return Path(str(start.play["out"])).expanduser()
     if start.source is None:

@@ -79,7 +79,7 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
 
 
 def _object(own: dict[str, str]) -> Any:
-    """What the recorded object is, as stated; None where nothing is."""
+    """Return what the recorded object is, as stated; None where nothing is."""
     from dexsim.recording.led_object import Stated
 
     rest = [k for k in ("object_size", "object_mass", "object_friction") if k in own]
@@ -195,7 +195,7 @@ def _plain(joints: tuple[str, ...], values: Any) -> dict[str, float | None]:
 
 
 def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
-    """The recorded posture beside the simulated one; whether it could be made."""
+    """Return the recorded posture beside the simulated one; whether it could be made."""
     import mujoco
 
     from dexsim.console.ticker import Ticker

@@ -53,7 +53,7 @@ def replay(
 
 
 def _video(env: Any, frames: dict[str, Any], path: Path) -> bool:
-    """Whether it could be made."""
+    """Return whether it could be made."""
     from dexsim.view.video import NoRenderer, clips_of, render
 
     try:
@@ -73,7 +73,7 @@ def _video(env: Any, frames: dict[str, Any], path: Path) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """JSON's own types: NaN and infinities become null, NumPy and torch numbers plain ones."""
+    """Convert to JSON's own types: NaN and infinities become null, NumPy and torch numbers plain ones."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -10,13 +10,13 @@ from dexsim.console.tables import table
 
 
 def versions_line() -> str:
-    """One line: dexsim 0.1.0 | python 3.11.2 | torch ... ."""
+    """Return one line: dexsim 0.1.0 | python 3.11.2 | torch ... ."""
     return " | ".join(f"{name} {number}" for name, number in machine.versions().items())
 
 
 def describe_env(tables: dict[str, Any]) -> str:
-    """The tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization; then its
-    notes."""
+    """Return the tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization;
+    then its notes."""
     parts = []
     for group, rows in tables.get("observations", {}).items():
         total = sum(int(row[1]) for row in rows)
@@ -36,5 +36,5 @@ def describe_env(tables: dict[str, Any]) -> str:
 
 
 def _fit(rows: Sequence[Sequence[Any]], width: int) -> list[list[Any]]:
-    """Rows cut or filled up with empty cells to ``width``."""
+    """Return rows cut or filled up with empty cells to ``width``."""
     return [[*row, *[""] * width][:width] for row in rows]

@@ -40,7 +40,7 @@ class Request:
 
 
 def groups(config_dir: Path) -> dict[str, list[str]]:
-    """The config groups and their options: the folders under ``dexsim/configs/`` and the YAML files in them."""
+    """Return the config groups and their options: the folders under ``dexsim/configs/`` and the YAML files in them."""
     found = {d.name: sorted(f.stem for f in d.glob("*.yaml")) for d in sorted(config_dir.iterdir()) if d.is_dir()}
     return {name: options for name, options in found.items() if options}
 
@@ -124,8 +124,8 @@ def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
 
 @functools.lru_cache(maxsize=16)
 def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tuple) -> DictConfig:
-    """What files of these stamps give: reading them takes some tenths of a second, and who trains or plays several
-    times in one process chooses the same again."""
+    """Return what files of these stamps give: reading them takes some tenths of a second, and who trains or plays
+    several times in one process chooses the same again."""
     overrides = [group if group.startswith("~") else f"{group}={option}" for group, option in choices]
     GlobalHydra.instance().clear()
     try:
@@ -264,7 +264,7 @@ def _there_too(wishes: Any, own: Any) -> Any:
 
 
 def resolve(cfg: DictConfig) -> dict[str, Any]:
-    """The plain dict that the library gets: interpolations resolved, nothing missing."""
+    """Return the plain dict that the library gets: interpolations resolved, nothing missing."""
     try:
         plain = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
@@ -274,7 +274,7 @@ def resolve(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
-    """The node that holds ``key``. Raises UserError naming what there is where the path breaks off."""
+    """Return the node that holds ``key``. Raises UserError naming what there is where the path breaks off."""
     node, parts = cfg, key.split(".")
     for depth, part in enumerate(parts):
         inside = isinstance(node, ListConfig) and part.isdigit() and int(part) < len(node)
@@ -310,7 +310,8 @@ def _every_key(cfg: DictConfig, prefix: str = "") -> list[str]:
 
 
 def _guess(name: str, valid: list[str]) -> str:
-    """ "; did you mean ...?" for the nearest name: by the whole path, else by its last part ('' when none is near)."""
+    """Return  "; did you mean ...?" for the nearest name: by the whole path, else by its last part ('' when none is
+    near)."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.8)
     if not near:
         last = {v.rpartition(".")[2]: v for v in reversed(valid)}

@@ -106,5 +106,5 @@ def main(argv: list[str]) -> int:
 
 
 def _value(key: str, text: str) -> Any:
-    """A setting as it was typed: a number, a word, a list. Raises UserError."""
+    """Return a setting as it was typed: a number, a word, a list. Raises UserError."""
     return yaml_text.parse(text, f"{key}={text[:40]}")

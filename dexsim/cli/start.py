@@ -49,7 +49,7 @@ class Start:
 
 
 def for_train(argv: list[str], config_dir: Path) -> Start | None:
-    """Settings of a training run; None when the command only asked for help or the settings (printed)."""
+    """Return settings of a training run; None when the command only asked for help or the settings (printed)."""
     given, only_show = _flags(argv, config_dir, "train")
     if given is None:
         return None
@@ -85,7 +85,7 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
 
 
 def for_play(argv: list[str], config_dir: Path) -> Start | None:
-    """Settings of a replay; None when the command only asked for help or the settings (printed)."""
+    """Return settings of a replay; None when the command only asked for help or the settings (printed)."""
     given, only_show = _flags(argv, config_dir, "play")
     if given is None:
         return None
@@ -137,7 +137,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
 
 @contextlib.contextmanager
 def _blamed(source: Any, request: settings.Request) -> Iterator[None]:
-    """Errors of settings that a checkpoint holds, and this command did not type, name its file."""
+    """Yield errors of settings that a checkpoint holds, and this command did not type, name its file."""
     try:
         yield
     except UserError as error:
@@ -162,7 +162,7 @@ def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | 
 
 
 def _yaml(path: Path) -> DictConfig:
-    """One of our own files of settings, which is a mapping."""
+    """Return one of our own files of settings, which is a mapping."""
     cfg = OmegaConf.load(path)
     assert isinstance(cfg, DictConfig)
     return cfg
@@ -197,8 +197,8 @@ def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
 def _from_checkpoint(
     data: dict[str, Any], source: Any, config_dir: Path, request: settings.Request, fresh: dict[str, Any]
 ) -> DictConfig:
-    """The checkpoint's own config, settings of the earlier command forgotten and this command's applied. fresh: what is
-    forgotten. source: its file, for messages."""
+    """Return the checkpoint's own config, settings of the earlier command forgotten and this command's applied. fresh:
+    what is forgotten. source: its file, for messages."""
     known = _yaml(config_dir / "config.yaml")
     plain = OmegaConf.to_container(known)
     assert isinstance(plain, dict)
@@ -252,7 +252,8 @@ def _another_world(plain: dict[str, Any]) -> bool:
 
 
 def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
-    """The config of another world (`reality=`), on the CPU, all its trials at once: C MuJoCo has a thread pool."""
+    """Return the config of another world (`reality=`), on the CPU, all its trials at once: C MuJoCo has a thread
+    pool."""
     if str(play["device"] or "cpu") != "cpu":
         raise UserError(
             f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu"

@@ -24,7 +24,7 @@ PROGRAM = (sys.executable, "-m", "dexsim")
 
 
 def wanted(argv: list[str]) -> bool:
-    """Whether the command asks for a sweep."""
+    """Return whether the command asks for a sweep."""
     return any(a in FLAGS for a in argv)
 
 
@@ -110,7 +110,8 @@ def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Callable[[
 
 
 def _collect(folder: Path) -> tuple[list[tuple], bool]:
-    """A row for each job: name, settings, status, iterations, last step reward, seconds; and whether one failed."""
+    """Return a row for each job: name, settings, status, iterations, last step reward, seconds; and whether one
+    failed."""
     rows, failed = [], False
     notes = sorted(folder.glob("jobs/*.json"), key=lambda p: int(p.stem))
     told = [json.loads(note.read_text("utf-8")) for note in notes]

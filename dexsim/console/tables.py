@@ -37,7 +37,7 @@ def cell(value: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """ "42 s", "3:07" (minutes) or "1:02:07" (hours)."""
+    """Return  "42 s", "3:07" (minutes) or "1:02:07" (hours)."""
     whole = int(round(seconds))
     if whole < 60:
         return f"{whole} s"

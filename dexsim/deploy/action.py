@@ -21,7 +21,7 @@ class ActionRule:
     high: np.ndarray
 
     def target(self, action: np.ndarray, before: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Targets [J] rad from the action [J], the last targets and the measured angles q [J] rad."""
+        """Return targets [J] rad from the action [J], the last targets and the measured angles q [J] rad."""
         a = np.clip(np.nan_to_num(np.asarray(action, np.float32)), -1.0, 1.0)
         if self.mode == "relative":
             target = before + a * np.float32(self.scale)

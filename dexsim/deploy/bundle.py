@@ -47,7 +47,8 @@ class Bundle:
         self._carried = {}
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions [N, A] of observations [N, D], float32; of a recurrent policy N is 1, and the next follows this."""
+        """Return actions [N, A] of observations [N, D], float32; of a recurrent policy N is 1, and the next follows
+        this."""
         p = self.manifest["policy"]
         action, self._carried = _act(self.session, p, observation, self._carried or _blank(p))
         return action
@@ -59,8 +60,8 @@ class Bundle:
 
 
 def load(path: str | Path) -> Bundle:
-    """The bundle in a folder. Raises UserError: a file missing or changed, a manifest of the wrong types or beyond the
-    hand's limits, another version, a network that does not fit it or reads other files, no onnxruntime."""
+    """Return the bundle in a folder. Raises UserError: a file missing or changed, a manifest of the wrong types or
+    beyond the hand's limits, another version, a network that does not fit it or reads other files, no onnxruntime."""
     path = Path(path).expanduser()
     if not (path / MANIFEST).is_file():
         raise UserError(f"{path}: no {MANIFEST} there; dexsim export checkpoint=... out=DIR writes a bundle")
@@ -76,14 +77,14 @@ def load(path: str | Path) -> Bundle:
 
 
 def network(file: Path, digest: str) -> Any:
-    """onnxruntime's session of another of a bundle's networks. Raises UserError as `load` does."""
+    """Return onnxruntime's session of another of a bundle's networks. Raises UserError as `load` does."""
     data = _network(file, digest)
     guard.rehearse(session, data, file, what=f"{file}", size=len(data))
     return session(data, file)
 
 
 def _network(file: Path, digest: str) -> bytes:
-    """The bytes of a network. Raises UserError: missing, too large, not the one that the manifest names."""
+    """Return the bytes of a network. Raises UserError: missing, too large, not the one that the manifest names."""
     if not file.exists():
         raise UserError(f"{file.parent}: {file.name} is missing; export the bundle again")
     files.check(file, "network")
@@ -94,8 +95,8 @@ def _network(file: Path, digest: str) -> bytes:
 
 
 def _hand(which: manifests.HandEntry, path: Path) -> Hand:
-    """The hand of a bundle in folder `path`: one that comes with dexsim, or the bundle's own. A name is no path: a
-    manifest cannot have other folders of this machine read."""
+    """Return the hand of a bundle in folder `path`: one that comes with dexsim, or the bundle's own. A name is no path:
+    a manifest cannot have other folders of this machine read."""
     file, own = path / MANIFEST, path / HAND
     if which.folder is None and which.name not in known():
         raise UserError(
@@ -130,8 +131,8 @@ def _mapping(file: Path) -> dict[str, Any]:
 
 
 def session(data: bytes, policy: Path) -> Any:
-    """onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander. The
-    network is taken from `data` alone: one that keeps weights in other files is refused, so that it reads none."""
+    """Return onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander.
+    The network is taken from `data` alone: one that keeps weights in other files is refused, so that it reads none."""
     try:
         import onnx
         import onnxruntime
@@ -158,7 +159,7 @@ def session(data: bytes, policy: Path) -> Any:
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """Every TensorProto in a protobuf message, at any depth: initializers, attributes, sub-graphs, functions."""
+    """Yield every TensorProto in a protobuf message, at any depth: initializers, attributes, sub-graphs, functions."""
     for field, value in message.ListFields():
         if field.message_type is None:
             continue
@@ -169,14 +170,14 @@ def _tensors(message: Any) -> Iterator[Any]:
 
 
 def _blank(p: dict[str, Any]) -> dict[str, np.ndarray]:
-    """What a recurrent policy carries as an episode begins."""
+    """Return what a recurrent policy carries as an episode begins."""
     return {k: np.zeros((layers, 1, size), np.float32) for k, (layers, size) in (p.get("state") or {}).items()}
 
 
 def _act(
     session: Any, p: dict[str, Any], observation: np.ndarray, carried: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Actions, and what is carried on."""
+    """Return actions, and what is carried on."""
     given = {p["input"]: np.asarray(observation, np.float32)} | {f"{k}_in": v for k, v in carried.items()}
     action, *new = session.run([p["output"], *(f"{k}_out" for k in carried)], given)
     return action, dict(zip(carried, new, strict=True))
@@ -204,5 +205,5 @@ def _tried(data: bytes, policy: Path, p: dict[str, Any]) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file."""
+    """Return hex digest of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

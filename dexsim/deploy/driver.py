@@ -71,7 +71,7 @@ class HandDriver(Protocol):
         """Connect; returns what to log once (serial number, firmware, protocol). Raises UserError; nothing moves."""
 
     def read(self) -> HandState | None:
-        """The newest reading (the same one again until there is a newer), None before the first."""
+        """Return the newest reading (the same one again until there is a newer), None before the first."""
 
     def send(self, command: HandCommand) -> Any:
         """Hand over targets for the next bus cycle. What is returned says that they were not taken, if anything: a
@@ -88,7 +88,7 @@ class Clock:
     """Host time."""
 
     def now(self) -> float:
-        """Monotonic time [s], the same in every process of this machine."""
+        """Return monotonic time [s], the same in every process of this machine."""
         return time.monotonic()
 
     def sleep_until(self, t: float) -> None:

@@ -146,11 +146,11 @@ class FakeXHand:
         self.HandCommand_t, self.FingerCommand_t = _HandCommand, _FingerCommand
 
     def XHandControl(self) -> _Control:
-        """A connection."""
+        """Return a connection."""
         return _Control(self)
 
     def seen(self) -> np.ndarray:
-        """The object [9], NaN where the hand behind knows none (not of the package: the simulated world's)."""
+        """Return the object [9], NaN where the hand behind knows none (not of the package: the simulated world's)."""
         out = np.full(9, np.nan)
         for part, name in ((slice(0, 4), "place"), (slice(4, 9), "orientation")):
             look = getattr(self.hand, name, lambda: None)()
@@ -185,7 +185,7 @@ class FakeXHand:
         return hand.state(t + self.zero)
 
     def ports(self) -> dict[str, bool]:
-        """Serial ports now, and whether the hand's bus is on it: the other is its auxiliary one."""
+        """Return serial ports now, and whether the hand's bus is on it: the other is its auxiliary one."""
         if self.faults.ethercat:
             return {"eth9": True}
         if self.faults.unplug_s <= self.time < self.faults.unplug_s + 2.0:
@@ -244,11 +244,11 @@ class _Control:
     # -- the package's calls
     # ---------------------------------------------------------------------------------------------------------------
     def enumerate_devices(self, kind: str) -> list[str]:
-        """Ports of a kind: RS485, EtherCAT."""
+        """Return ports of a kind: RS485, EtherCAT."""
         return list(self._fake.ports()) if kind == ("EtherCAT" if self._fake.faults.ethercat else "RS485") else []
 
     def open_serial(self, port: str, baud: int) -> SimpleNamespace:
-        """Error object."""
+        """Return error object."""
         fake = self._fake
         fake.opened += 1
         known = fake.ports() | ({"fake": True} if fake.ports() else {})
@@ -258,7 +258,7 @@ class _Control:
         return _error()
 
     def open_ethercat(self, name: str) -> SimpleNamespace:
-        """Error object."""
+        """Return error object."""
         self._fake.opened += 1
         if not self._fake.faults.ethercat or name != "eth9" or self._fake.opened <= self._fake.faults.opens:
             return _error(CLOSED, f"no EtherCAT on {name}")
@@ -271,23 +271,23 @@ class _Control:
         return _error()
 
     def list_hands_id(self) -> list[int]:
-        """Ids on the bus; none on the auxiliary port."""
+        """Return ids on the bus; none on the auxiliary port."""
         return list(range(len(self._held))) if (self._fake.ports() | {"fake": True}).get(self._port) else []
 
     def get_hand_type(self, hand: int) -> tuple:
-        """(error, L or R)."""
+        """Return (error, L or R)."""
         return self._said(hand, ("R" if self._fake.faults.side == "L" else "L") if hand else self._fake.faults.side)
 
     def get_serial_number(self, hand: int) -> tuple:
-        """(error, text)."""
+        """Return (error, text)."""
         return self._said(hand, self._fake.faults.second if hand else self._fake.faults.serial)
 
     def read_version(self, hand: int, part: int) -> tuple:
-        """(error, text)."""
+        """Return (error, text)."""
         return self._said(hand, "1.3.9")
 
     def get_sdk_version(self) -> str:
-        """Text alone."""
+        """Return text alone."""
         return self._fake.faults.sdk
 
     def reset_sensor(self, hand: int, sensor: int) -> SimpleNamespace:
@@ -296,7 +296,7 @@ class _Control:
         return _error() if 0x11 <= sensor <= 0x15 and not dead else _error(NO_TAXELS, f"sensor {sensor:#x}")
 
     def send_command(self, hand: int, command: _HandCommand) -> SimpleNamespace:
-        """One round trip; error object."""
+        """Return one round trip; error object."""
         if not isinstance(command, _HandCommand):
             raise TypeError("send_command(): incompatible function arguments")
         if not self._port or not 0 <= hand < len(self._held):
@@ -305,7 +305,7 @@ class _Control:
         return _error(self._trip(hand))
 
     def read_state(self, hand: int, force_update: bool = False) -> tuple:
-        """(error, state): forced, the last command goes out once more; the cache either way."""
+        """Return (error, state): forced, the last command goes out once more; the cache either way."""
         if not self._port or not 0 <= hand < len(self._held):
             return _error(NO_HAND, "no such hand"), self._zeros()
         if force_update:
@@ -327,7 +327,7 @@ class _Control:
         return (_error(), value) if there else (_error(NO_HAND, "no such hand"), "")
 
     def _trip(self, hand: int) -> int:
-        """The command goes out, the state comes back; the code of it."""
+        """Return the command goes out, the state comes back; the code of it."""
         fake, f, held = self._fake, self._fake.faults, self._held[hand]
         clock, t = fake.clock, fake.time
         if t >= f.abort_s:

@@ -58,7 +58,7 @@ class UdpImu:
         self.sender = sender
 
     def orientation(self, now: float) -> tuple[np.ndarray, float] | None:
-        """Never waits: the newest good line that has come in since the last call, else the last one."""
+        """Return, without waiting, the newest good line that has come in since the last call, else the last one."""
         waiting: list[tuple[bytes, tuple[str, int]]] = []
         for _ in range(MOST):
             try:
@@ -84,8 +84,8 @@ class UdpImu:
         return self._last
 
     def wait(self, seconds: float) -> bool:
-        """Whether a first orientation comes within that time. What comes is read at once: in a flood of others' lines a
-        queue that is looked at now and then would nearly always be full."""
+        """Return whether a first orientation comes within that time. What comes is read at once: in a flood of others'
+        lines a queue that is looked at now and then would nearly always be full."""
         limit = time.monotonic() + seconds
         while self.orientation(time.monotonic()) is None and (left := limit - time.monotonic()) > 0:
             select.select([self._socket], [], [], left)
@@ -97,7 +97,7 @@ class UdpImu:
 
 
 def _orientation(text: bytes) -> np.ndarray | None:
-    """A line's quaternion [4], w x y z, of length 1; None where it is not four numbers of about that length."""
+    """Return a line's quaternion [4], w x y z, of length 1; None where it is not four numbers of about that length."""
     try:
         q = np.array([float(x) for x in text.replace(b",", b" ").split()])
     except ValueError:

@@ -41,8 +41,8 @@ class HandKinematics:
     def __call__(
         self, q: np.ndarray, follower: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and skin).
-        follower [S] rad: of measured joints without a drive; None: where the others hold them."""
+        """Return angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and
+        skin). follower [S] rad: of measured joints without a drive; None: where the others hold them."""
         d = self.data
         self._couplings.put(d, q)
         if follower is not None:
@@ -64,7 +64,7 @@ class HandKinematics:
     def touch(
         self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal forces [P, T] N and the tips' poses -> (force [P] N, centre [P, 3] m in the palm frame: the
+        """Return normal forces [P, T] N and the tips' poses -> (force [P] N, centre [P, 3] m in the palm frame: the
         force-weighted mean of the taxels, or the mean of those that feel anything; the pad's centre where nothing is
         felt)."""
         force = normal.sum(1)

@@ -224,7 +224,8 @@ class Loop:
     # -- the run
     # -------------------------------------------------------------------------------------------------------------
     def run(self) -> Report:
-        """Home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand first."""
+        """Go home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand
+        first."""
         c = self.clock
         interval = sys.getswitchinterval()
         try:
@@ -362,8 +363,8 @@ class Loop:
                     self._begin_homing(now)
 
     def _problem(self, now: float, late: float) -> str | None:
-        """What forbids going on: an old reading, or none that can be true; error codes, actions that are no numbers; a
-        late turn; too much current or heat."""
+        """Return what forbids going on: an old reading, or none that can be true; error codes, actions that are no
+        numbers; a late turn; too much current or heat."""
         s = self.settings
         why = self._broken or getattr(self.driver, "problem", str)()
         if why:
@@ -409,7 +410,7 @@ class Loop:
             self.report.counts["no_new_reading"] += 1
 
     def _take(self, now: float) -> bool:
-        """The newest state becomes ours if it can be true; whether it is a new one. Recorded once."""
+        """Return the newest state becomes ours if it can be true; whether it is a new one. Recorded once."""
         given = self.driver.read()
         if self._given is not None and (name := overwritten(self._given, self.state)) is not None:
             self._broken = f"{self.driver.name}: changed the {name} of a reading that it had given; it must give copies"
@@ -492,7 +493,7 @@ class Loop:
             self._begin_run(now)
 
     def _look(self, now: float) -> bool:
-        """The newest of what is seen of the object, if it can be true; False where nothing was seen yet."""
+        """Return the newest of what is seen of the object, if it can be true; False where nothing was seen yet."""
         if self.measure.needs is None:
             self._seen, self._seen_at = None, now
             return True
@@ -507,8 +508,8 @@ class Loop:
         return True
 
     def _carried(self, pose: np.ndarray, stamp: float) -> np.ndarray:
-        """What is seen at its stamp [s], `ahead` later at its mean speed over `SPEED_OVER`: between two readings in a
-        row the noise would be carried on with it."""
+        """Return what is seen at its stamp [s], `ahead` later at its mean speed over `SPEED_OVER`: between two readings
+        in a row the noise would be carried on with it."""
         if not self._poses or stamp != self._poses[-1][0]:
             self._poses = [(t, x) for t, x in self._poses if stamp - SPEED_OVER < t < stamp] + [(stamp, pose)]
         (t0, before), (t1, last) = self._poses[0], self._poses[-1]
@@ -689,5 +690,5 @@ def _to_its_end(work: Callable[[], None]) -> None:
 
 
 def _smooth(share: float) -> float:
-    """Minimum jerk from 0 to 1."""
+    """Return minimum jerk from 0 to 1."""
     return share**3 * (10 - 15 * share + 6 * share**2)

@@ -177,13 +177,13 @@ def floats(x: Any) -> list[float]:
 
 
 def hand_entry(raw: dict[str, Any], source: object) -> HandEntry:
-    """Which hand a manifest is of: bundles from before there was a choice are of the xHand."""
+    """Return which hand a manifest is of: bundles from before there was a choice are of the xHand."""
     return convert(raw.get("hand") or {"name": "xhand"}, HandEntry, f"{source}: hand", AGAIN)
 
 
 def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
-    """The manifest as declared above, of this hand. Raises UserError, one line: not a manifest, another version, a key
-    missing or of the wrong type, a value outside its range or beyond what the hand can do."""
+    """Return the manifest as declared above, of this hand. Raises UserError, one line: not a manifest, another version,
+    a key missing or of the wrong type, a value outside its range or beyond what the hand can do."""
     if raw.get("format") != FORMAT:
         raise UserError(f"{source}: not the manifest of a policy bundle")
     if raw.get("version") != VERSION:

@@ -33,22 +33,22 @@ class Measure(Protocol):
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [P] N). seen: what `needs` names; command: 0..1;
-        target [J] rad: the last ones sent; action [J]: the last."""
+        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen: what `needs` names; command:
+        0..1; target [J] rad: the last ones sent; action [J]: the last."""
 
 
 def of(task: str) -> Any:
-    """The module of a task's observations, by the name of the task in a manifest."""
+    """Return the module of a task's observations, by the name of the task in a manifest."""
     own = f"of_{task}"
     named = {p.stem for p in Path(__file__).parent.glob("of_*.py")}
     return importlib.import_module(f"dexsim.deploy.{own if own in named else 'of_terms'}")
 
 
 def for_bundle(bundle: Any, calibration: Calibration) -> Any:
-    """The measure of a bundle's task."""
+    """Return the measure of a bundle's task."""
     return of(bundle.manifest["task"]).measure(bundle, calibration)
 
 
 def tensor(x: object) -> torch.Tensor:
-    """float32 with a leading axis of one hand."""
+    """Return float32 with a leading axis of one hand."""
     return torch.from_numpy(np.asarray(x, np.float32)[None])

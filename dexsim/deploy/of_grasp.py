@@ -27,17 +27,17 @@ def check(m: Any, source: object, again: str) -> None:
 
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
-    """Rows of the observation as this dexsim builds it."""
+    """Return rows of the observation as this dexsim builds it."""
     return observations.rows(len(hand.joints), len(hand.fingers), len(hand.pads), sensed=len(hand.sensed))
 
 
 def settings(m: dict[str, Any]) -> float:
-    """What `SIGNALS.build` takes beside signals."""
+    """Return what `SIGNALS.build` takes beside signals."""
     return float(m["normalization"]["force_max_N"])
 
 
 def measure(bundle: Any, calibration: Calibration) -> Measure:
-    """What the loop calls."""
+    """Return what the loop calls."""
     manifest = bundle.manifest
     width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
     made = Measure(calibration, settings(manifest), float(manifest["rates"]["policy_period_s"]))
@@ -46,7 +46,7 @@ def measure(bundle: Any, calibration: Calibration) -> Measure:
 
 
 def parts(env: Any) -> dict[str, Any]:
-    """The parts of a manifest that differ between tasks."""
+    """Return the parts of a manifest that differ between tasks."""
     scaling = {
         "tau/tau_max": "torque [N.m] / normalization.tau_max",
         "F/F_max": "force [N] / normalization.force_max_N",
@@ -109,8 +109,8 @@ class Measure:
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame, which
-        is needed; command 0..1."""
+        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm
+        frame, which is needed; command 0..1."""
         assert seen is not None
         s = self.signals(state, seen, command)
         force = s.touch_force[0].numpy()
@@ -135,5 +135,5 @@ class Measure:
             tensor([command] * self.commands), self.hand.followers(state))  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
-        """[1, D] float32, by the builder that training used."""
+        """Return [1, D] float32, by the builder that training used."""
         return observations.build(signals, self.force_max).numpy()

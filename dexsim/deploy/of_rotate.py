@@ -34,24 +34,24 @@ def check(m: Any, source: object, again: str) -> None:
 
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
-    """Rows of the observation as this dexsim builds it."""
+    """Return rows of the observation as this dexsim builds it."""
     sizes = len(hand.joints), len(hand.fingers), len(hand.pads), len(hand.sensed)
     return observations_rotate.rows(m["task_settings"], *sizes)
 
 
 def settings(m: dict[str, Any]) -> dict[str, Any]:
-    """What `SIGNALS.build` takes beside signals."""
+    """Return what `SIGNALS.build` takes beside signals."""
     return m["task_settings"]
 
 
 def measure(bundle: Any, calibration: Calibration) -> TurnMeasure:
-    """What the loop calls."""
+    """Return what the loop calls."""
     return TurnMeasure(calibration, bundle.manifest, float(bundle.manifest["rates"]["policy_period_s"]))
 
 
 def parts(env: Any) -> dict[str, Any]:
-    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose
-    that is most like all others: where the fingers wait for the cube, and the targets they close to."""
+    """Return the same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held
+    pose that is most like all others: where the fingers wait for the cube, and the targets they close to."""
     task, g = env.task, env.grasps
     targets = task["observe"].get("last_action", "step") != "step"
     scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
@@ -131,8 +131,8 @@ class TurnMeasure:
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation w x y
-        z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
+        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation
+        w x y z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
         s = self.signals(state, seen, target, action)
         out = observations_rotate.build(s, self.task)
         if self.task["perception"] == "proprioception":
@@ -179,7 +179,7 @@ class TurnMeasure:
             self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
 
     def _velocity(self, state: HandState) -> np.ndarray:
-        """[J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        """Return [J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
         if state.velocity is not None and np.isfinite(state.velocity).all():
             return np.asarray(state.velocity, float)
         q = np.asarray(state.position, float)

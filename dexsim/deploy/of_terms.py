@@ -29,7 +29,8 @@ ORDER: dict[str, str] = {}
 
 
 def signals(joints: int, fingers: int, pads: int) -> dict[str, tuple[int, ...]]:
-    """What a hand of so many joints, fingers and touch pads tells, by the name that a task has for it, and its shape.
+    """Return what a hand of so many joints, fingers and touch pads tells, by the name that a task has for it, and its
+    shape.
 
     q rad, qd rad/s, torque N.m (from currents), target rad and action (the last ones sent); touch_force N and
     touch_centre m of the pads; tips m; age s since the policy began; object_pose (x y z m, w x y z), from something
@@ -94,7 +95,7 @@ class Observation(torch.nn.Module):
         self.names = names or self._asked()
 
     def _asked(self) -> list[str]:
-        """Signals that the rows use, found by computing them once."""
+        """Return signals that the rows use, found by computing them once."""
         zeros = {k: torch.zeros(1, *shape) for k, shape in self.shapes.items()}
         zeros["object_pose"][:, 3] = 1.0
         asked: dict[str, None] = {}
@@ -117,7 +118,7 @@ class Observation(torch.nn.Module):
         return torch.cat([*out, *(by_name[f"command {k}"] for k in told)], 1)
 
     def of_env(self, world: int = 0) -> dict[str, torch.Tensor]:
-        """The signals as the simulation has them, without noise."""
+        """Return the signals as the simulation has them, without noise."""
         env = self.task
         now = {name: getattr(env, name) for name in self.shapes if not name.startswith("command ")}
         now |= {f"command {k}": v for k, v in env.commands.items()}
@@ -135,12 +136,12 @@ def check(m: Any, source: object, again: str) -> None:
 
 
 def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str]]:
-    """Rows of the observation: as the bundle states them, since its network builds them."""
+    """Return rows of the observation: as the bundle states them, since its network builds them."""
     return [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
 
 
 def parts(env: Task) -> dict[str, Any]:
-    """The parts of a manifest that are a task's own, but for the network's digest."""
+    """Return the parts of a manifest that are a task's own, but for the network's digest."""
     from dexsim.deploy.manifests import floats
 
     of = Observation(env)
@@ -177,7 +178,7 @@ def parts(env: Task) -> dict[str, Any]:
 
 
 def measure(bundle: Any, calibration: Calibration) -> TermsMeasure:
-    """What the loop calls."""
+    """Return what the loop calls."""
     from dexsim.deploy import bundle as bundles
 
     terms = bundle.manifest["terms"]
@@ -212,8 +213,8 @@ class TermsMeasure:
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where the
-        policy needs it. command: of a task with one command of one number, that."""
+        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where
+        the policy needs it. command: of a task with one command of one number, that."""
         c = self.calibration
         tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
@@ -230,7 +231,7 @@ class TermsMeasure:
         return self.built({name: np.asarray(now[name], np.float32) for name in self.names}), force
 
     def built(self, given: dict[str, np.ndarray]) -> np.ndarray:
-        """The observation [1, D] of signals; moves the past on."""
+        """Return the observation [1, D] of signals; moves the past on."""
         feed = {_input(k): given[k].reshape(1, *self.shapes[k]).astype(np.float32) for k in self.names}
         flat = self.session.run(["rows"], feed)[0][0]
         fresh, rows, at = not self._frames, [], 0
@@ -250,7 +251,7 @@ class TermsMeasure:
         return self._past.reshape(1, -1).astype(np.float32)
 
     def _velocity(self, state: HandState) -> np.ndarray:
-        """[J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        """Return [J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
         if state.velocity is not None and np.isfinite(state.velocity).all():
             return np.asarray(state.velocity, float)
         q = np.asarray(state.position, float)
@@ -261,7 +262,7 @@ class TermsMeasure:
 
 
 def _input(name: str) -> str:
-    """A signal's name in the network."""
+    """Return a signal's name in the network."""
     return name.replace(" ", "_")
 
 

@@ -49,17 +49,17 @@ class Body(Protocol):
         """Connect; returns what to log. Raises UserError."""
 
     def cycle(self, command: HandCommand | None) -> HandState | None:
-        """One bus cycle, which takes its time: the command goes out (None: none yet; the same object: sent before),
-        what comes back is returned, None where nothing new did."""
+        """Return one bus cycle, which takes its time: the command goes out (None: none yet; the same object: sent
+        before), what comes back is returned, None where nothing new did."""
 
     def problem(self) -> str:
-        """Why the hand cannot be driven any longer; empty while it can."""
+        """Return why the hand cannot be driven any longer; empty while it can."""
 
     def released(self) -> tuple[bool, str] | None:
-        """After a passive command: whether the hand is limp, and by what that is known; None while it is not."""
+        """Return, after a passive command, whether the hand is limp, and by what that is known; None while not."""
 
     def seen(self) -> np.ndarray:
-        """The object [9]: place [3] m, its time [s], orientation [4] w x y z, its time [s]; NaN where none."""
+        """Return the object [9]: place [3] m, its time [s], orientation [4] w x y z, its time [s]; NaN where none."""
 
     def handle(self, what: int) -> None:
         """The object is held out (1), or let go (2); finger k is pressed (3 + k); joint j is blocked (101 + j), or
@@ -140,7 +140,7 @@ class BusDriver:
         return dict(line.split("=", 1) for line in _text(v["info"]).splitlines())
 
     def read(self) -> HandState | None:
-        """The newest state, None before the first."""
+        """Return the newest state, None before the first."""
         if self.body is not None:
             return self._step(self.body)
         v = self._v
@@ -180,13 +180,13 @@ class BusDriver:
             self._v["era"].value = self._era  # counts at once, even where a thread hangs inside `send`
 
     def problem(self) -> str:
-        """Why the hand cannot be driven any longer; empty while it can."""
+        """Return why the hand cannot be driven any longer; empty while it can."""
         if self.body is not None:
             return self.body.problem()
         return self._ended if self._gone() else _text(self._v["problem"])
 
     def released(self) -> tuple[bool, str] | None:
-        """Whether the hand is limp since it was let go, and by what that is known; None while it is not."""
+        """Return whether the hand is limp since it was let go, and by what that is known; None while it is not."""
         if self.body is not None:
             return self.body.released()
         if self._gone():
@@ -243,15 +243,15 @@ class BusDriver:
     # -- the object, of a simulated hand
     # ---------------------------------------------------------------------------------------------------------------
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
-        """HeightSource: the object as a simulated camera last saw it."""
+        """Return the object (a HeightSource) as a simulated camera last saw it."""
         return self._object_seen(slice(0, 4))
 
     def orientation(self, now: float) -> tuple[np.ndarray, float] | None:
-        """OrientationSource: as the object's IMU last said."""
+        """Return the orientation (an OrientationSource) as the object's IMU last said."""
         return self._object_seen(slice(4, 9))
 
     def pose(self, now: float) -> tuple[np.ndarray, float] | None:
-        """Both, [7]: x y z m, w x y z; the older one's time."""
+        """Return both, [7]: x y z m, w x y z; the older one's time."""
         place, turned = self.place(now), self.orientation(now)
         if place is None or turned is None:
             return None
@@ -308,7 +308,7 @@ class BusDriver:
         return self._state
 
     def _gone(self) -> bool:
-        """Whether the child has ended by itself; says how, once."""
+        """Return whether the child has ended by itself; says how, once."""
         if self._process is not None and not self._ended and self._process.exitcode is not None:
             self._ended = f"the process of the bus ended ({self._how()}): {NOBODY}"
         return bool(self._ended)
@@ -378,7 +378,8 @@ def _child(
 def _serve(
     make: Callable[[Clock], Body], v: dict[str, Any], joints: int, hang: float, orphan: Callable[[], bool]
 ) -> int:
-    """Bus cycles until the loop says stop, is silent or is gone; the last of them let go. Returns an exit status."""
+    """Return bus cycles until the loop says stop, is silent or is gone; the last of them let go. Returns an exit
+    status."""
     try:
         body = make(Clock())
         info = body.open()

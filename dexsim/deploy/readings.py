@@ -37,10 +37,10 @@ _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded o
 def implausible(
     state: HandState, now: float, hand: Hand, taxels: tuple[int, int], felt: bool = False
 ) -> str | None:
-    """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead,
-    an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged
-    here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`); felt: whether readings before had
-    taxels, which a hand does not lose."""
+    """Return why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies
+    ahead, an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not
+    judged here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`); felt: whether readings
+    before had taxels, which a hand does not lose."""
     J, (low, high) = len(hand.joints), hand.limits.T
     if (wrong := bad_stamp(state.time, now)) is not None:
         return wrong
@@ -72,7 +72,7 @@ def implausible(
 
 
 def bad_stamp(stamp: Any, now: float) -> str | None:
-    """Why a stamp [s] cannot be a time of the loop's clock, or None."""
+    """Return why a stamp [s] cannot be a time of the loop's clock, or None."""
     if not isinstance(stamp, (int, float, np.integer, np.floating)) or not np.isfinite(stamp):
         return f"its stamp is {stamp}, no time"
     if stamp > now + AHEAD:
@@ -81,7 +81,7 @@ def bad_stamp(stamp: Any, now: float) -> str | None:
 
 
 def bad_sequence(number: Any, before: Any) -> str | None:
-    """Why the count of a reading cannot be one after `before` (None: the first), or None."""
+    """Return why the count of a reading cannot be one after `before` (None: the first), or None."""
     if not isinstance(number, (int, float, np.integer, np.floating)) or not np.isfinite(number):
         return f"the count of its readings is {number}, no number"
     back = before is not None and number < before
@@ -92,13 +92,13 @@ _ARRAYS = ("position", "current", "temperature", "error", "tactile", "velocity",
 
 
 def copied(state: HandState) -> HandState:
-    """A reading whose arrays nobody else writes."""
+    """Return a reading whose arrays nobody else writes."""
     own: dict[str, Any] = {n: x.copy() for n in _ARRAYS if isinstance(x := getattr(state, n), np.ndarray)}
     return dataclasses.replace(state, **own)
 
 
 def overwritten(given: HandState, mine: HandState) -> str | None:
-    """The array of a reading that has been changed since `mine` was copied of it, or None."""
+    """Return the array of a reading that has been changed since `mine` was copied of it, or None."""
     for name in _ARRAYS:
         theirs, ours = getattr(given, name), getattr(mine, name)
         if isinstance(theirs, np.ndarray) and isinstance(ours, np.ndarray) and theirs.tobytes() != ours.tobytes():
@@ -107,7 +107,7 @@ def overwritten(given: HandState, mine: HandState) -> str | None:
 
 
 def refused(answer: Any) -> str:
-    """What a driver's `send` said of a command that the hand did not take; empty where it took it."""
+    """Return what a driver's `send` said of a command that the hand did not take; empty where it took it."""
     code = getattr(answer, "error_code", 0)
     if code:
         return f"{getattr(answer, 'error_message', '') or 'an error'} (code {code})"
@@ -150,7 +150,7 @@ class Frozen:
     def problem(
         self, now: float, target: np.ndarray | None, state: HandState, limit: np.ndarray
     ) -> tuple[int, float] | None:
-        """The joint that should have moved, and for how long [s] nothing has; None. limit [J] mA."""
+        """Return the joint that should have moved, and for how long [s] nothing has; None. limit [J] mA."""
         if target is None or len(self._target) != len(target) or now - self._since < self.LONG:
             return None
         idle = np.abs(np.asarray(state.current, float)) < self.LOAD * limit
@@ -160,7 +160,7 @@ class Frozen:
 
 
 def bad_place(place: Any) -> str | None:
-    """Why an object's place [3] m, palm frame, cannot be true, or None."""
+    """Return why an object's place [3] m, palm frame, cannot be true, or None."""
     x = _array(place)
     if x is None or x.shape != (3,):
         return "its place is not x y z"
@@ -168,7 +168,7 @@ def bad_place(place: Any) -> str | None:
 
 
 def bad_orientation(q: Any) -> str | None:
-    """Why an object's orientation [4], w x y z, cannot be true, or None."""
+    """Return why an object's orientation [4], w x y z, cannot be true, or None."""
     x = _array(q)
     if x is None or x.shape != (4,):
         return "its orientation is not w x y z"
@@ -176,7 +176,7 @@ def bad_orientation(q: Any) -> str | None:
 
 
 def bad_pose(pose: Any) -> str | None:
-    """Why an object's pose [7], x y z m, w x y z, cannot be true, or None."""
+    """Return why an object's pose [7], x y z m, w x y z, cannot be true, or None."""
     x = _array(pose)
     if x is None or x.shape != (7,):
         return "its pose is not x y z w x y z"
@@ -184,7 +184,7 @@ def bad_pose(pose: Any) -> str | None:
 
 
 def _array(x: Any) -> np.ndarray | None:
-    """float64, None where it is not (real) numbers."""
+    """Return float64, None where it is not (real) numbers."""
     try:
         return None if np.iscomplexobj(x) else np.asarray(x, float)
     except (TypeError, ValueError):

@@ -45,7 +45,7 @@ class Transport(Protocol):
 
 
 def transport() -> Transport:
-    """ROS 2's own where the shell has it, else DDS. Raises UserError where there is neither."""
+    """Return ROS 2's own library where the shell has it, else DDS. Raises UserError where there is neither."""
     try:
         return Rclpy()
     except ImportError:
@@ -176,7 +176,7 @@ class Dds:
 
 
 def bare(joint: str) -> str:
-    """A joint's name without its side, as the xHand's own messages have it."""
+    """Return a joint's name without its side, as the xHand's own messages have it."""
     return joint.removeprefix("right_hand_").removeprefix("left_hand_")
 
 
@@ -261,7 +261,7 @@ class Ros2Hand:
                 self._peak = max(self._peak, float(np.abs(amps).max()))
 
     def read(self) -> HandState | None:
-        """The newest state, stamped when it came: the sender's clock is another."""
+        """Return the newest state, stamped when it came: the sender's clock is another."""
         return self._state
 
     def send(self, command: HandCommand) -> None:
@@ -281,7 +281,7 @@ class Ros2Hand:
         self.send(HandCommand(self._state.position, zero, kp=0, mode=PASSIVE))
 
     def released(self) -> tuple[bool, str] | None:
-        """Whether its effort has ended since."""
+        """Return whether its effort has ended since."""
         if not self._relaxed or self._state is None:
             return None
         since = self.clock.now() - self._let_go

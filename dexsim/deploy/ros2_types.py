@@ -11,7 +11,7 @@ from cyclonedds.idl.types import float64, int32, sequence, uint32
 
 
 def _message(package: str, name: str, /, **fields: tuple[Any, Any]) -> Any:
-    """A message of ROS 2: its fields, each with its type and what makes its default."""
+    """Return a message of ROS 2: its fields, each with its type and what makes its default."""
     body = {k: field(default_factory=make) for k, (_, make) in fields.items()}
     body |= {"__annotations__": {k: kind for k, (kind, _) in fields.items()}, "__module__": __name__}
     made = types.new_class(name, (IdlStruct,), {"typename": f"{package}.msg.dds_.{name}_"}, lambda ns: ns.update(body))

@@ -41,8 +41,8 @@ class Guard:
     def apply(
         self, target: np.ndarray, before: np.ndarray, q: np.ndarray, current: np.ndarray, period: float
     ) -> np.ndarray:
-        """Safe targets [J] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and
-        current mA: measured; period s since the last."""
+        """Return safe targets [J] rad: finite and within the limits, whatever comes in. before: the last ones sent; q
+        rad and current mA: measured; period s since the last."""
         t = np.asarray(target, float).copy()
         middle = 0.5 * (self.low + self.high)
         q = np.where(np.isfinite(q), q, middle)
@@ -70,7 +70,7 @@ class Guard:
         return np.clip(t, self.low, self.high)
 
     def must_relax(self, current: np.ndarray, temperature: np.ndarray, elapsed: float) -> str | None:
-        """Why the hand must be relaxed now, or None. elapsed: s since the last call."""
+        """Return why the hand must be relaxed now, or None. elapsed: s since the last call."""
         over = np.abs(current) > self.current
         self._over = np.where(over, self._over + elapsed, 0.0)
         if (self._over > self.sustained).any():

@@ -193,17 +193,17 @@ class SimulatedHand:
             self._seen = place, self.time
 
     def place(self) -> tuple[np.ndarray, float] | None:
-        """The object as last seen, [3] m, and when [s]."""
+        """Return the object as last seen, [3] m, and when [s]."""
         return self._seen
 
     def orientation(self) -> tuple[np.ndarray, float] | None:
-        """How the object is turned, [4] w x y z, as its IMU last said, and when [s]; in truth, without one."""
+        """Return how the object is turned, [4] w x y z, as its IMU last said, and when [s]; in truth, without one."""
         if self.imu is None:
             return self.env.object_pose[0, 3:].double().numpy().copy(), self.time
         return self.imu.newest(self.time)
 
     def state(self, now: float) -> HandState:
-        """The state as the SDK would give it, arriving at host time `now`."""
+        """Return the state as the SDK would give it, arriving at host time `now`."""
         env = self.env
         self.sequence += 1
         position = np.round(env.servo.position()[0].double().numpy() / POSITION_LSB) * POSITION_LSB
@@ -264,7 +264,7 @@ class SimulatedImu:
             del self._past[:100]
 
     def newest(self, t: float) -> tuple[np.ndarray, float] | None:
-        """The newest reading that has arrived by time t."""
+        """Return the newest reading that has arrived by time t."""
         at, q = next(
             ((at, q) for at, q in reversed(self._past) if at <= t - self.delay + 1e-9),
             self._past[0] if self._past else (0.0, None),
@@ -315,7 +315,7 @@ class SimulatedCamera:
         return CameraPose(position, np.stack([right, up, -forward], 1), focal, (self.WIDTH / 2, self.HEIGHT / 2))
 
     def frame(self) -> Any:
-        """Depth and mask now (`dexsim.deploy.vision.Frame`)."""
+        """Return depth and mask now (`dexsim.deploy.vision.Frame`)."""
         from dexsim.deploy.vision import Frame
 
         mujoco, r = self._mujoco, self._renderer
@@ -334,15 +334,15 @@ class SimulatedCamera:
         return Frame(depth, mask, self._env.engine.t.time[0].item())
 
     def see(self, now: float) -> np.ndarray | None:
-        """The object's place [3] m by the paper's rule, None where it is hidden."""
+        """Return the object's place [3] m by the paper's rule, None where it is hidden."""
         from dexsim.deploy.vision import centroid
 
         return centroid(self.frame(), self.pose)
 
 
 def choose_gl() -> str:
-    """The OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start. Raises UserError
-    where there is none."""
+    """Return the OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start. Raises
+    UserError where there is none."""
     if (name := system.renderer()) is not None:
         os.environ.update(system.renderer_environment(name))
         return name
@@ -377,7 +377,7 @@ class SimulatedBody:
         return self._zero + self._cycle * BUS_PERIOD + self.latency
 
     def cycle(self, command: HandCommand | None) -> HandState:
-        """The command acts, the hand is simulated to the next cycle's time; its state, when it is there."""
+        """Return the command acts, the hand is simulated to the next cycle's time; its state, when it is there."""
         if command is not None and command is not self._last:
             self.hand.command(command)
             self._last = command
@@ -461,7 +461,7 @@ def faked(
     serial: str | None = None,
     clock: Clock | None = None,
 ) -> VendorXHand:
-    """The xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
+    """Return the xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
     `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
     side = hand_of(config).handedness
     text = faults if "side=" in faults else f"side={side[0].upper()}," + faults

@@ -22,14 +22,14 @@ class Timing:
         self._wall, self._cpu = time.perf_counter(), time.thread_time()
 
     def end(self) -> float:
-        """The turn ends; returns its wall time [s]."""
+        """Return the turn ends; returns its wall time [s]."""
         cpu, wall = time.thread_time() - self._cpu, time.perf_counter() - self._wall
         self._rows[self.turns % len(self._rows)] = cpu, wall, self._late
         self.turns += 1
         return wall
 
     def summary(self) -> dict[str, float]:
-        """Milliseconds: median, 99.9th percentile and largest of each; turns and overruns."""
+        """Return milliseconds: median, 99.9th percentile and largest of each; turns and overruns."""
         rows = 1e3 * self._rows[: min(self.turns, len(self._rows))]
         out: dict[str, float] = {"turns": self.turns, "overruns": self.overruns}
         for k, name in enumerate(("cpu", "wall", "late")):
@@ -39,7 +39,7 @@ class Timing:
         return out
 
     def table(self) -> str:
-        """Lines to print."""
+        """Return lines to print."""
         s = self.summary()
         lines = [f"{'':<24}{'median':>10}{'99.9 %':>10}{'largest':>10}   ms"]
         for name, text in (("cpu", "thread CPU time"), ("wall", "wall time"), ("late", "woken late by")):

@@ -137,8 +137,8 @@ class XHandBus:
         return list(_enumerate(self._sdk, "RS485")) if name == "auto" else [self.port]
 
     def _take(self, device: Any, port: str, wrong: list[str], taken: Sequence[int] = ()) -> dict[str, str] | None:
-        """The hand that is asked for, on an open port, but for ids that are taken; None, with the reason in `wrong`,
-        where it is not there."""
+        """Return the hand that is asked for, on an open port, but for ids that are taken; None, with the reason in
+        `wrong`, where it is not there."""
         hands = [x for x in device.list_hands_id() or () if x not in taken]
         if not hands:
             wrong.append(f"{port} opens and lists no hand (the auxiliary port?)")
@@ -192,7 +192,7 @@ class XHandBus:
         return state
 
     def _call(self, work: Callable[[], Any], default: Any) -> Any:
-        """What the package answers; what it raises is counted, and is no answer."""
+        """Return what the package answers; what it raises is counted, and is no answer."""
         try:
             return work()
         except Exception as error:
@@ -202,7 +202,7 @@ class XHandBus:
             return default
 
     def _send(self, c: HandCommand) -> int:
-        """One round trip; the code of its answer."""
+        """Return one round trip; the code of its answer."""
         for i in range(JOINTS):
             f = self._wire.finger_command[i]
             f.id, f.kp, f.ki, f.kd = i, int(c.kp), int(c.ki), int(c.kd)
@@ -302,7 +302,7 @@ class XHandBus:
             self._last_bits, self._stirred, self._same = bits, now, 0
 
     def _dead(self) -> str:
-        """What is said of a bus whose cache alone answers; empty where it lives."""
+        """Return what is said of a bus whose cache alone answers; empty where it lives."""
         now = self.clock.now()
         still = now - self._stirred
         if self._restless and self._same >= FEW and still > STILL:
@@ -319,7 +319,7 @@ class XHandBus:
     # -- what the loop asks
     # ---------------------------------------------------------------------------------------------------------------
     def problem(self) -> str:
-        """Why the hand cannot be driven any longer; empty while it can."""
+        """Return why the hand cannot be driven any longer; empty while it can."""
         now = self.clock.now()
         if self._refusal and (self._refusal.startswith("a motor") or now - self._refused_at > LOST - 0.03):
             return self._refusal
@@ -330,8 +330,8 @@ class XHandBus:
     # -- letting go
     # ---------------------------------------------------------------------------------------------------------------
     def _letting(self, command: HandCommand) -> HandCommand:
-        """Passive, without stiffness and torque, where the joints are. Where the hand still draws current, the same in
-        position mode: a firmware may not know the passive one."""
+        """Return passive, without stiffness and torque, where the joints are. Where the hand still draws current, the
+        same in position mode: a firmware may not know the passive one."""
         if self._letting_go is None:
             before = 0.0 if self._state is None else float(np.abs(self._state.current).max())
             self._letting_go = {"mode": PASSIVE, "since": None, "before": before, "began": self.clock.now(),
@@ -381,7 +381,7 @@ class XHandBus:
         )
 
     def released(self) -> tuple[bool, str] | None:
-        """Whether the hand is limp, and by what that is known; None while it is not known."""
+        """Return whether the hand is limp, and by what that is known; None while it is not known."""
         go = self._letting_go
         if go is None:
             return None
@@ -392,7 +392,7 @@ class XHandBus:
         return None
 
     def seen(self) -> np.ndarray:
-        """The object, of a simulated hand behind the package."""
+        """Return the object, of a simulated hand behind the package."""
         look = getattr(self._sdk, "seen", None)
         return np.full(9, np.nan) if look is None else look()
 
@@ -565,7 +565,7 @@ class OneOfTwo:
         self.bus.part(self.k, None)
 
     def problem(self) -> str:
-        """Why the bus cannot be driven any longer; empty while it can."""
+        """Return why the bus cannot be driven any longer; empty while it can."""
         return self.bus.problem()
 
     def released(self) -> tuple[bool, str] | None:
@@ -628,7 +628,7 @@ def _enumerate(sdk: Any, kind: str) -> list[str]:
 
 
 def _error(answer: Any) -> tuple[int, str]:
-    """Code and message of an error object; -1 for no answer."""
+    """Return code and message of an error object; -1 for no answer."""
     if answer is None:
         return -1, ""
     message = str(getattr(answer, "error_message", "") or "")
@@ -636,7 +636,7 @@ def _error(answer: Any) -> tuple[int, str]:
 
 
 def _value(device: Any, name: str, *arguments: Any) -> str:
-    """What the hand says of itself; empty where it does not."""
+    """Return what the hand says of itself; empty where it does not."""
     try:
         answer = getattr(device, name)(*arguments)
     except Exception:
@@ -651,7 +651,7 @@ def _side(said: str) -> str:
 
 
 def _whole(raw: Any) -> list[Any] | None:
-    """The joints in their order, None of a frame that is not whole."""
+    """Return the joints in their order, None of a frame that is not whole."""
     if raw is None:
         return None
     joints = list(raw.finger_state)
@@ -660,5 +660,5 @@ def _whole(raw: Any) -> list[Any] | None:
 
 
 def _int16(values: list[int]) -> np.ndarray:
-    """Two's complement, of packages that give either sign."""
+    """Read two's complement, of packages that give either sign."""
     return (np.array([int(x) for x in values], np.int64) & 0xFFFF).astype(np.uint16).view(np.int16)

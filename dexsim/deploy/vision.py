@@ -29,7 +29,7 @@ class CameraPose:
     centre: tuple[float, float]
 
     def point(self, u: float, v: float, depth: float) -> np.ndarray:
-        """The point [3] m, palm frame, at pixel (u, v) and depth [m] along the viewing axis."""
+        """Return the point [3] m, palm frame, at pixel (u, v) and depth [m] along the viewing axis."""
         x, y = (u - self.centre[0]) / self.focal, (v - self.centre[1]) / self.focal
         return self.position + self.rotation @ np.array([x * depth, -y * depth, -depth])
 
@@ -49,7 +49,7 @@ class Camera(Protocol):
     pose: CameraPose
 
     def frame(self) -> Frame | None:
-        """The newest frame, None before the first."""
+        """Return the newest frame, None before the first."""
 
 
 class HeightSource(Protocol):
@@ -61,7 +61,8 @@ class HeightSource(Protocol):
 def centroid(
     frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 12, solid: bool = True
 ) -> np.ndarray | None:
-    """The mask's centroid as (x, y, z) m in the palm frame; None where fewer than `least` pixels are the object's.
+    """Return the mask's centroid as (x, y, z) m in the palm frame; None where fewer than `least` pixels are the
+    object's.
 
     The centroid is the mean of the mask's pixels; its depth is their median, so that a few pixels of the background (a
     mask's ragged edge) move nothing. The median lies on the side of the object that faces the camera; `solid` moves the

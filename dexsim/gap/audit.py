@@ -68,12 +68,12 @@ class Repeats:
     span: dict[str, float]
 
     def disagree(self, joint: str) -> bool:
-        """Whether they differ by far more than noise."""
+        """Return whether they differ by far more than noise."""
         return self.apart[joint] > max(APART * self.noise[joint], OF_SPAN * self.span[joint])
 
 
 def repeats(runs: Sequence[Run]) -> list[Repeats]:
-    """Recordings of the same commands, motion by motion: the floor of each."""
+    """Return recordings of the same commands, motion by motion: the floor of each."""
     groups: list[list[Run]] = []
     for run in runs:
         mine = next((g for g in groups if same_commands(g[0], run)), None)
@@ -99,8 +99,8 @@ def _apart(group: Sequence[Run]) -> Repeats:
 
 
 def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], dict[str, list[Finding]]]:
-    """(the recordings as a diagnosis takes them, what it would say of their signals by recording). A recording that
-    cannot be used is left out, with the reason."""
+    """Return (the recordings as a diagnosis takes them, what it would say of their signals by recording). A recording
+    that cannot be used is left out, with the reason."""
     runs: list[Run] = []
     out: dict[str, list[Finding]] = {r.path.name: [] for r in recordings}
     for r in recordings:
@@ -138,7 +138,7 @@ def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], 
 
 
 def carries(recordings: Sequence[Recording], runs: Sequence[Run]) -> str:
-    """What a diagnosis could tell from recordings: a row a joint; where repeats agree, motion by motion."""
+    """Return what a diagnosis could tell from recordings: a row a joint; where repeats agree, motion by motion."""
     rows = []
     for joint in dict.fromkeys(j for r in runs for j in r.joints):
         mine = [(r, r.joints.index(joint)) for r in runs if joint in r.joints]
@@ -187,8 +187,8 @@ def carries(recordings: Sequence[Recording], runs: Sequence[Run]) -> str:
 
 
 def delays(runs: Sequence[Run]) -> str:
-    """The order and the delays of the stages of each drive, a row a joint; nothing where only targets and positions are
-    recorded."""
+    """Return the order and the delays of the stages of each drive, a row a joint; nothing where only targets and
+    positions are recorded."""
     rows, order = [], []
     for joint in dict.fromkeys(j for r in runs for j in r.joints):
         chain = agreement.stages(runs, joint)
@@ -204,8 +204,8 @@ def delays(runs: Sequence[Run]) -> str:
 
 
 def beliefs(runs: Sequence[Run], known: Mechanism) -> str:
-    """How well a fit could tell each figure of the believed drives from recordings, a row a joint, and what to record
-    for those that it could not."""
+    """Return how well a fit could tell each figure of the believed drives from recordings, a row a joint, and what to
+    record for those that it could not."""
     from dexsim.gap.plant.case import build
     from dexsim.gap.plant.information import advice, informed
     from dexsim.sim.quiet import quiet_warp
@@ -244,8 +244,8 @@ LEAP, FEW = 3.0, 8
 
 
 def renewed(t: np.ndarray, x: np.ndarray) -> float:
-    """s from one new value of a signal x [n] at t [n] to the next while it changes; 0 where each sample is a new one,
-    or too few are. A joint that creeps over a coarse encoder's steps has new values seldom, but no leaps."""
+    """Return s from one new value of a signal x [n] at t [n] to the next while it changes; 0 where each sample is a new
+    one, or too few are. A joint that creeps over a coarse encoder's steps has new values seldom, but no leaps."""
     ok = np.isfinite(x)
     t, x = t[ok], x[ok]
     change = np.flatnonzero(np.diff(x) != 0) + 1
@@ -263,7 +263,7 @@ def renewed(t: np.ndarray, x: np.ndarray) -> float:
 
 
 def rates(recordings: Sequence[Recording]) -> list[str]:
-    """The signals that are renewed more seldom than they are logged, a line each."""
+    """Return the signals that are renewed more seldom than they are logged, a line each."""
     out = []
     for name in ("position", "velocity", "effort", "duty", "command"):
         slow: dict[str, tuple[float, float]] = {}
@@ -292,7 +292,7 @@ def _place(r: Recording, joint: str) -> int:
 
 
 def of_names(joints: Sequence[str]) -> Mechanism:
-    """A mechanism of joints of which nothing is known."""
+    """Return a mechanism of joints of which nothing is known."""
     bodies = "".join(
         f'<body><joint name="{j}" axis="0 1 0"/><geom size=".01" mass=".1" contype="0" conaffinity="0"/></body>'
         for j in map(_quoted, joints)
@@ -341,7 +341,7 @@ def begin(out: Path, joints: Sequence[str], own: dict[str, str]) -> None:
 
 
 def next_command(paths: Sequence[str], own: dict[str, str], rest: Sequence[str]) -> str:
-    """The `dexsim diagnose` to run next, as it is typed."""
+    """Return the `dexsim diagnose` to run next, as it is typed."""
     recordings = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
     of = [f"{k}={own[k]}" for k in ("model", "servo") if own.get(k)]
     words = [f"recordings={recordings}", *of, *rest, "out=out/diagnosis"]
@@ -396,13 +396,13 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _new(more: Sequence[Finding], known: Sequence[Finding]) -> list[Finding]:
-    """Findings of which the reader's audit does not say the like already."""
+    """Return findings of which the reader's audit does not say the like already."""
     there = {(f.kind, f.joint) for f in known if f.severity == "error"} | {(f.kind, "") for f in known if not f.joint}
     return [f for f in more if (f.kind, f.joint) not in there and (f.kind, "") not in there]
 
 
 def _gathered(found: Sequence[Finding]) -> list[Finding]:
-    """Findings with the defaults that hold in one line."""
+    """Return findings with the defaults that hold in one line."""
     plain = [f for f in found if f.kind == "missing_metadata" and f.severity == "info"]
     rest = [f for f in found if f not in plain]
     if len(plain) < 2:

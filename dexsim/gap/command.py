@@ -104,7 +104,7 @@ KEYS = (
 
 
 def parse(argv: list[str]) -> dict:
-    """key=value settings; UserError for a key that does not exist or a value of the wrong type."""
+    """Return key=value settings; UserError for a key that does not exist or a value of the wrong type."""
     from dexsim.actuator.columns import did_you_mean
 
     out: dict = {"meta": {}, "remap": {}}
@@ -145,7 +145,7 @@ def parse(argv: list[str]) -> dict:
 
 
 def _hidden(text: str) -> str | None:
-    """The effect that a demo hides; None for no demo."""
+    """Return the effect that a demo hides; None for no demo."""
     from dexsim.gap.demo import HIDDEN
     from dexsim.gap.effects.signals import CommandDelay
 
@@ -218,7 +218,7 @@ def claim(s: Settings) -> None:
 
 @contextmanager
 def _interruptible(limit: TimeLimit) -> Iterator[None]:
-    """Ctrl-C ends the search with the best answer so far; a second one ends the program."""
+    """Let Ctrl-C end the search with the best answer so far; a second one ends the program."""
 
     def ask(number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, before)
@@ -236,7 +236,7 @@ def _interruptible(limit: TimeLimit) -> Iterator[None]:
 
 
 def settings_of(given: dict, out: Path, device: str) -> Settings:
-    """What `parse` took apart, as :func:`dexsim.gap.diagnosis.diagnose` takes it. Raises UserError."""
+    """Return what `parse` took apart, as :func:`dexsim.gap.diagnosis.diagnose` takes it. Raises UserError."""
     from dexsim.actuator.columns import did_you_mean
     from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
     from dexsim.gap.inquiry import Settings
@@ -286,7 +286,7 @@ def started(device: str) -> str:
 
 
 def available(device: str) -> str:
-    """The device with its number, or the CPU with a line that says so where there is no such GPU."""
+    """Return the device with its number, or the CPU with a line that says so where there is no such GPU."""
     if device == "cpu":
         return device
     import warp as wp
@@ -335,7 +335,7 @@ class Progress:
 
 
 def verdict(d: Diagnosis) -> str:
-    """The verdict in at most ten lines."""
+    """Return the verdict in at most ten lines."""
     from dexsim.console.tables import number
     from dexsim.gap.finding import gathered
     from dexsim.gap.judge.conclude import place

@@ -34,7 +34,7 @@ _lock = threading.Lock()
 
 
 def cores() -> int:
-    """Cores that this process may use (OMP_NUM_THREADS, where it is set, counts as the cores)."""
+    """Return cores that this process may use (OMP_NUM_THREADS, where it is set, counts as the cores)."""
     given = os.environ.get("OMP_NUM_THREADS", "")
     if given.isdigit() and int(given) > 0:
         return int(given)
@@ -42,8 +42,8 @@ def cores() -> int:
 
 
 def parts(steps: np.ndarray, guesses: int) -> list[tuple[slice, slice]]:
-    """What of windows of `steps` [W], and which of the guesses, each thread of a launch simulates: as many parts as
-    cores are free, cut between windows, or between guesses where that is more even."""
+    """Return what of windows of `steps` [W], and which of the guesses, each thread of a launch simulates: as many parts
+    as cores are free, cut between windows, or between guesses where that is more even."""
     total = int(steps.sum()) * guesses
     count = max(min(cores() - _busy, total // WORTH), 1)
     every, everyone = slice(0, len(steps)), slice(0, guesses)
@@ -83,9 +83,9 @@ system.after_fork(_pool.cache_clear)  # a child process has none of its parent's
 
 
 def workers(device: str, jobs: int) -> int:
-    """How many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's launch
-    hides. On a CPU as many as it has cores: what one computes in Python, another's launch hides, in parts on all cores
-    that are free."""
+    """Return how many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's
+    launch hides. On a CPU as many as it has cores: what one computes in Python, another's launch hides, in parts on all
+    cores that are free."""
     return max(1, min(jobs, MOST_GPU if device != "cpu" else min(MOST_CPU, cores())))
 
 
@@ -128,7 +128,7 @@ _TURNS = Turns(TURNS)
 
 @contextmanager
 def turn(rank: float) -> Iterator[None]:
-    """A search's turn at the interpreter: what runs inside waits until it is one of the few."""
+    """Yield a search's turn at the interpreter: what runs inside waits until it is one of the few."""
     _TURNS.take(rank)
     _MINE.held, _MINE.rank = True, rank
     try:
@@ -140,7 +140,7 @@ def turn(rank: float) -> Iterator[None]:
 
 @contextmanager
 def away() -> Iterator[None]:
-    """What a search waits for without the interpreter (a launch): another has its turn meanwhile."""
+    """Yield what a search waits for without the interpreter (a launch): another has its turn meanwhile."""
     if not getattr(_MINE, "held", False):
         yield
         return
@@ -154,9 +154,9 @@ def away() -> Iterator[None]:
 
 
 def side_by_side(work: Sequence[Callable[[], T]], device: str) -> Iterator[T]:
-    """What each of `work` returns, in order. On a GPU all are begun at once: a launch of few guesses takes as long as
-    one of many there, so they wait together. On a CPU, whose cores share each launch already, one after the other, each
-    when it is asked for."""
+    """Yield what each of `work` returns, in order. On a GPU all are begun at once: a launch of few guesses takes as
+    long as one of many there, so they wait together. On a CPU, whose cores share each launch already, one after the
+    other, each when it is asked for."""
     if device == "cpu" or len(work) < 2:
         yield from (one() for one in work)
         return
@@ -210,7 +210,7 @@ class Pace:
             self._took[k] = now - begun
 
     def left(self) -> float | None:
-        """s that are left; None where they are not known."""
+        """Return s that are left; None where they are not known."""
         took, rest, now = np.array([*self._took.values()]), self._count - len(self._took), time.monotonic()
         if len(took) < 3 or rest < 2 * self._lanes or took.mean() <= 0:
             return None  # when the last of those side by side ends nobody knows
@@ -295,19 +295,19 @@ class TimeLimit:
         return self._stop.is_set()
 
     def left(self) -> float:
-        """s that searches have left; infinite without a limit."""
+        """Return s that searches have left; infinite without a limit."""
         if self.stopped:
             return 0.0
         return float("inf") if self.seconds is None else (1 - JUDGING) * self.seconds - (time.monotonic() - self._start)
 
     def rest(self) -> float:
-        """s until all but the page is to be done; infinite without a limit."""
+        """Return s until all but the page is to be done; infinite without a limit."""
         if self.seconds is None:
             return float("inf")
         return (1 - PAGE) * self.seconds - (time.monotonic() - self._start)
 
     def spent(self, share: float) -> bool:
-        """Whether this share (0..1) of the limit is over."""
+        """Return whether this share (0..1) of the limit is over."""
         return self.seconds is not None and time.monotonic() - self._start > share * self.seconds
 
     def leave_out(self, what: str) -> None:
@@ -315,7 +315,7 @@ class TimeLimit:
         self.left_out.append(f"{what} (the limit of {self.seconds:g} s)")
 
     def share(self, joint: str, of: float) -> Deadline:
-        """The deadline of one joint's search that gets `of` (0..1) of what is left."""
+        """Return the deadline of one joint's search that gets `of` (0..1) of what is left."""
         return Deadline(self, joint, time.monotonic() + self.left() * of)
 
 
@@ -326,7 +326,7 @@ class Deadline:
         self.limit, self.joint, self.until, self.seconds = limit, joint, until, until - time.monotonic()
 
     def over(self) -> bool:
-        """Whether it is time to end with what there is; noted for the page."""
+        """Return whether it is time to end with what there is; noted for the page."""
         if time.monotonic() < self.until and not (self.limit is not None and self.limit.stopped):
             return False
         if self.limit is not None:
@@ -334,7 +334,7 @@ class Deadline:
         return True
 
     def passed(self) -> bool:
-        """Whether what is over by more than `GRACE` is to end within a step, too."""
+        """Return whether what is over by more than `GRACE` is to end within a step, too."""
         if self.limit is None or self.limit.seconds is None:
             return False
         return time.monotonic() > self.until + GRACE * self.limit.seconds

@@ -104,7 +104,7 @@ def _next(d: Diagnosis, w: Inquiry, searched: Sequence[SearchedJoint]) -> None:
 
 
 def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
-    """What is left when no joint can be judged: touch, or the reason why nothing can be said."""
+    """Return what is left when no joint can be judged: touch, or the reason why nothing can be said."""
     felt = touch.result
     d = Diagnosis(empty(), f"{reason.rstrip('.')}.", w.notes, mechanism=w.m)
     d.findings = w.channel
@@ -336,7 +336,7 @@ class Drives(Steps):
         self.searched = [replace(x, outcome=a.outcome) for x, a in zip(self.searched, self.answers, strict=True)]
 
     def _begun(self, k: int, tell: Callable[[float], None]) -> JointSearch:
-        """The search of one joint, not yet run."""
+        """Return the search of one joint, not yet run."""
         w, case = self.w, self.cases[k]
         deadline = w.limit.share(case.joint, min(1.0, workers(w.settings.device, len(self.cases)) / max(self._left, 1)))
         return JointSearch(
@@ -351,12 +351,13 @@ class Drives(Steps):
         )
 
     def _start(self, k: int, tell: Callable[[float], None]) -> Trial | None:
-        """The joint as believed, its uncertain figures refitted; None where nothing is long enough to be simulated."""
+        """Return the joint as believed, its uncertain figures refitted; None where nothing is long enough to be
+        simulated."""
         search = self._begun(k, tell)
         return search.start() if len(search.long.window) else None
 
     def _search_of(self, k: int, tell: Callable[[float], None]) -> tuple[JointSearch, Outcome | None]:
-        """The search of one joint and its answer; None where nothing is long enough to be simulated."""
+        """Return the search of one joint and its answer; None where nothing is long enough to be simulated."""
         begun = time.monotonic()
         search, case = self._begun(k, tell), self.cases[k]
         if len(search.long.window) == 0:
@@ -381,12 +382,12 @@ class Drives(Steps):
             self.ahead[id(search)] = JudgedAhead(self._answer(search, found), self._plain(search))
 
     def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
-        """A joint on what was held out."""
+        """Return a joint on what was held out."""
         known = self.ahead.get(id(search))
         return known.answer if known else JointAnswer.of(search.case, search, found, self.kept)
 
     def _plain(self, search: JointSearch) -> baseline.Baseline | None:
-        """What a plain model of a joint leaves of what was held out."""
+        """Return what a plain model of a joint leaves of what was held out."""
         case, p, known = search.case, self.parts, self.ahead.get(id(search))
         if known or not case.moved:
             return known.plain if known else None
@@ -411,8 +412,8 @@ class Drives(Steps):
             answers[k] = answer
 
     def _time_for(self, searches: Iterable[JointSearch], first: float = 0.0) -> bool:
-        """Whether what is left of the limit is as much as these searches took, and `first` s before: they would begin
-        anew, and in less time end before where they did."""
+        """Return whether what is left of the limit is as much as these searches took, and `first` s before: they would
+        begin anew, and in less time end before where they did."""
         took = [x.took for x in searches]
         lanes = min(1.0, workers(self.w.settings.device, len(took)) / len(took))
         return lanes * (self.w.limit.left() - first) >= max(took)
@@ -488,8 +489,8 @@ class Drives(Steps):
         self._search_with(answers, draggers)
 
     def _search_with(self, answers: Answers, cases: dict[int, Case]) -> list[int]:
-        """The joints `cases`, by their number in `answers`, searched once more as these cases have them; `answers` is
-        changed where a coupling explains more. Returns the numbers of those."""
+        """Return the joints `cases`, by their number in `answers`, searched once more as these cases have them;
+        `answers` is changed where a coupling explains more. Returns the numbers of those."""
         before = {k: (self.cases[k], *answers[k]) for k in cases}
         if not cases or not self._time_for(search for _, search, _ in before.values()):
             return []
@@ -514,8 +515,8 @@ class Drives(Steps):
         return explained
 
     def _dragger(self, search: JointSearch, found: Outcome) -> Case | None:
-        """The joint's case with the one further off, if any, that by the scan drags it, in the place of the last of
-        those that its plant knows."""
+        """Return the joint's case with the one further off, if any, that by the scan drags it, in the place of the last
+        of those that its plant knows."""
         case = search.case
         far = [c for c in self.cases if c.joint not in {case.joint, *case.scales.others} and c.moved]
         groups = [far[i : i + DRAGGERS] for i in range(0, len(far), DRAGGERS)]
@@ -663,7 +664,7 @@ class Drives(Steps):
 
 
 def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str]:
-    """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
+    """Return of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
     every: dict[str, Any] = TOUCH_EFFECTS | EFFECTS
     return [
         f"{e} cannot be seen here: {left_out[e]}; to see it: {every[e].experiment}"
@@ -673,8 +674,8 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
 
 
 def _evenly(runs: Sequence[Run], held: set[int], share: float) -> list[int]:
-    """Which runs to keep, evenly of those held out and of the others, that share (0..1) of their time; one of each at
-    least."""
+    """Return which runs to keep, evenly of those held out and of the others, that share (0..1) of their time; one of
+    each at least."""
     if share >= 1:
         return list(range(len(runs)))
     kept: list[int] = []
@@ -693,14 +694,15 @@ def _spread(group: Sequence[int], count: int) -> list[int]:
 
 
 def _at_rest(runs: Sequence[Run]) -> bool:
-    """Whether no joint moves in any run and no target changes."""
+    """Return whether no joint moves in any run and no target changes."""
     joints = range(len(runs[0].joints))
     return not any(max(float(np.ptp(x[:, j])) for r in runs for x in (r.q, r.cmd)) > JUDGE.moved for j in joints)
 
 
 def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outcome]) -> list[Trial]:
-    """What was fitted to each joint, as the others are moved by it. Where an encoder misreads, joints along the same
-    chain seem to misread as well (gravity is turned for all of them): of one chain only the clearest is believed."""
+    """Return what was fitted to each joint, as the others are moved by it. Where an encoder misreads, joints along the
+    same chain seem to misread as well (gravity is turned for all of them): of one chain only the clearest is
+    believed."""
     chains = []
     for joint in joints:
         body = int(model.jnt_bodyid[model.joint(joint).id])
@@ -717,7 +719,7 @@ def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outc
 
 
 def _follows_better(old: Outcome | None, search: JointSearch, found: Outcome | None) -> bool:
-    """Whether what was found before follows the recordings of `search` better, as it is, than what it found."""
+    """Return whether what was found before follows the recordings of `search` better, as it is, than what it found."""
     if old is None or found is None or not old.best.members:
         return False
     fit = search.fitter.given(old.best.members).fit(old.best.fit.params, x0=old.best.fit.x, iterations=0)
@@ -726,13 +728,13 @@ def _follows_better(old: Outcome | None, search: JointSearch, found: Outcome | N
 
 
 def _unsettled(found: Outcome) -> bool:
-    """Whether a joint's search is looked at again with what was found in the others."""
+    """Return whether a joint's search is looked at again with what was found in the others."""
     return bool(found.best.members) or found.best.fit.loss > SEARCH.unsettled
 
 
 def _other(search: JointSearch, found: Outcome) -> bool:
-    """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was
-    thought."""
+    """Return whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise
+    than was thought."""
     for trial in (found.none, found.best):
         fitter = search.fitter.given(trial.members)
         loss = float(fitter.loss(fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
@@ -742,13 +744,13 @@ def _other(search: JointSearch, found: Outcome) -> bool:
 
 
 def _step(runs: list[Run]) -> float:
-    """Integration step [s]: 1 ms, and no coarser than half a sampling period."""
+    """Return integration step [s]: 1 ms, and no coarser than half a sampling period."""
     period = min(r.period for r in runs)
     return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
 
 
 def _limits(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
-    """Measured positions outside the model's range: the limit is taken away, and said."""
+    """Return measured positions outside the model's range: the limit is taken away, and said."""
     notes = []
     for j, name in enumerate(runs[0].joints):
         joint = model.joint(name).id

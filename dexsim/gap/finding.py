@@ -38,11 +38,11 @@ class Finding:
         return self.effect == WRONG_SIGNAL
 
     def at_most(self, confidence: float) -> Self:
-        """The finding with no more than this confidence."""
+        """Return the finding with no more than this confidence."""
         return replace(self, confidence=min(self.confidence, confidence))
 
     def to_json(self) -> dict[str, Any]:
-        """The entry of `findings`."""
+        """Return the entry of `findings`."""
         return {
             "effect": self.effect,
             "confidence": self.confidence,

@@ -92,8 +92,8 @@ def run(argv: list[str], given: Mapping[str, Any]) -> int:
 
 
 def machines(pattern: str) -> dict[str, list[Path]]:
-    """Recordings by machine: of every folder that a pattern names, those of its most frequent format. Raises UserError
-    where there is none."""
+    """Return recordings by machine: of every folder that a pattern names, those of its most frequent format. Raises
+    UserError where there is none."""
     root = files.place(pattern)
     folders = sorted(p for p in Path(root.anchor or ".").glob(str(root.relative_to(root.anchor))) if p.is_dir())
     found = {}
@@ -114,14 +114,14 @@ def _own(folder: Path) -> dict[str, Path]:
 
 
 def _last(job: jobs.Job) -> str:
-    """The line that says why a job failed."""
+    """Return the line that says why a job failed."""
     text = job.note.with_suffix(".txt")
     lines = text.read_text("utf-8", "replace").strip().splitlines() if text.is_file() else []
     return next((line for line in reversed(lines) if line.startswith("error:")), lines[-1] if lines else "lost")
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """A machine's diagnosis.json. Raises UserError for a damaged one."""
+    """Return a machine's diagnosis.json. Raises UserError for a damaged one."""
     try:
         data = files.mapping(folder / RESULT, "diagnosis", 64 << 20)
         cells_of(data)
@@ -131,7 +131,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def cells_of(data: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """What a diagnosis found, by effect and place."""
+    """Return what a diagnosis found, by effect and place."""
     found = {}
     for f in data["findings"]:
         where = f["where"]
@@ -146,7 +146,7 @@ def cells_of(data: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
 
 
 def compare(found: Mapping[str, Mapping[str, Any]], before: Mapping[str, Mapping[str, Any]]) -> list[Row]:
-    """Rows of the fleet, those first in which machines differ. found, before: diagnosis.json by machine."""
+    """Return rows of the fleet, those first in which machines differ. found, before: diagnosis.json by machine."""
     cells = {name: cells_of(data) for name, data in found.items() if data["verdict"] != "unusable"}
     earlier = {name: cells_of(data) for name, data in before.items()}
     rows = []
@@ -163,7 +163,7 @@ def compare(found: Mapping[str, Mapping[str, Any]], before: Mapping[str, Mapping
 
 
 def _apart(name: str, sizes: Mapping[str, Value]) -> bool:
-    """Whether a machine's interval lies beyond the middle one of the others, which are two or more."""
+    """Return whether a machine's interval lies beyond the middle one of the others, which are two or more."""
     others = [v for n, v in sizes.items() if n != name]
     if name not in sizes or len(others) < 2:
         return False
@@ -178,7 +178,7 @@ def _moved(now: Cell, then: Cell | None) -> bool:
 
 
 def _row(effect: str, place: str, cells: dict[str, Cell], everyone: list[str]) -> Row:
-    """A row with its words: of the type, of some machines, of one, another size, moved since."""
+    """Return a row with its words: of the type, of some machines, of one, another size, moved since."""
     apart, moved = ([n for n, c in cells.items() if getattr(c, what)] for what in ("apart", "moved"))
     if len(cells) == len(everyone) > 1:
         words, kind = f"all {len(everyone)} machines: what is believed of the type is wrong", "all"
@@ -197,6 +197,6 @@ def _row(effect: str, place: str, cells: dict[str, Cell], everyone: list[str]) -
 
 
 def page(found: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], rows: list[Row]) -> str:
-    """The page that compares them."""
+    """Return the page that compares them."""
     units = [{"name": n} | dict(zip(("word", "tone"), VERDICTS[d["verdict"]])) for n, d in found.items()]
     return ENVIRONMENT.get_template("fleet.html").render(units=units, failed=failed, rows=rows)

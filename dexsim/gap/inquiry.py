@@ -163,7 +163,7 @@ class Diagnosis:
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:
-    """diagnosis.json with nothing in it."""
+    """Return diagnosis.json with nothing in it."""
     zero: dict[str, Any] = {"recordings": [], "error": "position_rmse_rad"}
     zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
     return {
@@ -231,7 +231,7 @@ class Inquiry:
         return {self.names[p] for p in self.settings.held_out or []}
 
     def nothing_left(self) -> bool:
-        """Whether no run is left, or none that is fitted."""
+        """Return whether no run is left, or none that is fitted."""
         return not self.runs or bool(self.settings.held_out and len(self.held) == len(self.runs))
 
 
@@ -409,7 +409,7 @@ def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
 
 
 def _still(s: Settings) -> str:
-    """What can be said although the model or the servo cannot be used: of the recordings alone, in one line."""
+    """Return what can be said although the model or the servo cannot be used: of the recordings alone, in one line."""
     from dexsim.recording import read
 
     said = []

@@ -67,8 +67,8 @@ def spots(
     rng: np.random.Generator,
     of: str = "position",
 ) -> list[Spot]:
-    """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name
-    -> [n]."""
+    """Return bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time,
+    regimes name -> [n]."""
     _, block = np.unique(block, return_inverse=True)
     count = int(block.max()) + 1
     if count < 6:
@@ -130,7 +130,8 @@ def _binned(
 
 
 def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:
-    """Edges of the bins of a regime variable x [n]: where its meaning changes, or by equal numbers of samples."""
+    """Return edges of the bins of a regime variable x [n]: where its meaning changes, or by equal numbers of
+    samples."""
     if name == "time since reversal":
         return [0.0, 0.04, 0.12, 0.4, np.inf]
     if name in ("direction", "driven against its load"):
@@ -141,7 +142,7 @@ def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:
 
 
 def control(found: list[Spot]) -> list[Spot]:
-    """Benjamini-Hochberg over all bins: those that stand at `JUDGE.level`, the largest first, positions before
+    """Return Benjamini-Hochberg over all bins: those that stand at `JUDGE.level`, the largest first, positions before
     efforts."""
     if not found:
         return []

@@ -179,6 +179,6 @@ class Hand:
         return self.folder == Path(__file__).parents[1] / "assets" / self.name
 
     def pose(self, which: str) -> np.ndarray:
-        """Joint angles [J] rad of the pose "open" or "cupped"."""
+        """Return joint angles [J] rad of the pose "open" or "cupped"."""
         angles = getattr(self.file.poses, which)
         return np.array([angles[j] for j in self.joints])

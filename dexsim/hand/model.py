@@ -42,7 +42,7 @@ def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, lis
 
 
 def limits(spec: mujoco.MjSpec, joints: list[str], where: str) -> np.ndarray:
-    """Position limits [J, 2] of these joints."""
+    """Return position limits [J, 2] of these joints."""
     m = spec.copy().compile()
     out = []
     for name in joints:

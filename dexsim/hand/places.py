@@ -22,9 +22,9 @@ class Places:
 
 
 def places(hand: Hand) -> Places:
-    """Those of the file, mirrored and scaled with the hand; what it leaves out from the cupped pose: on the palm, 70 %
-    of the way along the fingers to the tips of those that the opposing ones press against (the xHand's is there).
-    `dexsim import-hand` searches for `catch` from there (`dexsim.tasks.held_drops`)."""
+    """Return those of the file, mirrored and scaled with the hand; what it leaves out from the cupped pose: on the
+    palm, 70 % of the way along the fingers to the tips of those that the opposing ones press against (the xHand's is
+    there). `dexsim import-hand` searches for `catch` from there (`dexsim.tasks.held_drops`)."""
     given = hand.file.places
     said = np.array([1.0, -1.0 if hand.mirror else 1.0, 1.0]) * hand.scale
     tips = fingertips(hand, hand.pose("cupped"))
@@ -40,7 +40,7 @@ def places(hand: Hand) -> Places:
 
 
 def surface(hand: Hand, over: np.ndarray) -> float:
-    """Height [m] of the palm: the highest that its collision geoms are between its centre and below a point."""
+    """Return height [m] of the palm: the highest that its collision geoms are between its centre and below a point."""
     spec = hand.spec()
     for geom in list(spec.geoms):
         if geom.parent.name != hand.palm_body or not geom.contype:
@@ -59,7 +59,7 @@ def surface(hand: Hand, over: np.ndarray) -> float:
 
 
 def fingertips(hand: Hand, angles: np.ndarray) -> np.ndarray:
-    """Fingertips [F, 3] m at joint angles [J] rad, palm frame."""
+    """Return fingertips [F, 3] m at joint angles [J] rad, palm frame."""
     model = hand.compiled
     data = mujoco.MjData(model)
     hand.couplings.put(data, angles)

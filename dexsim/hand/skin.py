@@ -17,7 +17,7 @@ MAX_SKIN = 32 << 20
 
 
 def tip_skin(hand: Hand, finger: Finger) -> np.ndarray:
-    """Corners [V, 3] m in the tip body's frame: the pad's `skin` where it names one, else of the tip's geoms.
+    """Return corners [V, 3] m in the tip body's frame: the pad's `skin` where it names one, else of the tip's geoms.
 
     Raises UserError for a file without vertices, and for geoms that have no surface points (planes, height fields).
     """
@@ -56,7 +56,7 @@ def _vertices(path: Path, stamp: int) -> np.ndarray:
 
 
 def obj_vertices(path: Path) -> np.ndarray:
-    """Vertices [V, 3] of an OBJ file. Raises UserError."""
+    """Return vertices [V, 3] of an OBJ file. Raises UserError."""
     files.check(path, "fingertip skin", MAX_SKIN)
     return _vertices(path, path.stat().st_mtime_ns).copy()
 

@@ -56,7 +56,7 @@ def build(
     note: str,
     pulls: Sequence[Pull] = (),
 ) -> Model:
-    """MJCF of the hand: its root is the palm, which stands in the world's origin.
+    """Return the MJCF of the hand: its root is the palm, which stands in the world's origin.
 
     Links meet those of other fingers and objects; a tip meets objects with its mesh and the hand with a capsule inside.
     excluded: pairs of bodies that do not meet each other. pulls: actuators that pull a tendon, each a drum on the
@@ -148,11 +148,11 @@ def build(
     order = {f"tip_{f.name}": k for k, f in enumerate(tree.fingers)}
     out.tip_geoms.sort(key=lambda g: order[g])
     assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
-    apart = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
+    excluding = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
     out.xml = _TEMPLATE.format(
         name=_t(name), note=re.sub("-{2,}", "-", note), assets=assets, bodies="\n".join(lines), solref=SOLREF,
         margin=MARGIN,
-        contact=(f"\n  <contact>\n{apart}\n  </contact>" if apart else "") + tendons + equalities,
+        contact=(f"\n  <contact>\n{excluding}\n  </contact>" if excluding else "") + tendons + equalities,
     )  # fmt: skip
     return out
 
@@ -258,7 +258,7 @@ def _colour(m: mujoco.MjModel, g: int) -> str:
 
 
 def hull_obj(points: np.ndarray) -> str:
-    """OBJ text of the convex hull of points [V, 3] m, outward."""
+    """Return OBJ text of the convex hull of points [V, 3] m, outward."""
     hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     faces = faces.reshape(-1, 3)
@@ -270,7 +270,7 @@ def hull_obj(points: np.ndarray) -> str:
 
 
 def obj(vertices: np.ndarray, faces: np.ndarray) -> str:
-    """Wavefront OBJ text, metres."""
+    """Return wavefront OBJ text, metres."""
     return "".join(
         [f"v {x:.7g} {y:.7g} {z:.7g}\n" for x, y, z in vertices + 0.0] + [f"f {a} {b} {c}\n" for a, b, c in faces + 1]
     )

@@ -195,7 +195,7 @@ def _limits(m: mujoco.MjModel, j: int, where: str, stated: tuple[float, float] |
 
 
 def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
-    """Masses and inertias against the shapes that carry them."""
+    """Return masses and inertias against the shapes that carry them."""
     out = []
     bodies = {b for f in tree.fingers for j in f.joints for b in [int(m.jnt_bodyid[j])]}
     for b in sorted(bodies):

@@ -85,6 +85,6 @@ def write_note(folder: Path, hand: dict[str, Any], said: list[str]) -> None:
 
 
 def sha(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,14 +12,14 @@ Surface = tuple[np.ndarray, np.ndarray]
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
-    """Matrix [3, 3] of a quaternion (w, x, y, z)."""
+    """Return matrix [3, 3] of a quaternion (w, x, y, z)."""
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(quat, float))
     return out.reshape(3, 3)
 
 
 def quaternion(matrix: np.ndarray) -> np.ndarray:
-    """Quaternion (w, x, y, z) of a matrix [3, 3]."""
+    """Return quaternion (w, x, y, z) of a matrix [3, 3]."""
     out = np.zeros(4)
     mujoco.mju_mat2Quat(out, np.asarray(matrix, float).ravel())
     return out
@@ -55,7 +55,7 @@ def geom_surface(m: mujoco.MjModel, g: int) -> Surface:
 
 
 def joined(surfaces: list[Surface]) -> Surface:
-    """Several surfaces as one."""
+    """Return several surfaces as one."""
     at, vertices, faces = 0, [np.zeros((0, 3))], [np.zeros((0, 3), int)]
     for v, f in surfaces:
         vertices.append(v)
@@ -65,18 +65,18 @@ def joined(surfaces: list[Surface]) -> Surface:
 
 
 def colliding(m: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms of a body that its author lets collide."""
+    """Return geoms of a body that its author lets collide."""
     return [g for g in _geoms(m, body) if m.geom_contype[g] or m.geom_conaffinity[g]]
 
 
 def seen(m: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms of a body that are drawn: those that do not collide, or all where all collide."""
+    """Return geoms of a body that are drawn: those that do not collide, or all where all collide."""
     geoms = _geoms(m, body)
     return [g for g in geoms if not (m.geom_contype[g] or m.geom_conaffinity[g])] or geoms
 
 
 def solid(m: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms that say where a body's surface is: those that collide, or else those that are drawn."""
+    """Return geoms that say where a body's surface is: those that collide, or else those that are drawn."""
     return colliding(m, body) or _geoms(m, body)
 
 

@@ -346,7 +346,7 @@ def _poses(
     s: poses.Search, order: list[str], fixes: Corrections, pick: Callable[..., Any], out: Path, where: str,
     tell: Callable[[str], None],
 ) -> tuple[dict[str, float], dict[str, float]]:  # fmt: skip
-    """Cupped and open pose by joint name."""
+    """Return cupped and open pose by joint name."""
     ids = {j: s.m.joint(j).id for j in order}
 
     def said(pose: str) -> np.ndarray:

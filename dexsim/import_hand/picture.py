@@ -24,7 +24,7 @@ LABEL = {
 
 
 def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
-    """Joint angles [J] in the hand's order as the model's qpos [nq]."""
+    """Return joint angles [J] in the hand's order as the model's qpos [nq]."""
     data = mujoco.MjData(model)
     hand.couplings.put(data, angles)
     return data.qpos.copy()
@@ -40,7 +40,7 @@ def posed(model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
 
 
 def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Middle [3] m of what is drawn, and the radius [m] of a sphere that holds it."""
+    """Return middle [3] m of what is drawn, and the radius [m] of a sphere that holds it."""
     spheres = [(data.geom_xpos[g], model.geom_rbound[g]) for g in range(model.ngeom)]
     low = np.min([c - r for c, r in spheres], axis=0)
     high = np.max([c + r for c, r in spheres], axis=0)

@@ -51,7 +51,7 @@ class Search:
         return self.couplings.placed(q) if self.passive else q
 
     def tips(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tips' positions and normals [F, 3] in the palm frame."""
+        """Return tips' positions and normals [F, 3] in the palm frame."""
         d = self.data
         d.qpos[:] = q
         mujoco.mj_kinematics(self.m, d)

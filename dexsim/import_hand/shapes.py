@@ -92,7 +92,7 @@ def _hull_surface(points: np.ndarray) -> geometry.Surface:
 
 
 def distance(points: np.ndarray, capsules: list[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
-    """Signed distance [P] m of points to the union of capsules."""
+    """Return signed distance [P] m of points to the union of capsules."""
     best = np.full(len(points), np.inf)
     for a, b, r in capsules:
         ab = b - a
@@ -138,8 +138,8 @@ def _fitted(
 
 
 def core(skin: np.ndarray, margin: float = MARGIN, most: int = CORNERS) -> np.ndarray:
-    """Corners [<= most, 3] of the hull `skin` moved in by `margin`, chosen one by one: always the one farthest outside.
-    A hull too thin for the margin is moved in by a third of its thickness."""
+    """Return corners [<= most, 3] of the hull `skin` moved in by `margin`, chosen one by one: always the one farthest
+    outside. A hull too thin for the margin is moved in by a third of its thickness."""
     hull = ConvexHull(skin)
     planes = np.unique(hull.equations.round(9), axis=0)
     middle = skin[hull.vertices].mean(0)
@@ -165,8 +165,8 @@ def core(skin: np.ndarray, margin: float = MARGIN, most: int = CORNERS) -> np.nd
 
 
 def palm_row(m: mujoco.MjModel, tree: Tree, palm: Palm) -> list[Capsule]:
-    """Capsules side by side along the palm's forward axis whose fronts follow the side of the palm that objects touch;
-    its back has none. Each strip's length and height come from the foremost points in it."""
+    """Return capsules side by side along the palm's forward axis whose fronts follow the side of the palm that objects
+    touch; its back has none. Each strip's length and height come from the foremost points in it."""
     points = palm_points(m, tree.palm, 6000)
     if len(points) < 4:
         return []

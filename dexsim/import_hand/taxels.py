@@ -112,7 +112,7 @@ def _hull(points: np.ndarray) -> geometry.Surface:
 
 
 def _smooth(normals: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Normals averaged with their neighbours' in the grid: facets of a hull turn in steps."""
+    """Return normals averaged with their neighbours' in the grid: facets of a hull turn in steps."""
     grid = np.pad(normals.reshape(columns, rows, 3), ((1, 1), (1, 1), (0, 0)), mode="edge")
     mean = grid[1:-1, 1:-1] * 2 + grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]
     return unit(mean).reshape(-1, 3)
@@ -151,7 +151,7 @@ def read(path: Path) -> dict[str, Pad]:
 
 
 def _spacing(points: np.ndarray) -> float:
-    """Median distance to the nearest neighbour [m]."""
+    """Return median distance to the nearest neighbour [m]."""
     if len(points) < 2:
         return 2e-3
     away = np.linalg.norm(points[:, None] - points[None], axis=2)

@@ -172,7 +172,7 @@ def _convert(path: Path, to: Path) -> Path:
 
 
 def _collada_unit(path: Path) -> float:
-    """Metres a unit of a COLLADA file."""
+    """Return metres a unit of a COLLADA file."""
     unit = _root_of_any(path).find("{*}asset/{*}unit")
     metres = float((unit.get("meter") if unit is not None else None) or 1.0)
     if not 0 < metres < math.inf:

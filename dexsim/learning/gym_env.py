@@ -80,7 +80,7 @@ class GymVectorEnv(VectorEnv):
         return self._out(obs[self._group]), self._out(reward), self._out(done & ~truncated), self._out(truncated), info
 
     def render(self, worlds: int = 4) -> tuple[np.ndarray, ...] | None:
-        """Pictures [H, W, 3] uint8 of the first worlds, without a display; None with render_mode=None."""
+        """Return pictures [H, W, 3] uint8 of the first worlds, without a display; None with render_mode=None."""
         if self.render_mode is None:
             return None
         return tuple(self.env.render(k) for k in range(min(worlds, self.num_envs)))

@@ -141,7 +141,7 @@ def mirrored(weights: dict[str, torch.Tensor], env: Any, path: str) -> dict[str,
 
 
 def by_episode(actor: Any, env: Any) -> Any:
-    """The actor itself; a recurrent one so that its state begins anew where an episode of ``env`` does."""
+    """Return the actor itself; a recurrent one so that its state begins anew where an episode of ``env`` does."""
     return ByEpisode(actor, env) if actor.is_recurrent else actor
 
 

@@ -148,7 +148,7 @@ class Ranks:
         yield path
 
     def _meeting(self) -> Any:
-        """torch's key-value store that all ranks share, before and after they have joined."""
+        """Return torch's key-value store that all ranks share, before and after they have joined."""
         if self._store is None:
             self._store, _, _ = next(dist.rendezvous("env://", self.rank, self.size, timeout=COMPILE_LIMIT))
         return self._store

@@ -8,7 +8,7 @@ from dexsim.errors import UserError
 
 
 def read_arguments(argv: Sequence[str]) -> tuple[list[str], dict[str, str], dict[str, str]]:
-    """(what is neither, remap, meta with units). Raises UserError for another KEY=VALUE."""
+    """Return (what is neither, remap, meta with units). Raises UserError for another KEY=VALUE."""
     rest: list[str] = []
     maps: dict[str, dict[str, str]] = {"remap": {}, "meta": {}}
     for argument in argv:

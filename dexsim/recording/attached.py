@@ -63,7 +63,7 @@ class Config(msgspec.Struct):
 
 
 def fault(text: str | None, source: str) -> str:
-    """Why an attached config cannot be used, in words; empty where it can, or there is none."""
+    """Return why an attached config cannot be used, in words; empty where it can, or there is none."""
     if text is None:
         return ""
     try:

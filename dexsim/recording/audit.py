@@ -46,7 +46,7 @@ KINDS: dict[str, str] = {
 
 
 def audit(recording: Recording) -> list[Finding]:
-    """Findings about the signals of a recording, in order of topic and time; [] for a clean one."""
+    """Return findings about the signals of a recording, in order of topic and time; [] for a clean one."""
     r = recording
     series: list[Series] = [
         s
@@ -78,7 +78,7 @@ def audit(recording: Recording) -> list[Finding]:
 
 
 def _of_joints(r: Recording) -> list[Finding]:
-    """Findings about values; each message tells of every joint."""
+    """Return findings about values; each message tells of every joint."""
     found: list[Finding] = []
     for check in (
         audit_values.commanded,
@@ -97,7 +97,7 @@ def _of_joints(r: Recording) -> list[Finding]:
 
 
 def table(findings: Sequence[Finding]) -> str:
-    """The findings as text, the worst first."""
+    """Return the findings as text, the worst first."""
     if not findings:
         return "no findings"
     rows = [("severity", "kind", "topic", "from s", "to s", "count", "what")]
@@ -109,7 +109,7 @@ def table(findings: Sequence[Finding]) -> str:
 
 
 def summary(r: Recording) -> str:
-    """One line a topic: samples, rate, span."""
+    """Return one line a topic: samples, rate, span."""
     lines = [
         f"{r.path}: {r.meta['source']}, {r.meta['robot']}, {len(r.joints)} joints, {r.duration:.2f} s,"
         f" effort {r.effort_is}"

@@ -20,7 +20,7 @@ EPOCH_S = 1e6  # s: stamps this far off count from another zero
 
 
 def timing(series: Series) -> Iterator[Finding]:
-    """Gaps, dropped samples, times that repeat, bursts."""
+    """Yield gaps, dropped samples, times that repeat, bursts."""
     topic, t = series.topic, series.t
     if len(t) < 5:
         return
@@ -81,7 +81,7 @@ def timing(series: Series) -> Iterator[Finding]:
 
 
 def stamps(all_series: list[Series]) -> Iterator[Finding]:
-    """header.stamp against host time, in each topic and between topics."""
+    """Yield header.stamp against host time, in each topic and between topics."""
     offsets: dict[str, float] = {}
     for s in all_series:
         if s.stamp is None:
@@ -166,7 +166,8 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
 
 
 def between_topics(r: Recording) -> Iterator[Finding]:
-    """Topics whose host times cannot be of one clock: one is shifted as a whole, or answers come before commands."""
+    """Yield topics whose host times cannot be of one clock: one is shifted as a whole, or answers come before
+    commands."""
     state = r.states.position
     if len(state) < 20:
         return
@@ -216,9 +217,9 @@ def between_topics(r: Recording) -> Iterator[Finding]:
 
 
 def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float | None:
-    """Median time [s] by which measured speed leads commanded speed (negative: it lags, as it should), from their
-    cross-correlation over joints that follow well, in each half of the recording alike (a joint that sticks or hits its
-    torque limit stops early, which looks like a lead); None where nothing can be said."""
+    """Return median time [s] by which measured speed leads commanded speed (negative: it lags, as it should), from
+    their cross-correlation over joints that follow well, in each half of the recording alike (a joint that sticks or
+    hits its torque limit stops early, which looks like a lead); None where nothing can be said."""
     state, leads = r.states.position, []
     if len(r.commands) < 20:
         return None
@@ -248,7 +249,8 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
 
 
 def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5) -> int | None:
-    """Grid steps by which the position's change comes before the command's; None where they do not go together."""
+    """Return grid steps by which the position's change comes before the command's; None where they do not go
+    together."""
     if np.ptp(command) < 0.05 or np.ptp(position) < 0.05:
         return None
     a, b = command[width:] - command[:-width], position[width:] - position[:-width]
@@ -274,6 +276,6 @@ def _line(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray | None:
 
 
 def _slope(t: np.ndarray, y: np.ndarray) -> float:
-    """Robust slope: medians of the first and last quarter."""
+    """Return robust slope: medians of the first and last quarter."""
     q = max(len(t) // 4, 1)
     return float((np.median(y[-q:]) - np.median(y[:q])) / max(np.median(t[-q:]) - np.median(t[:q]), 1e-9))

@@ -40,13 +40,13 @@ def quantum(x: np.ndarray) -> float:
 
 
 def is_integer(x: np.ndarray) -> bool:
-    """Whether every finite value is a whole number, and not all are 0 or 1."""
+    """Return whether every finite value is a whole number, and not all are 0 or 1."""
     x = x[np.isfinite(x)]
     return len(x) > 0 and bool((x == np.round(x)).all()) and float(np.abs(x).max()) > 1
 
 
 def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarray]]:
-    """(topic, quantity, joint, t, values [T]) of every per-joint signal."""
+    """Yield (topic, quantity, joint, t, values [T]) of every per-joint signal."""
     s = r.states
     for series, name in (
         (r.commands, "command"),
@@ -63,8 +63,8 @@ def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarr
 
 
 def commanded(r: Recording) -> Iterator[Finding]:
-    """That nothing says what the joints were asked for: an error, but where touch was recorded, which `calibrate touch`
-    reads by itself."""
+    """Yield that nothing says what the joints were asked for: an error, but where touch was recorded, which `calibrate
+    touch` reads by itself."""
     if not np.isfinite(r.commands.value).any():
         felt = r.tactile is not None and len(r.tactile) > 0
         use = "calibrate touch can use this recording, diagnose and replay cannot" if felt else (
@@ -130,12 +130,12 @@ def _together(r: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _follows(command: np.ndarray, position: np.ndarray) -> float:
-    """The largest correlation of a position with a command of up to 0.3 s before."""
+    """Return the largest correlation of a position with a command of up to 0.3 s before."""
     return max(_corr(command[: len(command) - k], position[k:]) for k in range(0, 31, 3))
 
 
 def finite(r: Recording) -> Iterator[Finding]:
-    """Values that are missing or infinite."""
+    """Yield values that are missing or infinite."""
     for topic, name, joint, t, x in channels(r):
         bad = ~np.isfinite(x)
         if not bad.any():
@@ -171,7 +171,7 @@ def finite(r: Recording) -> Iterator[Finding]:
 
 
 def wraps(r: Recording) -> Iterator[Finding]:
-    """A signed number read as unsigned, or an angle that starts again after a turn."""
+    """Yield a signed number read as unsigned, or an angle that starts again after a turn."""
     for topic, name, joint, t, x in channels(r):
         if name not in ("temperature", "enabled"):
             found = wrapped(x)
@@ -216,7 +216,7 @@ def wraps(r: Recording) -> Iterator[Finding]:
 
 
 def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
-    """(modulus, indices of the samples beyond half of it) of a wrapped signal; None otherwise."""
+    """Return (modulus, indices of the samples beyond half of it) of a wrapped signal; None otherwise."""
     ok = np.flatnonzero(np.isfinite(x))
     v = x[ok]
     if len(v) < 10 or np.ptp(v) == 0:
@@ -239,7 +239,7 @@ def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
 
 
 def spikes(r: Recording) -> Iterator[Finding]:
-    """Single samples of position, command and effort far from their neighbours."""
+    """Yield single samples of position, command and effort far from their neighbours."""
     s = r.states
     for series, name in ((s.position, "position"), (r.commands, "command"), (s.effort, "effort")):
         if series is None or not len(series):
@@ -319,7 +319,8 @@ def held(r: Recording) -> Iterator[Finding]:
 
 
 def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """[T] bool: samples equal to the one before within a steady motion, followed by a jump that makes up for them."""
+    """Return [T] bool: samples equal to the one before within a steady motion, followed by a jump that makes up for
+    them."""
     out = np.zeros(len(x), bool)
     dx = np.diff(x)
     edge = np.flatnonzero(np.diff(np.concatenate([[False], dx == 0, [False]]).astype(np.int8)))
@@ -351,7 +352,7 @@ def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def stuck(r: Recording) -> Iterator[Finding]:
-    """A channel that never changes where it must."""
+    """Yield a channel that never changes where it must."""
     s = r.states.position
     for j, joint in enumerate(r.joints):
         x = s.value[:, j]
@@ -391,7 +392,7 @@ def stuck(r: Recording) -> Iterator[Finding]:
 
 
 def saturation(r: Recording) -> Iterator[Finding]:
-    """Values that pile up at their largest."""
+    """Yield values that pile up at their largest."""
     for topic, name, joint, t, x in channels(r):
         if name not in ("effort", "duty"):
             continue
@@ -437,7 +438,7 @@ def saturation(r: Recording) -> Iterator[Finding]:
 
 
 def signs(r: Recording) -> Iterator[Finding]:
-    """Effort that lost its sign, or whose sign is not the one that is stated."""
+    """Yield effort that lost its sign, or whose sign is not the one that is stated."""
     e = r.states.effort
     if e is None or len(e) < 50:
         return
@@ -494,7 +495,7 @@ def signs(r: Recording) -> Iterator[Finding]:
 
 
 def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
-    """What an effort should follow [T]: target minus position; where nothing is commanded, the speed."""
+    """Return what an effort should follow [T]: target minus position; where nothing is commanded, the speed."""
     s = r.states.position
     ok = np.isfinite(s.value[:, j])
     if ok.sum() < 5:
@@ -662,7 +663,7 @@ def _smooth(x: np.ndarray, width: int = 5) -> np.ndarray:
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> float | None:
-    """b / a where they go together; None where they do not."""
+    """Return b / a where they go together; None where they do not."""
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 20 or a[ok].std() == 0 or b[ok].std() == 0:
         return None

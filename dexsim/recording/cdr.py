@@ -64,13 +64,13 @@ class Cdr:
         struct.pack_into("<iI", self._b, len(_ENCAPSULATION), *divmod(stamp_ns, 1_000_000_000))
 
     def bytes(self) -> bytes:
-        """The message."""
+        """Return the message."""
         return bytes(self._b)
 
 
 @lru_cache(maxsize=16)
 def _named(names: tuple[str, ...]) -> bytes:
-    """Header and names of a joint state: of the thousands in a recording they differ in the stamp alone."""
+    """Return header and names of a joint state: of the thousands in a recording they differ in the stamp alone."""
     c = Cdr()
     c.header(0)
     c.strings(names)
@@ -84,7 +84,7 @@ def joint_state(
     velocity: np.ndarray | None = None,
     effort: np.ndarray | None = None,
 ) -> bytes:
-    """sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
+    """Return sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
     c = Cdr(_named(tuple(names)))
     c.stamp(stamp_ns)
     for values in (position, velocity, effort):
@@ -93,7 +93,7 @@ def joint_state(
 
 
 def multi_array(values: np.ndarray, labels: Sequence[str] = ()) -> bytes:
-    """std_msgs/Float32MultiArray of any shape; one dimension label an axis (none: layout left empty)."""
+    """Return std_msgs/Float32MultiArray of any shape; one dimension label an axis (none: layout left empty)."""
     array = np.asarray(values, dtype="<f4")
     c = Cdr()
     c.pack("I", len(labels))
@@ -109,7 +109,7 @@ def multi_array(values: np.ndarray, labels: Sequence[str] = ()) -> bytes:
 
 
 def wrench(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
-    """geometry_msgs/WrenchStamped: force and torque [6]."""
+    """Return geometry_msgs/WrenchStamped: force and torque [6]."""
     c = Cdr()
     c.header(stamp_ns, frame)
     c.array(np.asarray(values, dtype="<f8"))
@@ -117,7 +117,7 @@ def wrench(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
 
 
 def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
-    """geometry_msgs/PoseStamped from [7] x y z, w x y z."""
+    """Return geometry_msgs/PoseStamped from [7] x y z, w x y z."""
     x, y, z, qw, qx, qy, qz = np.asarray(values, dtype="<f8")
     c = Cdr()
     c.header(stamp_ns, frame)
@@ -126,8 +126,9 @@ def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
 
 
 def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
-    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0). A
-    part that is not a number is not measured, which the message says by -1 as the first entry of its covariance."""
+    """Return sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown
+    (0). A part that is not a number is not measured, which the message says by -1 as the first entry of its
+    covariance."""
     v = np.asarray(values, dtype="<f8")
     c = Cdr()
     c.header(stamp_ns, frame)

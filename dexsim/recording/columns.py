@@ -34,7 +34,7 @@ _PLACES = ("position", "pos", "angle", "joint_position", "joint_pos", "joint_ang
 
 
 def _both(of: Iterable[str]) -> tuple[str, ...]:
-    """Words of a position before each of `of` and after it: `target_pos`, `pos_target`."""
+    """Return words of a position before each of `of` and after it: `target_pos`, `pos_target`."""
     return tuple(name for a in of for p in _PLACES for name in (f"{a}_{p}", f"{p}_{a}"))
 
 
@@ -57,7 +57,7 @@ _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=
 
 
 def _patterns(word: str) -> tuple[re.Pattern[str], ...]:
-    """A column that is a word alone, that begins with it, and that ends with it, the joint beside it."""
+    """Return a column that is a word alone, that begins with it, and that ends with it, the joint beside it."""
     inner = r"[\s_-]*".join(map(re.escape, word.split("_"))) + ("s?" if len(word) > 3 else "")
     # one letter is a quantity only beside a mark no word has inside
     between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"
@@ -104,7 +104,7 @@ class Table:
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
 
     def carried(self, quantity: str) -> np.ndarray | None:
-        """[T, J] of which joints each of the quantity's samples tells; None: of all."""
+        """Return [T, J] of which joints each of the quantity's samples tells; None: of all."""
         if quantity not in self.told:
             return None
         lines = len(self.time[quantity])
@@ -116,7 +116,7 @@ class Table:
         return np.any([np.isfinite(columns[j]) for j in self.joints if j in columns], axis=0)
 
     def samples(self, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-        """(t [T] s, value [T, J]) of one quantity, rows without any number left out."""
+        """Return (t [T] s, value [T, J]) of one quantity, rows without any number left out."""
         t, columns = self.time[quantity], self.value.get(quantity, {})
         rows = (
             np.stack([columns.get(j, np.full(len(t), np.nan)) for j in self.joints], 1)
@@ -128,7 +128,8 @@ class Table:
 
 
 def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str], time_unit: str = "") -> Table:
-    """The table in a CSV, TSV or NPZ file. remap: see the module, and our joint name -> theirs (left to the caller).
+    """Return the table in a CSV, TSV or NPZ file. remap: see the module, and our joint name -> theirs (left to the
+    caller).
 
     meta: what is stated of it; time_unit: of a time without a unit of its own. Raises UserError naming what is
     missing."""
@@ -145,8 +146,8 @@ def of_columns(
     meta: Mapping[str, str],
     time_unit: str = "",
 ) -> Table:
-    """The table in columns by name: numbers [T], or texts [T] (of a text file) that only the columns' names tell how to
-    read."""
+    """Return the table in columns by name: numbers [T], or texts [T] (of a text file) that only the columns' names tell
+    how to read."""
     named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
     if not raw:
         raise UserError(f"recording {path}: holds no column of numbers")
@@ -237,7 +238,7 @@ def of_columns(
 
 
 def _stamped(raw: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Columns as they are, seconds and nanoseconds of one stamp as one time."""
+    """Return columns as they are, seconds and nanoseconds of one stamp as one time."""
     for column in raw if "time" not in raw else ():
         found = re.fullmatch(r"(|.*[._])secs?", column)
         if found is None:
@@ -259,8 +260,8 @@ def _names_in(raw: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _lines_of_joints(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns as they are; where a column says which joint each line is of, one for each of its joints, empty in the
-    lines of others."""
+    """Return columns as they are; where a column says which joint each line is of, one for each of its joints, empty in
+    the lines of others."""
     which = next((c for c in raw if c.lower().strip() in _NAMED and isinstance(raw[c], list)), None)
     if which is None:
         return dict(raw)
@@ -290,8 +291,8 @@ def _numbers(
     findings: list[Finding],
     named: set[str],
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """(columns as numbers, those without any left out; of columns with empty places, where there is a value [T]). Texts
-    that are none are found, but in columns that no role asks for. named: columns that the user named."""
+    """Return (columns as numbers, those without any left out; of columns with empty places, where there is a value
+    [T]). Texts that are none are found, but in columns that no role asks for. named: columns that the user named."""
     out: dict[str, np.ndarray] = {}
     told: dict[str, np.ndarray] = {}
     words, example = 0, ""
@@ -332,7 +333,7 @@ def _numbers(
 def _some_clock(
     raw: Mapping[str, np.ndarray], roles: Mapping[str, Any], findings: list[Finding]
 ) -> dict[str, tuple[str, str, str, str]]:
-    """The role of the first column that seems to be a time and never goes back; {} where there is none."""
+    """Return the role of the first column that seems to be a time and never goes back; {} where there is none."""
     for column, x in raw.items():
         name, unit = _unit(column)
         words = re.split(r"[^a-z]+", name.lower())
@@ -346,8 +347,8 @@ def _some_clock(
 
 
 def _roles(path: Path, columns: list[str], named: Mapping[str, str]) -> dict[str, tuple[str, str, str, str]]:
-    """Column -> (quantity, joint or "", unit or "", the word it was known by); columns that say nothing known are left
-    out."""
+    """Return column -> (quantity, joint or "", unit or "", the word it was known by); columns that say nothing known
+    are left out."""
     out: dict[str, tuple[str, str, str, str]] = {}
     for key, column in named.items():
         quantity, _, joint = key.partition(".")
@@ -413,7 +414,8 @@ _CONTROLLER = re.compile(
 
 
 def _unit(column: str) -> tuple[str, str]:
-    """(the name without its unit, the unit in lower case or ""). Of a drive's own numbers the unit is not named."""
+    """Return (the name without its unit, the unit in lower case or ""). Of a drive's own numbers the unit is not
+    named."""
     bare = re.sub(rf"([\s_.]+|\s*[\[(])({'|'.join(_OWN)})[\])]?(?=$|[./:])", "", column, flags=re.I)
     if bare != column and _known(bare):
         return bare, ""
@@ -526,8 +528,8 @@ def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
-    """Columns of a text file, as texts: separated by commas, semicolons or tabs, a line of names before the numbers;
-    lines from # on are left out."""
+    """Return columns of a text file, as texts: separated by commas, semicolons or tabs, a line of names before the
+    numbers; lines from # on are left out."""
     text = files.text(path, "recording", 1 << 30, "cp1252")  # as spreadsheets write it
     if "\0" in text:
         raise UserError(f"recording {path}: is no text file of columns")
@@ -593,7 +595,7 @@ def _floats(cells: list[str]) -> tuple[np.ndarray, int]:
 
 
 def _point(cell: str) -> str:
-    """A number with a decimal comma as one with a point; thousands may be set apart by points."""
+    """Return a number with a decimal comma as one with a point; thousands may be set apart by points."""
     if cell.count(",") != 1:
         return cell
     whole, rest = cell.split(",")
@@ -601,8 +603,8 @@ def _point(cell: str) -> str:
 
 
 def _dates(cells: list[str]) -> tuple[np.ndarray, int]:
-    """(s since 1970, or of the day where only hours are given, NaN where there is none; how many entries are something
-    else)."""
+    """Return (s since 1970, or of the day where only hours are given, NaN where there is none; how many entries are
+    something else)."""
     out, bad = np.full(len(cells), np.nan), 0
     for i, cell in enumerate(cells):
         text = cell.strip().replace(",", ".")
@@ -626,7 +628,7 @@ def _numeric(line: str) -> bool:
 
 
 def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Columns of a NumPy archive: arrays [T], or [T, J] with `joint_names` [J]. Nothing pickled is read."""
+    """Return columns of a NumPy archive: arrays [T], or [T, J] with `joint_names` [J]. Nothing pickled is read."""
     try:
         arrays = files.arrays(path)
     except ValueError as error:

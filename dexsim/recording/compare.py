@@ -43,7 +43,7 @@ class Comparison:
     notes: list[str] = field(default_factory=list)
 
     def position_rmse(self) -> np.ndarray:
-        """[J] rad."""
+        """Return [J] rad."""
         return (
             np.sqrt(np.nanmean((self.position - self.position_simulated) ** 2, axis=0))
             if len(self.t)
@@ -51,7 +51,7 @@ class Comparison:
         )
 
     def effort_rmse(self) -> np.ndarray:
-        """[J] N.m; NaN where no effort was recorded."""
+        """Return [J] N.m; NaN where no effort was recorded."""
         if self.effort is None:
             return np.full(len(self.joints), np.nan)
         d = self.effort - self.effort_simulated
@@ -103,7 +103,8 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
 
 
 def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
-    """position.png, effort.png and, where touch was recorded or simulated, force.png: one panel a joint or finger."""
+    """Return position.png, effort.png and, where touch was recorded or simulated, force.png: one panel a joint or
+    finger."""
     paths = [
         _panels(
             folder / "position.png",

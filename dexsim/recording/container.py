@@ -49,7 +49,7 @@ class Container:
     damage: list[tuple[int | None, int, str]] = field(default_factory=list)
 
     def channel(self, message: Message) -> Channel | None:
-        """The channel of a message; None where its record is lost."""
+        """Return the channel of a message; None where its record is lost."""
         return self.channels.get(message.channel_id)
 
 
@@ -118,7 +118,7 @@ def _sqlite(data: Any, out: Container) -> None:
 
 
 def _standard(kind: str) -> str:
-    """The definition of a standard message type; empty for another."""
+    """Return the definition of a standard message type; empty for another."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
 
     try:
@@ -145,7 +145,8 @@ def _mcap(data: mmap.mmap | bytes, size: int, out: Container) -> None:
 
 
 def _records(data: mmap.mmap | bytes, out: Container) -> Iterator[tuple[int, int, int]]:
-    """(opcode, offset of the body, length) of each record; the last may reach beyond the end of a truncated file."""
+    """Yield (opcode, offset of the body, length) of each record; the last may reach beyond the end of a truncated
+    file."""
     at, size = len(MAGIC), len(data)
     while at + _HEAD.size <= size:
         if data[at : at + len(MAGIC)] == MAGIC and size - at == len(MAGIC):
@@ -170,12 +171,14 @@ def _plausible(opcode: int) -> bool:
 
 
 def _cut_chunk(data: mmap.mmap | bytes, at: int) -> bool:
-    """A chunk record at the end of the file that the file does not hold in full (rather than a damaged length)."""
+    """Return a chunk record at the end of the file that the file does not hold in full (rather than a damaged
+    length)."""
     return data[at] == Opcode.CHUNK and _resync(data, at + 1) is None
 
 
 def _resync(data: mmap.mmap | bytes, start: int) -> int | None:
-    """The next offset at which a whole chunk record stands, followed by another record or the end of the file."""
+    """Return the next offset at which a whole chunk record stands, followed by another record or the end of the
+    file."""
     size = len(data)
     raw = np.frombuffer(data, dtype=np.uint8)
     for at in (np.flatnonzero(raw[start:] == int(Opcode.CHUNK)) + start).tolist():
@@ -211,7 +214,7 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
 
 
 def _unzip(packed: Any) -> bytes:
-    """What zstd packed, as far as it is there."""
+    """Return what zstd packed, as far as it is there."""
     with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
         return b"".join(iter(lambda: reader.read(1 << 20), b""))
 

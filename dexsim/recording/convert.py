@@ -115,7 +115,7 @@ TASK = "joint motion"
 
 
 def _framed(r: Recording, s: Any, fps: float) -> np.ndarray:
-    """[n, J] values of a series at the frames from the first state on: what was read, or the target in force."""
+    """Return [n, J] values of a series at the frames from the first state on: what was read, or the target in force."""
     start, end = float(r.states.position.t[0]), float(r.states.position.t[-1])
     t = start + np.arange(int((end - start) * fps + 1e-6) + 1) / fps
     out = np.full((len(t), s.value.shape[1]), np.nan)

@@ -19,7 +19,7 @@ class Unreadable(Exception):
 
 
 def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
-    """A function from bytes to a message (object or dict). Raises Unreadable."""
+    """Return a function from bytes to a message (object or dict). Raises Unreadable."""
     encoding = channel.message_encoding
     if encoding == "cdr":
         return _ros2(schema)
@@ -38,7 +38,7 @@ def _json(data: bytes) -> Any:
 
 
 def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
-    """Whether the messages are of the standard definition, whose fields need not be looked for."""
+    """Return whether the messages are of the standard definition, whose fields need not be looked for."""
     if channel.message_encoding != "cdr" or schema is None or schema.name != kind:
         return False
 
@@ -139,12 +139,12 @@ def vector_reader(channel: Channel, schema: Schema | None, part: str, kind: str)
 
 
 def get(m: Any, name: str) -> Any:
-    """A field of a message or dict; None where there is none."""
+    """Return a field of a message or dict; None where there is none."""
     return m.get(name) if isinstance(m, dict) else getattr(m, name, None)
 
 
 def first(m: Any, *names: str) -> Any:
-    """The first of these fields that there is."""
+    """Return the first of these fields that there is."""
     return next((v for v in (get(m, n) for n in names) if v is not None), None)
 
 
@@ -162,7 +162,7 @@ def walk(m: Any, path: str) -> Any:
 
 
 def floats(values: Any) -> np.ndarray:
-    """float64 array; None within it (JSON's null) is NaN, None itself is empty."""
+    """Return float64 array; None within it (JSON's null) is NaN, None itself is empty."""
     if values is None:
         return np.zeros(0)
     if isinstance(values, (bytes, bytearray)):
@@ -175,7 +175,7 @@ def floats(values: Any) -> np.ndarray:
 
 
 def stamp_of(m: Any) -> int | None:
-    """header.stamp (or `timestamp`) [ns]; None where unset or zero."""
+    """Return header.stamp (or `timestamp`) [ns]; None where unset or zero."""
     header = get(m, "header")
     stamp = get(header, "stamp") if header is not None else first(m, "timestamp", "stamp")
     if stamp is None:
@@ -189,7 +189,7 @@ def stamp_of(m: Any) -> int | None:
 
 
 def _seconds(duration: Any) -> float:
-    """A duration [s]: a message, a dict or a number; 0 for None."""
+    """Return a duration [s]: a message, a dict or a number; 0 for None."""
     if duration is None or isinstance(duration, (int, float)):
         return float(duration or 0.0)
     sec, nano = first(duration, "sec", "secs", "seconds"), first(duration, "nanosec", "nsec", "nsecs", "nanos")
@@ -208,7 +208,7 @@ def _pose(m: Any) -> np.ndarray:
 
 
 def _imu(m: Any) -> np.ndarray:
-    """A part whose covariance begins with -1 is not measured (sensor_msgs/Imu): NaN."""
+    """Return a part whose covariance begins with -1 is not measured (sensor_msgs/Imu): NaN."""
     out = []
     for name, axes in (("orientation", "wxyz"), ("angular_velocity", "xyz"), ("linear_acceleration", "xyz")):
         part, covariance = get(m, name), get(m, f"{name}_covariance")

@@ -40,7 +40,7 @@ class Limits:
     current: float | None = None
 
     def torques(self, m: Mechanism) -> np.ndarray:
-        """Fraction of the stall torque that each joint may reach [J], by `torque` and `current`."""
+        """Return fraction of the stall torque that each joint may reach [J], by `torque` and `current`."""
         share = np.full(len(m.joints), self.torque)
         if self.current is not None:
             stall = m.column("torque_limit")
@@ -50,7 +50,7 @@ class Limits:
 
 
 def current_per_torque(m: Mechanism) -> np.ndarray:
-    """A per N.m [J] of the servo table, `realistic.CURRENT_PER_TORQUE` where it does not say."""
+    """Return a per N.m [J] of the servo table, `realistic.CURRENT_PER_TORQUE` where it does not say."""
     known = np.asarray(m.table.current(m.joints), float)
     return np.where(np.isfinite(known), known, CURRENT_PER_TORQUE)
 
@@ -95,8 +95,8 @@ def plan(
     repeats: int = 1,
     say: Callable[[str], None] = lambda text: None,
 ) -> Plan:
-    """A safe sequence of motions of `joints` (default all) of these `kinds` (default all), in an order shuffled by
-    `seed`.
+    """Return a safe sequence of motions of `joints` (default all) of these `kinds` (default all), in an order shuffled
+    by `seed`.
 
     Each motion begins and ends at rest at home and is simulated with the mechanism's servo; it is made smaller until it
     keeps the limits and nothing touches, or left out. repeats: how many of the motions of each group of joints come a
@@ -167,8 +167,8 @@ def plan(
 
 
 def groups(m: Mechanism, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """Joints that move at the same time: the k-th of every branch of the tree (a finger), so that no joint carries
-    another."""
+    """Return joints that move at the same time: the k-th of every branch of the tree (a finger), so that no joint
+    carries another."""
     model = m.spec.compile()
     branches: dict[int, list[str]] = {}
     body_of = {j: int(model.joint(j).bodyid[0]) for j in m.joints}
@@ -189,8 +189,8 @@ FILES = ("excite.mcap", "excite.csv", "excite_simulated.mcap", "excite.yaml")
 
 
 def write_plan(p: Plan, folder: Path) -> list[Path]:
-    """Into a folder that is there: the commands, twice, what the simulation made of them, and what moves when, what was
-    left out, the peaks. Returns the paths."""
+    """Write into a folder that is there the commands, twice, what the simulation made of them, and what moves when,
+    what was left out, the peaks. Returns the paths."""
     paths = [folder / name for name in FILES]
     write_commands(p, paths[0])
     with open(paths[1], "w", newline="", encoding="utf-8") as file:
@@ -232,14 +232,15 @@ def next_recording(
     seed: int = 0,
     limits: Limits = Limits(),
 ) -> Plan:
-    """The recording that a diagnosis asks for: a safe plan of these joints and kinds of motion, written as `path`."""
+    """Return the recording that a diagnosis asks for: a safe plan of these joints and kinds of motion, written as
+    `path`."""
     made = plan(m, joints, kinds, seed, limits=limits)
     write_commands(made, path)
     return made
 
 
 def summary(p: Plan) -> dict:
-    """The plan as plain data."""
+    """Return the plan as plain data."""
     joints = p.mechanism.joints
     return {
         "robot": p.mechanism.robot,
@@ -294,7 +295,7 @@ def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Li
 
 
 def _range(m: Mechanism, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lowest and highest command and home [J]: the model's rest position, brought inside the margins."""
+    """Return lowest and highest command and home [J]: the model's rest position, brought inside the margins."""
     model = m.spec.compile()
     rest = np.array([model.qpos0[model.jnt_qposadr[model.joint(j).id]] for j in m.joints])
     wide = m.limits[:, 1] - m.limits[:, 0]
@@ -307,7 +308,7 @@ def _range(m: Mechanism, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.nda
 def _free(
     check: safety.ContactCheck, home: np.ndarray, j: int, low: np.ndarray, high: np.ndarray, count: int = 60
 ) -> tuple[float, float]:
-    """The interval around home in which joint j touches nothing, the others at home."""
+    """Return the interval around home in which joint j touches nothing, the others at home."""
     ends = []
     for end in (low[j], high[j]):
         reached = home[j]
@@ -332,7 +333,7 @@ def _motion(
     dt: float,
     seed: int,
 ) -> tuple[Segment | None, str]:
-    """The largest safe version of a motion, or None and why there is none."""
+    """Return the largest safe version of a motion, or None and why there is none."""
     scale, why = 1.0, ""
     for _ in range(TRIES):
         command = _command(m, kind, group, free, home, limits, dt, seed, scale)
@@ -362,7 +363,7 @@ def _command(
     seed: int,
     scale: float,
 ) -> np.ndarray | None:
-    """Targets [T, J]: from home to each joint's centre, the motion, and back."""
+    """Return targets [T, J]: from home to each joint's centre, the motion, and back."""
     kp, stall, allowed = m.column("kp"), m.column("torque_limit"), limits.torques(m)
     rng = np.random.default_rng(seed)
     speed = limits.speed * m.speeds * (1.0 if kind == "steps" else max(scale, 0.2))
@@ -393,7 +394,7 @@ def _simulate(m: Mechanism, t: np.ndarray, command: np.ndarray, home: np.ndarray
 
 
 def _faults(m: Mechanism, peaks: safety.Peaks, limits: Limits, reserve: float = 1.0) -> str:
-    """What a motion violates of this share of the limits, in words; "" where nothing."""
+    """Return what a motion violates of this share of the limits, in words; "" where nothing."""
     out = []
     speeds = np.full(len(m.joints), limits.speed)
     for name, value, allowed in (("speed", peaks.speed, speeds), ("torque", peaks.torque, limits.torques(m))):
@@ -407,7 +408,7 @@ def _faults(m: Mechanism, peaks: safety.Peaks, limits: Limits, reserve: float = 
 
 
 def _repeated(made: list[Segment], repeats: int, rng: np.random.Generator) -> list[int]:
-    """Indices of the motions that come again: `repeats` of each group of joints."""
+    """Return indices of the motions that come again: `repeats` of each group of joints."""
     by_group: dict[tuple[str, ...], list[int]] = {}
     for i, s in enumerate(made):
         by_group.setdefault(s.joints, []).append(i)

@@ -28,7 +28,7 @@ MARKER = 0.015  # m, radius of what stands for an object of unknown shape: seen,
 
 
 def pairs(hand: Hand) -> tuple[ContactPair, ...]:
-    """Fingertip on object, one a finger; a fingertip of several geoms counts as its whole distal link."""
+    """Return fingertip on object, one a finger; a fingertip of several geoms counts as its whole distal link."""
     return tuple(
         ContactPair(f.name, ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body), ("body", NAME))
         for f in hand.fingers
@@ -74,7 +74,7 @@ class Stated:
 
 
 def _library_size(shape: Any) -> list[float]:
-    """Half extents of a primitive of the library as its kind counts them."""
+    """Return half extents of a primitive of the library as its kind counts them."""
     e = [float(x) / 2 for x in shape.extents]
     return {"box": e, "sphere": e[:1], "capsule": [min(e), max(e)]}[shape.kind]
 

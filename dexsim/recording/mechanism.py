@@ -80,7 +80,7 @@ class Mechanism:
         return {j: (float(a), float(b)) for j, (a, b) in zip(self.joints, self.limits, strict=True) if np.isfinite(a)}
 
     def column(self, name: str) -> np.ndarray:
-        """A servo column's nominal value [J]."""
+        """Return a servo column's nominal value [J]."""
         from dexsim.actuator.columns import INDEX
 
         return self.table.nominal(self.joints)[:, INDEX[name]]
@@ -95,7 +95,7 @@ class Mechanism:
 def of_hand(
     hand: Hand, servo: str | Path | dict | None = None, gravity: Sequence[float] | np.ndarray | None = None
 ) -> Mechanism:
-    """The mechanism of a hand alone, in its palm frame; servo, gravity as in `mechanism`. Raises UserError."""
+    """Return the mechanism of a hand alone, in its palm frame; servo, gravity as in `mechanism`. Raises UserError."""
     spec = hand.spec()
     _hold_friction(spec)
     if gravity is not None:
@@ -110,8 +110,8 @@ def mechanism(
     gravity: Sequence[float] | np.ndarray | None = None,
     hand: Hand | None = None,
 ) -> Mechanism:
-    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a hand
-    (its hand.yaml names servo and joints); by default `hand`, or the xHand, and its own.
+    """Return the mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a
+    hand (its hand.yaml names servo and joints); by default `hand`, or the xHand, and its own.
 
     joints: the driven ones; by default those of the hand, else every hinge and slide of the model. gravity: [3] m/s2,
     world frame. hand: beside a model, the one whose fingertips it carries. Raises UserError for a model or servo that
@@ -163,12 +163,13 @@ def _uncoupled(spec: mujoco.MjSpec, table: ServoTable) -> None:
 
 
 def stated_hand(name: str | None, mirror: bool = False) -> Hand | None:
-    """The hand of a command's settings hand= and hand_mirror=; None where neither is stated. Raises UserError."""
+    """Return the hand of a command's settings hand= and hand_mirror=; None where neither is stated. Raises
+    UserError."""
     return load_hand(name or XHAND, mirror) if name or mirror else None
 
 
 def _hand_folder(model: str | Path) -> Path | None:
-    """The folder of a hand.yaml, where `model` is one."""
+    """Return the folder of a hand.yaml, where `model` is one."""
     path = Path(model).expanduser()
     path = path.parent if path.name == HAND_FILE else path
     return path if (path / HAND_FILE).is_file() else None
@@ -238,8 +239,8 @@ def held_joints(m: Mechanism, joints: Sequence[str]) -> list[str]:
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`over` laid over `base`, mapping by mapping; the servo file's value mappings {value, low, high} are replaced
-    whole."""
+    """Return `over` laid over `base`, mapping by mapping; the servo file's value mappings {value, low, high} are
+    replaced whole."""
     out = copy.deepcopy(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(out.get(key), dict) and "value" not in value:
@@ -395,8 +396,8 @@ def drive(
 def recorded(
     run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0, start_ns: int = 1_000_000_000
 ) -> Recording:
-    """The run as a simulated recording: commands as sent, states `rate` times a second (Hz; at most the physics rate),
-    torque in N.m. `realistic` makes of it what the hardware would have delivered."""
+    """Return the run as a simulated recording: commands as sent, states `rate` times a second (Hz; at most the physics
+    rate), torque in N.m. `realistic` makes of it what the hardware would have delivered."""
     every = max(1, round(1.0 / rate / (run.t[1] - run.t[0]))) if len(run.t) > 1 else 1
     t = run.t[::every]
     value = np.full((len(commands), len(m.joints)), np.nan)
@@ -565,8 +566,8 @@ class Led:
 
 
 def _path(poses: Series, steps: int, timestep: float) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [K, 7] at each physics step, and the speeds [K, 6] (linear in the world, angular in the body) that led
-    there."""
+    """Return poses [K, 7] at each physics step, and the speeds [K, 6] (linear in the world, angular in the body) that
+    led there."""
     value = poses.value.copy()
     turned = np.cumprod(np.where((value[1:, 3:] * value[:-1, 3:]).sum(1) < 0, -1.0, 1.0))
     value[1:, 3:] *= turned[:, None]  # q and -q are one orientation: take the near one

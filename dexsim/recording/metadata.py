@@ -40,8 +40,8 @@ NAN = float("nan")
 def collect(
     path: Path, own: Mapping[str, str], given: Mapping[str, Any], units: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[dict[str, str], dict[str, str], list[Finding]]:
-    """Stated metadata (no defaults yet) and units: `given` and `units` win over the file beside the recording, that
-    over its own record.
+    """Return stated metadata (no defaults yet) and units: `given` and `units` win over the file beside the recording,
+    that over its own record.
 
     Each key that one source overrides in another is a finding. Raises UserError for unknown keys or a bad file.
     """
@@ -112,7 +112,7 @@ def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> lis
 
 
 def own_record(records: list[Any]) -> dict[str, str]:
-    """The `dexsim` record among an MCAP file's metadata records; {} where there is none."""
+    """Return the `dexsim` record among an MCAP file's metadata records; {} where there is none."""
     return next((dict(r.metadata) for r in records if r.name == METADATA), {})
 
 

@@ -11,7 +11,7 @@ from dexsim.errors import UserError
 def match(
     theirs: Sequence[str], ours: Sequence[str], given: Mapping[str, str], where: str, shorter: bool = True
 ) -> dict[str, str]:
-    """Their name -> ours, for those that can be matched.
+    """Return their name -> ours, for those that can be matched.
 
     A name fits when it is equal, or equal but for case and separators, or when theirs ends with ours
     (`right_hand_index_joint1`, `index_joint1`; the longest fit wins), or (`shorter`) when the only one of ours that

@@ -62,14 +62,15 @@ def unreachable(r: Recording, known: set[tuple[str, str]]) -> Iterator[Finding]:
 
 
 def _near(x: np.ndarray, other: np.ndarray) -> bool:
-    """Whether no value of x is as far as a turn (less a margin of rounding) from any of the other; cheaper to say than
-    what `_spans` finds out, and true of nearly all signals."""
+    """Return whether no value of x is as far as a turn (less a margin of rounding) from any of the other; cheaper to
+    say than what `_spans` finds out, and true of nearly all signals."""
     turn = 0.99 * TURN
     return bool(np.fmax.reduce(x) < np.fmin.reduce(other) + turn and np.fmin.reduce(x) > np.fmax.reduce(other) - turn)
 
 
 def _spans(series: Series, j: int, name: str) -> tuple[float, float]:
-    """(lowest, highest) of a joint's values but for spikes and the outermost hundredth; NaN where there are too few."""
+    """Return (lowest, highest) of a joint's values but for spikes and the outermost hundredth; NaN where there are too
+    few."""
     x = series.value[:, j]
     x = x[np.isfinite(x) & ~spiked(x, name)]
     if len(x) < FEWEST:

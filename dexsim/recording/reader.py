@@ -47,8 +47,8 @@ def read(
     hand: Hand | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> Recording:
-    """The recording in an MCAP file, in a folder that `ros2 bag record` wrote, in a CSV or NPZ file with named columns
-    (`columns.py`), or in an episode of a data set (`readers.py`): "DATASET#3".
+    """Return the recording in an MCAP file, in a folder that `ros2 bag record` wrote, in a CSV or NPZ file with named
+    columns (`columns.py`), or in an episode of a data set (`readers.py`): "DATASET#3".
 
     Arguments:
         remap: our topic -> theirs ("/joint_states": "/xhand/state"), "#a.b" behind it for a sub-message; our joint name
@@ -195,7 +195,7 @@ class _Reading:
             )
 
     def _first(self, messages: list[Message]) -> int:
-        """The earliest host time [ns] of those that can be true."""
+        """Return the earliest host time [ns] of those that can be true."""
         base = sorted(m.log_time for m in messages)[len(messages) // 2]
         keep = timeline.kept(np.array([(m.log_time - base) * 1e-9 for m in messages]))
         return min((m.log_time for m, on in zip(messages, keep, strict=True) if on), default=base)
@@ -205,8 +205,8 @@ class _Reading:
 
     # -- topics -------------------------------------------------------------------
     def _topics(self, remap: dict[str, str]) -> dict[str, tuple[str, str]]:
-        """Our topic -> (theirs, part): as stated, else of the same name, else of the same name in a namespace, else
-        (for joint states) the only one of the type."""
+        """Return our topic -> (theirs, part): as stated, else of the same name, else of the same name in a namespace,
+        else (for joint states) the only one of the type."""
         for ours in remap:
             if ours not in schema.TOPICS:
                 raise UserError(f"remap.{ours}: no such topic; topics are {', '.join(schema.TOPICS)}")
@@ -300,7 +300,7 @@ class _Reading:
     def _decode(
         self, ours: str, make: Callable[[Channel, McapSchema | None, str], Reader[Any]]
     ) -> tuple[np.ndarray, Sequence[Any]]:
-        """Host times [T] s and decoded messages of one of our topics, in order of time."""
+        """Return host times [T] s and decoded messages of one of our topics, in order of time."""
         if ours not in self.sources:
             return np.zeros(0), []
         theirs, part = self.sources[ours]
@@ -392,7 +392,7 @@ class _Reading:
 
     # -- values -------------------------------------------------------------------
     def build(self, stated: dict[str, str], joints: Sequence[str] | None, units: Units) -> Recording:
-        """The recording, with metadata complete, in SI."""
+        """Return the recording, with metadata complete, in SI."""
         t_command, commands, lines = self._points(*self._decode(schema.COMMANDS, decode.joint_reader))
         t_state, states = self._decode(schema.STATES, decode.joint_reader)
         given = set(stated)
@@ -466,7 +466,7 @@ class _Reading:
         return out
 
     def _tactile_shape(self, dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
-        """[fingers, taxels, 3]: as the message says, else the hand's."""
+        """Return [fingers, taxels, 3]: as the message says, else the hand's."""
         if len(dims) == 3 and int(np.prod(dims)) == len(values):
             return values.reshape(dims)
         fingers = len(self.hand.fingers)
@@ -475,7 +475,7 @@ class _Reading:
     def _their_joints(
         self, stated: dict[str, str], commands: Sequence, states: Sequence, joints: Sequence[str] | None
     ) -> list[str]:
-        """The recording's own joint names: `joint_names` first, then as they appear in messages."""
+        """Return the recording's own joint names: `joint_names` first, then as they appear in messages."""
         listed = list(schema.joint_names(stated.get("joint_names", "")))
         seen: dict[str, None] = dict.fromkeys(listed)
         unnamed = 0
@@ -584,7 +584,8 @@ class _Reading:
                 self.findings.append(Finding("unit", "", NAN, len(joints), said, "info" if sure else "warning"))
 
     def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
-        """Whether a current of no stated unit [S] can only be in mA; never of messages, whose effort is in SI."""
+        """Return whether a current of no stated unit [S] can only be in mA; never of messages, whose effort is in
+        SI."""
         return False
 
     def _joint_series(
@@ -657,7 +658,7 @@ class _Reading:
                 self.findings.append(Finding("joint_names", topic, NAN, len(group), text, "warning"))
 
     def _stamps(self, samples: Sequence[JointSample]) -> np.ndarray:
-        """[T] `header.stamp` in s from the recording's start, NaN where there is none."""
+        """Return [T] `header.stamp` in s from the recording's start, NaN where there is none."""
         if isinstance(samples, JointRows) and 0 <= self.start_ns < MAX_START:
             return np.where(samples.stamp == 0, np.nan, (samples.stamp - self.start_ns) * 1e-9)
         return np.array([np.nan if s.stamp is None else (s.stamp - self.start_ns) * 1e-9 for s in samples])
@@ -789,7 +790,7 @@ class _TableReading(_Reading):
 
 
 def _between(a: tuple[float, Any, Any], b: tuple[float, Any, Any], t: float) -> np.ndarray:
-    """Position [n] at t between points (s, position [n], velocity [n] or empty): a cubic by both speeds, else a
+    """Return position [n] at t between points (s, position [n], velocity [n] or empty): a cubic by both speeds, else a
     line."""
     size = b[0] - a[0]
     u = (t - a[0]) / size
@@ -809,7 +810,7 @@ def _taken(samples: Sequence[Any], which: np.ndarray) -> Sequence[Any]:
 
 
 def _unlike(samples: Sequence[JointSample]) -> Sequence[JointSample]:
-    """Those of the samples whose names or numbers of values differ: of rows, the first tells of all."""
+    """Return those of the samples whose names or numbers of values differ: of rows, the first tells of all."""
     return samples[:1] if isinstance(samples, JointRows) else samples
 
 
@@ -852,7 +853,7 @@ class _Placer:
         self._known: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def __call__(self, names_: Sequence[str], size: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """(which values to take, their columns), or None where names and values do not fit."""
+        """Return (which values to take, their columns), or None where names and values do not fit."""
         key = tuple(names_) or tuple(self.theirs[: self.stated] if size == self.stated else self.theirs)
         if key not in self._known:
             columns = self.column[np.array([self._at[n] for n in key], int)]

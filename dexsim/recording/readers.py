@@ -53,18 +53,18 @@ class Reader(Protocol):
     imports: ClassVar[tuple[str, ...]]
 
     def fits(self, path: Path) -> bool:
-        """Whether the path is such a data set; looks at names only."""
+        """Return whether the path is such a data set; looks at names only."""
 
     def count(self, path: Path) -> int:
-        """How many episodes it holds."""
+        """Return how many episodes it holds."""
 
     def read(self, path: Path, episode: int) -> Episode:
-        """One of them. Raises UserError, KeyError, ValueError or OSError for what is not as it should be."""
+        """Return one of them. Raises UserError, KeyError, ValueError or OSError for what is not as it should be."""
 
 
 @cache
 def known() -> dict[str, Reader]:
-    """All readers by name: those of dexsim, and what other packages add."""
+    """Return all readers by name: those of dexsim, and what other packages add."""
     out: dict[str, Reader] = {"lerobot": LeRobot(), "zarr": Zarr(), "hdf5": Hdf5(), "torch": Torch()}
     for name, point in door.installed(GROUP).items():
         if name not in out:
@@ -73,7 +73,7 @@ def known() -> dict[str, Reader]:
 
 
 def address(path: Path) -> tuple[Path, str]:
-    """(the file or folder, what follows `#`: its episodes, or nothing)."""
+    """Return (the file or folder, what follows `#`: its episodes, or nothing)."""
     if "#" not in path.name or path.exists():
         return path, ""
     name, _, part = path.name.rpartition("#")
@@ -81,7 +81,8 @@ def address(path: Path) -> tuple[Path, str]:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """What reads a path; None where it is no data set. Raises UserError for a pickle, which runs code when opened."""
+    """Return what reads a path; None where it is no data set. Raises UserError for a pickle, which runs code when
+    opened."""
     if path.suffix.lower() in PICKLES:
         raise UserError(
             f"recording {path}: a pickle runs what it holds when it is opened, and is not read; save plain arrays where"
@@ -103,7 +104,7 @@ def ready(reader: Reader, path: Path) -> int:
 
 
 def expanded(path: Path) -> list[Path]:
-    """The recordings that a path stands for: the episodes of a data set, those that follow `#`, or itself."""
+    """Return the recordings that a path stands for: the episodes of a data set, those that follow `#`, or itself."""
     base, part = address(path)
     if not base.exists():
         return [path]
@@ -126,7 +127,8 @@ def _count(path: Path) -> int:
 
 
 def numbers(text: str, count: int, where: str) -> list[int]:
-    """The numbers below count that `3`, `40:`, `:40` or `1:9:2` stand for. Raises UserError, which `where` begins."""
+    """Return the numbers below count that `3`, `40:`, `:40` or `1:9:2` stand for. Raises UserError, which `where`
+    begins."""
     if not re.fullmatch(r"-?\d+|(-?\d+)?:(-?\d+)?(:\d+)?", text):
         raise UserError(f"{where}: '{text}' must be a number or a slice, such as 3, 40: or :40")
     parts = [int(x) if x else None for x in text.split(":")]
@@ -140,7 +142,7 @@ def numbers(text: str, count: int, where: str) -> list[int]:
 
 
 def read_episode(path: Path, reader: Reader, part: str) -> Episode:
-    """The episode that `path#part` names; the only one where nothing is named. Raises UserError."""
+    """Return the episode that `path#part` names; the only one where nothing is named. Raises UserError."""
     count = reader.count(path)
     if not part and count > 1:
         raise UserError(f"recording {path}: holds {count} episodes; say which: {path.name}#0 to #{count - 1}")
@@ -168,15 +170,15 @@ _WORDS = re.compile(
 
 
 def quantity_of(name: str) -> tuple[str, str]:
-    """(quantity of an array by its name, or nothing; what of the name is not the quantity's)."""
+    """Return (quantity of an array by its name, or nothing; what of the name is not the quantity's)."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     kind = next((k for k, pattern in _KINDS if re.search(pattern, plain)), "")
     return kind, "_".join(w for w in plain.split("_") if w and not _WORDS.fullmatch(w))
 
 
 def of_arrays(arrays: Mapping[str, np.ndarray], names: Mapping[str, Sequence[str]], rate: float | None) -> Episode:
-    """An episode from arrays [T] or [T, J] by name, joints named by `names` of an array, or numbered; rate [Hz] where
-    no array is a time."""
+    """Return an episode from arrays [T] or [T, J] by name, joints named by `names` of an array, or numbered; rate [Hz]
+    where no array is a time."""
     out = Episode({})
     groups: dict[str, list[tuple[str, str, np.ndarray]]] = {}
     for name, x in arrays.items():
@@ -265,7 +267,7 @@ class LeRobot:
         return out
 
     def _place(self, path: Path, episode: int) -> dict[str, Any]:
-        """Where v3 keeps an episode: its chunk and file."""
+        """Return where v3 keeps an episode: its chunk and file."""
         for part in sorted((path / "meta" / "episodes").rglob("*.parquet")):
             for row in _table(part, ["data/chunk_index", "data/file_index"], episode).to_pylist():
                 return {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
@@ -283,7 +285,7 @@ def _table(path: Path, columns: Sequence[str], episode: int) -> Any:
 
 
 def _filled(pattern: str, place: Mapping[str, Any]) -> str:
-    """The path that a pattern such as data/chunk-{chunk_index:03d}/... gives; only whole numbers are put in."""
+    """Return the path that a pattern such as data/chunk-{chunk_index:03d}/... gives; only whole numbers are put in."""
 
     def one(found: re.Match[str]) -> str:
         return f"{int(place[found[1]]):0{int(found[2] or 0)}d}"
@@ -292,7 +294,7 @@ def _filled(pattern: str, place: Mapping[str, Any]) -> str:
 
 
 def _motors(names: Any, width: int) -> list[tuple[str, str]]:
-    """(quantity, joint) of each value of a LeRobot feature, by its names: a list, or lists under one word."""
+    """Return (quantity, joint) of each value of a LeRobot feature, by its names: a list, or lists under one word."""
     if isinstance(names, dict):
         names = [x for v in names.values() for x in (v if isinstance(v, list) else [v])]
     if not isinstance(names, list) or len(names) != width:
@@ -320,7 +322,7 @@ class Zarr:
         return zarr.open_group(zarr.storage.ZipStore(path) if path.is_file() else str(path), mode="r")
 
     def _groups(self, group: Any) -> list[str]:
-        """The groups that are an episode each; none where the arrays stand beside each other."""
+        """Return the groups that are an episode each; none where the arrays stand beside each other."""
         found = [k for k, g in group.groups() if k not in ("data", "meta") and any(True for _ in g.arrays())]
         return sorted(found, key=_natural)
 

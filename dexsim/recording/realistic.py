@@ -51,7 +51,7 @@ def realistic(
     current_per_torque: np.ndarray | float | None = None,
     hardware: Hardware = Hardware(),
 ) -> Recording:
-    """The recording as the hardware would have delivered it; the given one (dense, in N.m and N) is not changed.
+    """Return the recording as the hardware would have delivered it; the given one (dense, in N.m and N) is not changed.
 
     current_per_torque: A per N.m, [J] or one value; NaN or None: `CURRENT_PER_TORQUE`, said in the notes. Commands
     stay: the host knows what it sent. Speeds are left out, as by the vendor's driver. No latency is added.
@@ -97,12 +97,12 @@ def realistic(
 
 
 def _at(series: Series, t: np.ndarray) -> Series:
-    """Linear between samples."""
+    """Interpolate linearly between samples."""
     value = np.stack([np.interp(t, series.t, column) for column in series.value.T], 1)
     return Series(t, value, series.topic, t.copy())
 
 
 def _latest(series: Series, t: np.ndarray) -> Series:
-    """The last sample at each time."""
+    """Return the last sample at each time."""
     i = np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, None)
     return Series(t, series.value[i].copy(), series.topic)

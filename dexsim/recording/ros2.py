@@ -24,7 +24,7 @@ class BadDefinition(ValueError):
 
 @lru_cache(maxsize=64)  # a definition takes longer to read than a short recording's messages
 def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
-    """A function from the bytes of a message (CDR) to an object with its fields; arrays of numbers are NumPy's.
+    """Return a function from the bytes of a message (CDR) to an object with its fields; arrays of numbers are NumPy's.
 
     name: "pkg/msg/Name"; encoding: "ros2msg" or "ros2idl", as MCAP stores them. Raises BadDefinition; the function
     raises ValueError, or what the reading of a damaged message leads to."""

@@ -47,8 +47,8 @@ class ContactCheck:
             self._separate[a, b] = self._separate[b, a] = True
 
     def near(self, q: np.ndarray) -> list[tuple[str, str]]:
-        """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest, or, in a hand,
-        where these hold them)."""
+        """Return pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest, or, in a
+        hand, where these hold them)."""
         self.data.qpos[:] = self.model.qpos0
         if self._couplings is not None:
             self._couplings.put(self.data, q)
@@ -57,7 +57,7 @@ class ContactCheck:
         return self.near_qpos(self.data.qpos.copy())
 
     def near_qpos(self, qpos: np.ndarray) -> list[tuple[str, str]]:
-        """The same for a whole qpos [nq]."""
+        """Return the same for a whole qpos [nq]."""
         m, d = self.model, self.data
         d.qpos[:] = qpos
         mujoco.mj_kinematics(m, d)
@@ -70,7 +70,7 @@ class ContactCheck:
         return sorted(pairs)
 
     def along(self, run: Run) -> dict[tuple[str, str], float]:
-        """Pairs that came near, with the time of the first."""
+        """Return pairs that came near, with the time of the first."""
         out: dict[tuple[str, str], float] = {}
         for k, qpos in enumerate(run.qpos):
             for pair in self.near_qpos(qpos):
@@ -79,7 +79,7 @@ class ContactCheck:
 
 
 def peaks(m: Mechanism, run: Run, check: ContactCheck) -> Peaks:
-    """What a simulated run reached, over what is allowed."""
+    """Return what a simulated run reached, over what is allowed."""
     torque_limit, limits = m.column("torque_limit"), m.limits
     torque = np.abs(run.torque).max(0)
     excess = np.maximum(run.position - limits[:, 1], limits[:, 0] - run.position).max()

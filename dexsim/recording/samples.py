@@ -62,7 +62,7 @@ class JointRows(Sequence[JointSample]):
         return (JointSample(self.names, q, v, e, stamp or None) for q, v, e, stamp in rows)
 
     def take(self, which: np.ndarray | slice) -> JointRows:
-        """These samples, in this order."""
+        """Return these samples, in this order."""
         carried = None if self.carried is None else self.carried[which]
         position, velocity, effort, stamp = (x[which] for x in (self.position, self.velocity, self.effort, self.stamp))
         return JointRows(self.names, position, velocity, effort, stamp, carried)
@@ -77,11 +77,11 @@ class Reader(Generic[T]):
         self._one, self._stack = one, stack
 
     def __call__(self, data: bytes) -> T:
-        """One message; raises what a damaged one leads to."""
+        """Return one message; raises what a damaged one leads to."""
         return self._one(data)
 
     def together(self, messages: Sequence[bytes]) -> Sequence[T] | None:
-        """All messages, as one after another would be read; None where they are not of one layout."""
+        """Return all messages, as one after another would be read; None where they are not of one layout."""
         if self._stack is None or len(messages) < 2:
             return None
         try:

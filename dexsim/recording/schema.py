@@ -194,11 +194,11 @@ class Series:
         return len(self.t)
 
     def between(self, start: float, end: float) -> Series:
-        """The samples with start <= t < end [s]."""
+        """Return the samples with start <= t < end [s]."""
         return self.take((self.t >= start) & (self.t < end))
 
     def take(self, which: np.ndarray) -> Series:
-        """These samples: [T] bool, or their numbers."""
+        """Return these samples: [T] bool, or their numbers."""
         part = lambda x: None if x is None else x[which]  # noqa: E731
         return replace(
             self, t=self.t[which], value=self.value[which], stamp=part(self.stamp), carried=part(self.carried)
@@ -258,7 +258,8 @@ class Recording:
         return max([0.0, *(s.t[-1] for s in (self.commands, self.states.position) if len(s))])
 
     def targets(self, step: float = 0.005) -> Series:
-        """The commands as the servos are sent them: the points of trajectories joined, with a sample every `step` s."""
+        """Return the commands as the servos are sent them: the points of trajectories joined, with a sample every
+        `step` s."""
         c = self.commands
         if not c.lines or len(c) < 2:
             return c
@@ -273,8 +274,8 @@ class Recording:
         return Series(t, value, c.topic)
 
     def parts(self) -> list[Recording]:
-        """The recording as one for each group of joints that are told of in the same messages, without the messages of
-        others; itself where each message tells of all."""
+        """Return the recording as one for each group of joints that are told of in the same messages, without the
+        messages of others; itself where each message tells of all."""
         groups: dict[tuple[bytes, ...], list[int]] = {}
         told = [s.carried for s in (self.commands, self.states.position)]
         for j in range(len(self.joints)):
@@ -305,7 +306,7 @@ class Recording:
         )  # fmt: skip
 
     def _of(self, columns: list[int]) -> Recording:
-        """These joints, and the messages that tell of them."""
+        """Return these joints, and the messages that tell of them."""
 
         def own(s: Series | None) -> Series | None:
             if s is None or s.value.ndim != 2 or s.value.shape[1] != len(self.joints):
@@ -357,7 +358,7 @@ class Recording:
         return None if text == "unknown" else float(numbers(text, 1, "tactile_lsb", str(self.path))[0])
 
     def signed_effort(self) -> Series | None:
-        """Effort, positive along positive joint position; NaN where the sign is lost."""
+        """Return effort, positive along positive joint position; NaN where the sign is lost."""
         effort = self.states.effort
         if effort is None:
             return None
@@ -376,7 +377,7 @@ class Recording:
 
 
 def shown(text: str) -> str:
-    """A value as a message names it: one line, not long."""
+    """Return a value as a message names it: one line, not long."""
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
 
@@ -401,7 +402,7 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
 
 
 def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray:
-    """effort_sign [J]: one value for all, or one a joint; each -1, 0 or 1."""
+    """Return effort_sign [J]: one value for all, or one a joint; each -1, 0 or 1."""
     count = len(text.replace(",", " ").split())
     values = numbers(text, 1 if count == 1 else len(joints), "effort_sign", where)
     if not np.isin(values, (-1, 0, 1)).all():
@@ -412,5 +413,5 @@ def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray
 
 
 def joint_names(text: str) -> tuple[str, ...]:
-    """The comma-separated list of `joint_names`."""
+    """Return the comma-separated list of `joint_names`."""
     return tuple(name for name in text.replace(",", " ").split())

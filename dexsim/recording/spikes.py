@@ -33,8 +33,8 @@ AFTER = 0.06
 
 
 def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
-    """[T] bool: samples of x [T] that are single spikes (at most two in a row); none where x is not finite nearly
-    everywhere."""
+    """Return [T] bool: samples of x [T] that are single spikes (at most two in a row); none where x is not finite
+    nearly everywhere."""
     out = np.zeros(len(x), bool)
     ok = np.flatnonzero(np.isfinite(x))
     if len(ok) < 20:
@@ -82,8 +82,8 @@ def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
 
 
 def _jumps(v: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """[n] bool: of samples `far`, those of a stretch of at most `ROW` that begins and ends with a jump (`JUMP`); False
-    elsewhere."""
+    """Return [n] bool: of samples `far`, those of a stretch of at most `ROW` that begins and ends with a jump (`JUMP`);
+    False elsewhere."""
     out = np.zeros(len(v), bool)
     step = np.abs(np.diff(v))
     usual = np.where(far[1:] | far[:-1], np.nan, step)
@@ -100,8 +100,8 @@ def _jumps(v: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def _on_purpose(v: np.ndarray) -> np.ndarray:
-    """[n] bool: samples at a value that is held for three samples and more at least `LEVELS` times, between others that
-    are."""
+    """Return [n] bool: samples at a value that is held for three samples and more at least `LEVELS` times, between
+    others that are."""
     same = np.r_[False, np.abs(np.diff(v)) <= 1e-6 * max(float(np.ptp(v)), 1e-12)]
     start = np.flatnonzero(~same)
     length = np.diff(np.r_[start, len(v)])
@@ -112,7 +112,7 @@ def _on_purpose(v: np.ndarray) -> np.ndarray:
 
 
 def of_effort(r: Recording, j: int) -> np.ndarray:
-    """[T] bool: spikes of a joint's effort, but for those that a jump of its target may have caused."""
+    """Return [T] bool: spikes of a joint's effort, but for those that a jump of its target may have caused."""
     effort = r.states.effort
     assert effort is not None  # asked for where there is effort
     out = spiked(effort.value[:, j], "effort")

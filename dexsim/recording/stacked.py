@@ -73,7 +73,7 @@ def joint_state(data: bytes) -> list[Span] | None:
 
 
 def multi_array(data: bytes) -> list[Span] | None:
-    """The values of a std_msgs/Float32MultiArray; None where it is none."""
+    """Return the values of a std_msgs/Float32MultiArray; None where it is none."""
     c = _Cursor(data)
     try:
         for _ in range(c.count()):
@@ -103,8 +103,8 @@ def _whole(c: _Cursor) -> bool:
 
 
 def take(messages: Sequence[bytes], spans: Sequence[Span]) -> list[np.ndarray] | None:
-    """The numbers [T, n] of each span of T messages; None where they differ in length, or in any byte that is not of
-    these numbers."""
+    """Return the numbers [T, n] of each span of T messages; None where they differ in length, or in any byte that is
+    not of these numbers."""
     size = len(messages[0])
     if not size or any(len(m) != size for m in messages):
         return None
@@ -126,7 +126,7 @@ def take(messages: Sequence[bytes], spans: Sequence[Span]) -> list[np.ndarray] |
 
 
 def nanoseconds(seconds: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """[T] int64 ns of stamps [T, 1] s and [T, 1] ns; 0 where unset."""
+    """Return [T] int64 ns of stamps [T, 1] s and [T, 1] ns; 0 where unset."""
     return (seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64))[:, 0]
 
 
@@ -134,12 +134,12 @@ def nanoseconds(seconds: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two arrays are the same to the last bit."""
+    """Return whether two arrays are the same to the last bit."""
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
 def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
-    """Joint states of one layout; None where they are not. one: the first, as the standard decoder reads it."""
+    """Return joint states of one layout; None where they are not. one: the first, as the standard decoder reads it."""
     spans = joint_state(messages[0])
     found = None if spans is None else take(messages, spans)
     if found is None:
@@ -154,7 +154,7 @@ def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
 
 
 def array_rows(messages: Sequence[bytes], one: Array) -> list[Array] | None:
-    """Arrays of one layout; None where they are not. one: the first, as the standard decoder reads it."""
+    """Return arrays of one layout; None where they are not. one: the first, as the standard decoder reads it."""
     spans = multi_array(messages[0])
     found = None if spans is None else take(messages, spans)
     if found is None:
@@ -174,7 +174,7 @@ class Plain:
     missing: tuple[tuple[int, slice], ...] = ()
 
     def rows(self, messages: Sequence[bytes], one: Vector) -> list[Vector] | None:
-        """Vectors of one layout; None where they are not. one: the first, as it is read by itself."""
+        """Return vectors of one layout; None where they are not. one: the first, as it is read by itself."""
         spans = plain(messages[0], self.count)
         found = None if spans is None else take(messages, spans)
         if found is None:

@@ -30,8 +30,8 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 @cache
 def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.Kernel, Any]:
-    """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
-    object's pose and the angles of measured joints without a drive. The slot written goes round, and is kept on the
+    """Return one row of each chosen world: time, then reported position, speed and motor torque of every joint, then
+    the object's pose and the angles of measured joints without a drive. The slot written goes round, and is kept on the
     device so that the launch can be part of a graph. features: of the servo, those of `columns.FEATURES`. The kernel,
     and the struct that it takes, shapes and units as in `servo.Servo`."""
     encoder, Memory = encoder_error(features), wp.types.vector(len(MEMORY), real)
@@ -99,8 +99,8 @@ def tap(
     kind: Any, engine: Any, servo: Servo, q_index: np.ndarray, v_index: np.ndarray, object_q: int,
     sensed_q: np.ndarray,
 ) -> Any:  # fmt: skip
-    """The struct of a `copy_kernel` with an engine's and its servo's arrays; where joints, object and joints without a
-    drive are in the state."""
+    """Return the struct of a `copy_kernel` with an engine's and its servo's arrays; where joints, object and joints
+    without a drive are in the state."""
     made = kind()
     made.sensed_q = wp.array(sensed_q, dtype=int)
     made.q_index, made.v_index, made.object_q = wp.array(q_index, dtype=int), wp.array(v_index, dtype=int), object_q
@@ -220,7 +220,7 @@ class PlayRecorder:
                 track.add(about, turned, rows, target, gravity, done, rest[4] if len(rest) > 4 else None)
 
     def recordings(self) -> list[Recording]:
-        """What was recorded so far, one a world that has anything."""
+        """Return what was recorded so far, one a world that has anything."""
         self._fetch()
         for track in self.tracks:
             track.finish()
@@ -228,8 +228,8 @@ class PlayRecorder:
 
     @staticmethod
     def place(path: str | Path) -> Path:
-        """`path` as a file that can be written, its folder made. Raises UserError: before a long play, rather than
-        after it."""
+        """Return `path` as a file that can be written, its folder made. Raises UserError: before a long play, rather
+        than after it."""
         path = Path(path).expanduser()
         path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
         there = path.exists()
@@ -249,7 +249,7 @@ class PlayRecorder:
             outputs.new(to, "record=")
 
     def _paths(self, path: Path) -> dict[int, Path]:
-        """World -> its file."""
+        """Return world -> its file."""
         if len(self.tracks) == 1:
             return {self.tracks[0].world: path}
         return {t.world: path.with_name(f"{path.stem}_w{t.world}.mcap") for t in self.tracks}
@@ -321,13 +321,13 @@ class PlayRecorder:
         ).with_followers(self.env.hand.sensed, rows[:, 8 + 3 * J :])
 
     def _believed(self) -> dict[str, Any] | None:
-        """The drives as the policy believes them, where it plays in another world (reality=), which does not tell its
-        own: a recording from there says no more than one of a real hand."""
+        """Return the drives as the policy believes them, where it plays in another world (reality=), which does not
+        tell its own: a recording from there says no more than one of a real hand."""
         belief = self.config.get("belief")
         return ServoTable.from_dict(belief["servo"]).to_dict() if belief else None
 
     def _world(self, index: int, about: list[np.ndarray]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What differs in a world: object and drives, as plain data."""
+        """Return what differs in a world: object and drives, as plain data."""
         params, variant, size, mass, friction, stiffness, damping = about
         shape = self.env.objects.scene.variants[int(variant)].shape
         servo = {

@@ -17,7 +17,7 @@ LOST = 0.3
 
 
 def kept(t: np.ndarray) -> np.ndarray:
-    """[T] bool: the samples whose times t [T] s, in the order they were written, can be theirs.
+    """Return [T] bool: the samples whose times t [T] s, in the order they were written, can be theirs.
 
     Where times only change places (by less than REORDERED), all can. Else the longest series of times that never goes
     back, of those that do not stand far from all others (ALONE, FEW). O(T log T)."""
@@ -35,7 +35,7 @@ def kept(t: np.ndarray) -> np.ndarray:
 
 
 def _outliers(t: np.ndarray) -> np.ndarray:
-    """[T] bool: times in groups of less than FEW of all, ALONE s from the next."""
+    """Return [T] bool: times in groups of less than FEW of all, ALONE s from the next."""
     order = np.argsort(t, kind="stable")
     group = np.cumsum(np.r_[0, np.diff(t[order]) > ALONE])
     few = np.bincount(group) <= FEW * len(t)
@@ -45,7 +45,7 @@ def _outliers(t: np.ndarray) -> np.ndarray:
 
 
 def _longest(t: np.ndarray) -> np.ndarray:
-    """Indices of the longest series of times that never goes back (patience sorting)."""
+    """Return indices of the longest series of times that never goes back (patience sorting)."""
     tails: list[float] = []
     at: list[int] = []
     before = np.full(len(t), -1)
@@ -83,8 +83,8 @@ def gaps(t: np.ndarray, on: np.ndarray) -> list[tuple[float, float]]:
 
 
 def stretch(t: np.ndarray, pause: float = 1.0) -> tuple[float, float]:
-    """(first, last) time [s] of the longest series of samples at times t [T] s, sorted, without a pause as long: what
-    is laid on an even grid is laid over this, never over all that the stamps span."""
+    """Return (first, last) time [s] of the longest series of samples at times t [T] s, sorted, without a pause as long:
+    what is laid on an even grid is laid over this, never over all that the stamps span."""
     edges = np.r_[0, np.flatnonzero(np.diff(t) > pause) + 1, len(t)]
     k = int(np.argmax(np.diff(edges)))
     return float(t[edges[k]]), float(t[edges[k + 1] - 1])

@@ -60,7 +60,7 @@ class Unit:
     turn: float = 0.0
 
     def __call__(self, x: np.ndarray, rate: bool = False) -> np.ndarray:
-        """Values x in SI; rate: by second, where an offset is none."""
+        """Return values x in SI; rate: by second, where an offset is none."""
         out = np.asarray(self.scale * x + (0.0 if rate else self.offset))
         known = x[np.isfinite(x)]
         if not rate and self.turn and len(known) and 0 <= known.min() and known.max() <= self.turn:
@@ -70,8 +70,8 @@ class Unit:
 
 
 def parse(text: str, quantity: str, where: str, limits: tuple[float, float] | None = None) -> Unit:
-    """The unit that `text` states. limits: of the joint [rad or m], for units along its range. Raises UserError, which
-    `where` begins (file and setting)."""
+    """Return the unit that `text` states. limits: of the joint [rad or m], for units along its range. Raises UserError,
+    which `where` begins (file and setting)."""
     plain = UNITS[quantity].get(text.lower())
     if plain is not None:
         return Unit(plain, 0.0, text)
@@ -113,7 +113,7 @@ class Units:
                 raise UserError(f"{where}: units.{key}: no such quantity.{did_you_mean(quantity, list(UNITS))}")
 
     def of(self, quantity: str, joint: str) -> Unit | None:
-        """The unit that is stated; None where none is."""
+        """Return the unit that is stated; None where none is."""
         asked = [f"{quantity}.{joint}", quantity]
         if quantity in ("command", "velocity"):
             asked += [f"position.{joint}", "position"]
@@ -125,8 +125,8 @@ class Units:
         return None
 
     def guess(self, joint: str, command: np.ndarray, position: np.ndarray) -> Unit | None:
-        """What command [K] and position [S] of a joint, of no stated unit, must be in; None where rad is possible, or
-        several units are: both whole numbers, as a drive's registers have them."""
+        """Return what command [K] and position [S] of a joint, of no stated unit, must be in; None where rad is
+        possible, or several units are: both whole numbers, as a drive's registers have them."""
         both = [x[np.isfinite(x)] for x in (command, position)]
         if any(len(x) < 5 or (x != np.round(x)).any() for x in both) or np.ptp(both[1]) < 20:
             return None
@@ -140,7 +140,7 @@ class Units:
 
 
 def split(meta: Mapping[str, object]) -> tuple[dict[str, object], dict[str, str]]:
-    """(metadata without units, what is stated of units): keys "units.position" or a mapping under "units"."""
+    """Return (metadata without units, what is stated of units): keys "units.position" or a mapping under "units"."""
     rest: dict[str, object] = {}
     found: dict[str, str] = {}
     for key, value in meta.items():

@@ -15,7 +15,7 @@ PEAK = 1.875  # peak over mean speed of a minimum-jerk move
 
 
 def minimum_jerk(start: np.ndarray | float, end: np.ndarray | float, seconds: float, dt: float) -> np.ndarray:
-    """A move at rest on both ends (Flash and Hogan 1985), without its first sample."""
+    """Return a move at rest on both ends (Flash and Hogan 1985), without its first sample."""
     n = max(2, round(seconds / dt))
     s = np.arange(1, n + 1) / n
     s = s**3 * (10 - 15 * s + 6 * s**2)
@@ -23,7 +23,7 @@ def minimum_jerk(start: np.ndarray | float, end: np.ndarray | float, seconds: fl
 
 
 def through(points: Sequence[float], speed: float, dt: float) -> np.ndarray:
-    """Straight lines between points at one speed, from 0 and back to 0."""
+    """Return a path of straight lines between points at one speed, from 0 and back to 0."""
     out, at = [np.zeros(1)], 0.0
     for point in (*points, 0.0):
         n = max(1, round(abs(point - at) / speed / dt + 0.499))
@@ -33,7 +33,7 @@ def through(points: Sequence[float], speed: float, dt: float) -> np.ndarray:
 
 
 def triangles(a: float, v: float, dt: float, rng: np.random.Generator) -> np.ndarray:
-    """Over the whole range in about 12 s, then a small one four times slower: friction, play, ripple."""
+    """Move over the whole range in about 12 s, then a small one four times slower: friction, play, ripple."""
     slow = max(4 * a / 12.0, 0.02 * v)
     return np.concatenate([through((a, -a), min(slow, v), dt), through((0.15 * a, -0.15 * a), min(slow / 4, v), dt)])
 
@@ -48,7 +48,7 @@ def ladder(a: float, v: float, dt: float, rng: np.random.Generator) -> np.ndarra
 def chirp(
     a: float, v: float, dt: float, rng: np.random.Generator, low: float = 0.3, high: float = 8.0, seconds: float = 12.0
 ) -> np.ndarray:
-    """A sine from 0.3 to 8 Hz, smaller as it gets faster: delay, lag, inertia, elasticity."""
+    """Return a sine from 0.3 to 8 Hz, smaller as it gets faster: delay, lag, inertia, elasticity."""
     t = np.arange(0, seconds, dt)
     rate = np.log(high / low) / seconds
     f = low * np.exp(rate * t)

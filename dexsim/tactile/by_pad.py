@@ -238,9 +238,9 @@ class Skins:
 
 @cache
 def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
-    """One thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under each
-    taxel, in place of the law in `dexsim.tactile.kernel`; the sum stays the solver's. A contact that reaches no taxel
-    stays as it is. With sum=spring the taxels' forces are the rubber's own. One object."""
+    """Return one thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under
+    each taxel, in place of the law in `dexsim.tactile.kernel`; the sum stays the solver's. A contact that reaches no
+    taxel stays as it is. With sum=spring the taxels' forces are the rubber's own. One object."""
 
     def spread(
         here: Surroundings,

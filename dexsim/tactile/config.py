@@ -109,7 +109,7 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
 
 
 def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
-    """Foundation stiffness of each pad by its kind, in the unit of the force law (`STIFFNESS_UNITS`)."""
+    """Return the foundation stiffness of each pad by its kind, in the unit of the force law (`STIFFNESS_UNITS`)."""
     given = cfg.stiffness.get(cfg.law, {})
     out = []
     for kind in kinds:

@@ -271,7 +271,7 @@ def touch_kernel(
     shared: bool = False,
     registers: int = 0,
 ) -> wp.Kernel:
-    """The kernel for one choice of options; dimensions: [N, F] threads (serial) or N * F * 32 (lanes).
+    """Return the kernel for one choice of options; dimensions: [N, F] threads (serial) or N * F * 32 (lanes).
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
     the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the

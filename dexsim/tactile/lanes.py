@@ -47,19 +47,19 @@ _BALLOT = _EXCHANGE.format(
 
 @wp.func_native(_XOR)
 def lane_xor(v: float, mask: int) -> float:  # type: ignore[empty-body]
-    """The value of the lane whose number differs by the bits of `mask`."""
+    """Return the value of the lane whose number differs by the bits of `mask`."""
     ...
 
 
 @wp.func_native(_FROM)
 def lane_from(v: float, lane: int) -> float:  # type: ignore[empty-body]
-    """The value of one lane."""
+    """Return the value of one lane."""
     ...
 
 
 @wp.func_native(_BALLOT)
 def lane_ballot(yes: bool) -> int:  # type: ignore[empty-body]
-    """Bit k: whether lane k says yes."""
+    """Return bit k: whether lane k says yes."""
     ...
 
 

@@ -52,13 +52,14 @@ class TaxelLayout:
         return self.point.shape[1]
 
     def centre(self) -> np.ndarray:
-        """Area-weighted centre of each pad [F, 3] [m], body frame: the centre reported while the force is zero."""
+        """Return area-weighted centre of each pad [F, 3] [m], body frame: the centre reported while the force is
+        zero."""
         w = self.area / self.area.sum(1, keepdims=True)
         return np.einsum("ft,ftk->fk", w, self.point)
 
     def beside(self, pad: int) -> np.ndarray:
-        """Taxels beside each taxel of a pad in its lattice, [count, 4], -1 where there is none. UserError without a
-        lattice."""
+        """Return taxels beside each taxel of a pad in its lattice, [count, 4], -1 where there is none. UserError
+        without a lattice."""
         n, rows = int(self.count[pad]), self.rows[pad]
         if not rows or n % rows:
             raise UserError(
@@ -149,7 +150,8 @@ class TaxelLayout:
 
 
 def gap_to_hull(point: np.ndarray, normal: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distance [n] along each normal from points [n, 3] to the convex hull of corners [V, 3]: negative from outside."""
+    """Return distance [n] along each normal from points [n, 3] to the convex hull of corners [V, 3]: negative from
+    outside."""
     return _gap(*(np.ascontiguousarray(x, dtype=float).tobytes() for x in (point, normal, corners))).copy()
 
 
@@ -165,7 +167,7 @@ def _gap(point: bytes, normal: bytes, corners: bytes) -> np.ndarray:
 
 
 def neighbours(columns: int, rows: int) -> list[list[int]]:
-    """Taxels beside each taxel of a lattice, k = column * rows + row."""
+    """Return taxels beside each taxel of a lattice, k = column * rows + row."""
     out = []
     for k in range(columns * rows):
         c, r = divmod(k, rows)
@@ -289,7 +291,8 @@ def tip_layout(hand: Hand) -> TaxelLayout:
 
 
 def tip_points(model: mujoco.MjModel, geoms: Sequence[str]) -> list[np.ndarray]:
-    """Corners [V, 3] (m, body frame) of the tips' collision meshes in a `mujoco.MjModel`: what other pads can feel."""
+    """Return corners [V, 3] (m, body frame) of the tips' collision meshes in a `mujoco.MjModel`: what other pads can
+    feel."""
     import mujoco
 
     out = []

@@ -81,7 +81,7 @@ def counts(f: float, lsb: float, low: float, high: float):
 
 @cache
 def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
-    """One thread per (world, pad, taxel): felt force in, reading of this moment into slot `tick` of the ring."""
+    """Return one thread per (world, pad, taxel): felt force in, reading of this moment into slot `tick` of the ring."""
 
     def measure_taxels(
         felt: wp.array3d(dtype=float),

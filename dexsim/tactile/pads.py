@@ -107,7 +107,7 @@ def pad_configs(value: Mapping[str, Any]) -> dict[str, PadConfig]:
 
 
 def _plain(node: object) -> object:
-    """Other mappings and sequences (a config's) as dicts and lists; names as text."""
+    """Return other mappings and sequences (a config's) as dicts and lists; names as text."""
     if isinstance(node, Mapping):
         return {k if isinstance(k, int) else str(k): _plain(v) for k, v in node.items()}
     return [_plain(v) for v in node] if isinstance(node, Sequence) and not isinstance(node, str) else node

@@ -64,7 +64,8 @@ def skin_of(
 def surface_points(
     rng: np.random.Generator, shape: Shape, size: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Random points of an object's surface, by area, and the outward normals there (object frame), without end."""
+    """Yield random points of an object's surface, by area, and the outward normals there (object frame), without
+    end."""
     kind = shape.kind
     if kind == "grid":
         from dexsim.assets.objects.geometry import union_boundary

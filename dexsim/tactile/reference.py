@@ -32,7 +32,7 @@ def sd_cylinder(q: np.ndarray, radius: float, half: float) -> np.ndarray:
 
 
 def sd_grid(q: np.ndarray, grid: Grid) -> np.ndarray:
-    """Trilinear; outside the grid sqrt(gap^2 + value at the nearest point of the box ^2)."""
+    """Interpolate trilinearly; outside the grid sqrt(gap^2 + value at the nearest point of the box ^2)."""
     q = np.asarray(q, dtype=float)
     top = np.array(grid.data.shape) - 1
     g = (q - grid.origin) / grid.spacing
@@ -48,7 +48,7 @@ def sd_grid(q: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None) -> np.ndarray:
-    """Signed distance [m]; size as in `dexsim.tactile.sdf`."""
+    """Return signed distance [m]; size as in `dexsim.tactile.sdf`."""
     if kind == "box":
         return sd_box(q, np.asarray(size))
     if kind == "sphere":
@@ -62,7 +62,7 @@ def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = Non
 
 
 def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None, eps: float = 1e-6) -> np.ndarray:
-    """Outward unit normal [..., 3] at the nearest surface point: the gradient of the distance."""
+    """Return outward unit normal [..., 3] at the nearest surface point: the gradient of the distance."""
     g = np.stack(
         [distance(kind, size, q + e, grid) - distance(kind, size, q - e, grid) for e in eps * np.eye(3)], axis=-1
     )
@@ -70,8 +70,9 @@ def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None,
 
 
 def sampled_depth(taxels: np.ndarray, points: np.ndarray, normals: np.ndarray, nearest: int = 1) -> np.ndarray:
-    """Depth [n] (m, 0 without contact) of taxels [n, 3] in a surface given by samples, as the paper words it: v = taxel
-    - sample, contact when v . n < 0; the `nearest` samples are blended with weights 1 / |v|^2 (one: the paper's p_o).
+    """Return depth [n] (m, 0 without contact) of taxels [n, 3] in a surface given by samples, as the paper words it: v
+    = taxel - sample, contact when v . n < 0; the `nearest` samples are blended with weights 1 / |v|^2 (one: the paper's
+    p_o).
 
     The depth along the normal, -v . n, is blended rather than |v|, which would add the distance between samples.
     """
@@ -97,7 +98,7 @@ def hertz_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.nda
 
 
 def mooney_rivlin_force(depth: np.ndarray, area: np.ndarray, thickness: float, c10: float, c01: float) -> np.ndarray:
-    """Uniaxial compression, stretch l = 1 - depth / thickness: pressure 2 (l^-2 - l) (c10 + c01 / l)."""
+    """Return uniaxial compression, stretch l = 1 - depth / thickness: pressure 2 (l^-2 - l) (c10 + c01 / l)."""
     stretch = 1.0 - np.minimum(np.maximum(depth, 0.0) / thickness, MAX_STRAIN)
     return area * 2.0 * (stretch**-2 - stretch) * (c10 + c01 / stretch)
 

@@ -73,7 +73,7 @@ def sd_cylinder(q: wp.vec3, radius: float, half: float):
 #endif
 """)
 def load4(data: wp.array(dtype=wp.vec4), i: int) -> wp.vec4:
-    """data[i] in one 16-byte load."""
+    """Load data[i] in one 16-byte load."""
     ...
 
 

@@ -53,13 +53,13 @@ class Sensors:
             return self._pads
 
     def lattice(self, pad: int) -> tuple[int, int] | None:
-        """Columns and rows of the lattice that a pad's taxels form, k = column * rows + row; None where none is
+        """Return columns and rows of the lattice that a pad's taxels form, k = column * rows + row; None where none is
         known."""
         rows = self._pads.rows[pad]
         return (int(self._pads.count[pad]) // rows, rows) if rows else None
 
     def beside(self, pad: int) -> list[list[int]]:
-        """Taxels beside each taxel of a pad: in its lattice, or by where they lie where there is none."""
+        """Return taxels beside each taxel of a pad: in its lattice, or by where they lie where there is none."""
         lattice = self.lattice(pad)
         if lattice is not None:
             return neighbours(*lattice)
@@ -92,8 +92,8 @@ class Sensors:
 
 
 def _gabriel(p: np.ndarray) -> list[list[int]]:
-    """Neighbours of each of points [K, 3] in their Gabriel graph: two with no other in the ball between them. Of a
-    rectangular lattice those are the four beside."""
+    """Return neighbours of each of points [K, 3] in their Gabriel graph: two with no other in the ball between them. Of
+    a rectangular lattice those are the four beside."""
     out: list[list[int]] = [[] for _ in p]
     for i in range(len(p)):
         for j in range(i):

@@ -108,8 +108,8 @@ def _laid_out(shapes: list[Felt], device: str) -> _LaidOut:
 
 
 def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-3) -> Grid:
-    """Distance grid [m] of the convex hull of points [n, 3]: exact inside (largest of the face planes' distances) and
-    on faces; near an edge outside it is a lower bound, which no contact reads."""
+    """Return distance grid [m] of the convex hull of points [n, 3]: exact inside (largest of the face planes'
+    distances) and on faces; near an edge outside it is a lower bound, which no contact reads."""
     from scipy.spatial import ConvexHull
 
     planes = ConvexHull(points).equations
@@ -178,7 +178,7 @@ def _cells(d: np.ndarray) -> np.ndarray:
 
 
 def _surface_bound(g: Grid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Radius about the frame's origin, and middle and half sizes of a box, that hold every cell with a corner
+    """Return radius about the frame's origin, and middle and half sizes of a box, that hold every cell with a corner
     inside."""
     points = [np.argwhere(g.data <= limit) * g.spacing + g.origin for limit in (g.spacing, 0.0)]
     radius = np.sqrt((points[0] ** 2).sum(1).max()) + np.sqrt(3.0) * g.spacing

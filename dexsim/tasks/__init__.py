@@ -30,7 +30,7 @@ def __getattr__(name: str) -> Any:
 
 
 def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: Any = None) -> HandEnv:
-    """The environment of a resolved configuration: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
+    """Return the environment of a resolved configuration: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
 
     cfg: as a plain dict; its task's class is found by `dexsim.tasks.registry`. engine: "auto", "warp" or "mujoco".
     grasps: held poses that rotation begins with (`tasks.stable_grasps.GraspSet`); by default those of

@@ -33,16 +33,16 @@ SHAKE, SHAKE_HZ, SHAKES = 0.02, 3.0, 2  # m either way, 1/s, periods along the f
 
 
 def lifted(t: float) -> np.ndarray:
-    """Acceleration [3] m/s2, palm frame, t s after the lift begins: x(s) = LIFT (10 s^3 - 15 s^4 + 6 s^5), s = t /
-    LIFT_S."""
+    """Return acceleration [3] m/s2, palm frame, t s after the lift begins: x(s) = LIFT (10 s^3 - 15 s^4 + 6 s^5), s = t
+    / LIFT_S."""
     s = t / LIFT_S
     inside = 0.0 <= s <= 1.0
     return np.array([0.0, 0.0, LIFT / LIFT_S**2 * (60 * s - 180 * s**2 + 120 * s**3) if inside else 0.0])
 
 
 def shaken(t: float) -> np.ndarray:
-    """Acceleration [3] m/s2, palm frame, t s after the shaking begins: SHAKE (1 - cos w t) along x for SHAKES periods,
-    then along y; at rest before and after."""
+    """Return acceleration [3] m/s2, palm frame, t s after the shaking begins: SHAKE (1 - cos w t) along x for SHAKES
+    periods, then along y; at rest before and after."""
     w, span = 2 * np.pi * SHAKE_HZ, SHAKES / SHAKE_HZ
     out = np.zeros(3)
     if 0.0 <= t < 2 * span:
@@ -77,8 +77,8 @@ def of(setting: str) -> Base:
 
 
 def along(path: Path) -> tuple[Callable[[float], np.ndarray], float]:
-    """(gravity [3] m/s2 in the frame of a palm that is carried along a file's path, by time [s]; how long the path is
-    [s]). Cubic splines, at rest at both ends. Raises UserError."""
+    """Return (gravity [3] m/s2 in the frame of a palm that is carried along a file's path, by time [s]; how long the
+    path is [s]). Cubic splines, at rest at both ends. Raises UserError."""
     t, x, turn = _read(path)
     where = f"task.evaluation.base={path}"
     place = CubicSpline(t, x, bc_type="clamped")

@@ -64,7 +64,7 @@ class HandEnv(Kept):
 
     @classmethod
     def config(cls) -> dict[str, Any]:
-        """The settings of a task that has them in its class; see `dexsim.tasks.Task`. Raises UserError."""
+        """Return the settings of a task that has them in its class; see `dexsim.tasks.Task`. Raises UserError."""
         raise UserError(f"{cls.__name__}: its settings stand in a file; derive from dexsim.tasks.Task for your own")
 
     @classmethod
@@ -124,7 +124,7 @@ class HandEnv(Kept):
         self.touch.launch()
 
     def terminated(self) -> dict[str, torch.Tensor]:
-        """Named terminations, bool [N] each."""
+        """Return named terminations, bool [N] each."""
         raise NotImplementedError
 
     def reward_words(self) -> dict[str, str]:
@@ -148,7 +148,7 @@ class HandEnv(Kept):
         return [(name, weight, words[name]) for name, weight in self.task["rewards"].items()]
 
     def rewards(self) -> dict[str, torch.Tensor]:
-        """Named reward terms, weighted, [N] each."""
+        """Return named reward terms, weighted, [N] each."""
         raise NotImplementedError
 
     @property
@@ -174,9 +174,9 @@ class HandEnv(Kept):
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """One control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are reset, and
-        their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds), and with
-        `keep_final_obs` also "final_obs", the observations before the reset."""
+        """Return one control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are
+        reset, and their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds), and
+        with `keep_final_obs` also "final_obs", the observations before the reset."""
         self._steps_since += 1
         self._action_in.copy_(actions)
         self._replay("before", self._before)
@@ -194,7 +194,7 @@ class HandEnv(Kept):
         return observations, reward, done, extras
 
     def results(self) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """What `step` returns, copied: the next step writes over the environment's own."""
+        """Return what `step` returns, copied: the next step writes over the environment's own."""
         assert self._log_values is not None  # since the first step
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         extras = {"time_outs": self.time_out.clone(), "log": log}
@@ -327,7 +327,7 @@ class HandEnv(Kept):
         self._log_values.copy_(values)
 
     def metrics(self) -> dict[str, torch.Tensor]:
-        """Task metrics for the log, scalars on the device."""
+        """Return task metrics for the log, scalars on the device."""
         return {}
 
     def check(self) -> None:
@@ -361,11 +361,11 @@ class HandEnv(Kept):
             )
 
     def usual_ends(self) -> list[tuple[str, str]]:
-        """Rows of the ends that every task has."""
+        """Return rows of the ends that every task has."""
         return [("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")]
 
     def describe(self) -> dict[str, Any]:
-        """Tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
+        """Return tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
         "terminations", "randomization", "notes", and "headline", names of the log that the console shows."""
         return {
             "observations": {group: [(group, value.shape[1], "")] for group, value in self.obs.items()},
@@ -377,7 +377,7 @@ class HandEnv(Kept):
         }
 
     def figure_units(self) -> dict[str, str]:
-        """Units of the figures in `last`, which an evaluation reports."""
+        """Return units of the figures in `last`, which an evaluation reports."""
         return dict.fromkeys(self.last, "")
 
     def judge_kept_out(self, kept_out: bool) -> None:

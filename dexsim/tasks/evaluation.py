@@ -75,7 +75,7 @@ def _episodes(
 def _play(
     env: HandEnv, policy: Policy, film: bool, progress: Progress | None, before: int, episodes: int
 ) -> tuple[dict[str, np.ndarray], dict | None]:
-    """An episode in every world."""
+    """Return an episode in every world."""
     n, dev = env.num_envs, env.device
     env.reset_all()
     getattr(policy, "reset", lambda *_: None)()

@@ -22,7 +22,7 @@ from dexsim.tasks.terms import VECTOR, done, observe
 
 
 def _is_range(pair: Any) -> bool:
-    """Two numbers, 0 <= low <= high <= 1."""
+    """Return two numbers, 0 <= low <= high <= 1."""
     if not isinstance(pair, list) or len(pair) != 2:
         return False
     return all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in pair) and 0 <= pair[0] <= pair[1] <= 1
@@ -240,7 +240,7 @@ class GraspEnv(Launches):
         return [f"F_max = {self.f_max:.2f} N a fingertip: static press at {tau:.2f} N.m (command 1)"]
 
     def describe(self) -> dict:
-        """Tables for the first screen."""
+        """Return tables for the first screen."""
         return super().describe() | {"headline": ["task/held", "task/force_error"]}
 
     def evaluate(
@@ -256,7 +256,7 @@ class GraspEnv(Launches):
         return evaluate(self, policy, episodes, seed, progress)
 
     def scripted_policy(self, rate: float = 0.5, wait: float = 0.35) -> Callable[[Mapping], torch.Tensor]:
-        """A policy without learning; see `tasks/grasp_eval.py`."""
+        """Return a policy without learning; see `tasks/grasp_eval.py`."""
         from dexsim.tasks.grasp_eval import scripted
 
         return scripted(self, rate, wait)

@@ -104,7 +104,7 @@ def _play(
     done: int,
     episodes: int,
 ) -> dict:
-    """One episode in every world."""
+    """Return one episode in every world."""
     n, dev, dt, base = env.num_envs, env.device, env.dt, _base(env)
     steps = int(round((SETTLE + HOLD + sum(base.stages)) / dt))
     training_length, env.max_episode_length = env.max_episode_length, steps + 2
@@ -213,38 +213,39 @@ def _play(
 
 
 def _angle(t: float) -> float:
-    """Angle [rad] by which the hand is turned at time t."""
+    """Return angle [rad] by which the hand is turned at time t."""
     first = SETTLE + HOLD
     second = first + TURN_S + STAY_S
     return np.pi / 2 * (np.clip((t - first) / TURN_S, 0, 1) + np.clip((t - second) / TURN_S, 0, 1))
 
 
 def _base(env: GraspEnv) -> base_path.Base:
-    """What the base goes through after the hold; checkpoints from before cannot say."""
+    """Return what the base goes through after the hold; checkpoints from before cannot say."""
     return base_path.of((env.task.get("evaluation") or {}).get("base", "turn"))
 
 
 def _carried(base: base_path.Base, down: torch.Tensor, t: float) -> torch.Tensor:
-    """Gravity [N, 3] m/s2 of a hand whose base moves after the hold."""
+    """Return gravity [N, 3] m/s2 of a hand whose base moves after the hold."""
     assert base.gravity is not None  # it is turned instead
     g = base.gravity(t - SETTLE - HOLD) if t > SETTLE + HOLD else base_path.GRAVITY
     return torch.as_tensor(g, dtype=down.dtype, device=down.device).expand_as(down)
 
 
 def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
-    """v [N, 3] rotated about unit axes [N, 3] (Rodrigues)."""
+    """Return v [N, 3] rotated about unit axes [N, 3] (Rodrigues)."""
     c, s = float(np.cos(angle)), float(np.sin(angle))
     return v * c + torch.linalg.cross(axis, v) * s + axis * (axis * v).sum(1, keepdim=True) * (1 - c)
 
 
 def must_hold(r: dict, f_max: float, fingers: int) -> np.ndarray:
-    """Episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, summed over
-    the fingers beside the opposing one, a_push in its drawn direction (zero in episodes without a push)."""
+    """Return episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu,
+    summed over the fingers beside the opposing one, a_push in its drawn direction (zero in episodes without a push)."""
     return fingers * r["command"] * f_max >= 2 * r["load"] / r["friction"]
 
 
 def can_carry(r: dict, f_max: float, fingers: int) -> np.ndarray:
-    """Episodes [E] whose commanded forces can carry the object's weight alone: sum_i F_cmd F_max >= 2 m g / mu."""
+    """Return episodes [E] whose commanded forces can carry the object's weight alone: sum_i F_cmd F_max >= 2 m g /
+    mu."""
     return fingers * r["command"] * f_max >= 2 * r["mass"] * 9.81 / r["friction"]
 
 
@@ -309,19 +310,19 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
 
 
 def _rate_interval(ok: np.ndarray, among: np.ndarray) -> list[float] | None:
-    """95 % of `_rate` (Wilson's)."""
+    """Return 95 % of `_rate` (Wilson's)."""
     return list(intervals.share(int(ok[among].sum()), int(among.sum()))) if among.any() else None
 
 
 def _corr_interval(a: np.ndarray, b: np.ndarray) -> list[float] | None:
-    """95 % bootstrap over episodes of `_corr`."""
+    """Return 95 % bootstrap over episodes of `_corr`."""
     if _corr(a, b) is None:
         return None
     return intervals.bootstrap((a, b), _correlations, 0, RESAMPLES).tolist()
 
 
 def _correlations(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Pearson's correlation along an axis; 0 where one does not vary."""
+    """Return Pearson's correlation along an axis; 0 where one does not vary."""
     a, b = (x - x.mean(axis, keepdims=True) for x in (a, b))
     spread = np.sqrt((a**2).sum(axis) * (b**2).sum(axis))
     return (a * b).sum(axis) / np.maximum(spread, 1e-12)
@@ -335,9 +336,9 @@ def _by_object(r: dict, env: GraspEnv) -> dict[str, float | None]:
 
 
 def by_share(r: dict) -> dict:
-    """Episodes by the share of the normal contact force on the object that fingertips have just before the hold (the
-    rest is links' and palm's), in fifths: their number, shares held of those without and with a push, and of all those
-    still held with the hand turned by 180 degrees. Commands below 0.1 do not count; empty fifths are left out."""
+    """Return episodes by the share of the normal contact force on the object that fingertips have just before the hold
+    (the rest is links' and palm's), in fifths: their number, shares held of those without and with a push, and of all
+    those still held with the hand turned by 180 degrees. Commands below 0.1 do not count; empty fifths are left out."""
     bins = np.minimum((np.asarray(r["tips"]) * SHARES).astype(int), SHARES - 1)
     pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
     rows: dict = {"from": [], "to": [], "episodes": [], "held": [], "held_pushed": [], "held_turned_180": []}
@@ -354,18 +355,18 @@ def by_share(r: dict) -> dict:
 
 
 def _of(x: np.ndarray, columns: list[int]) -> np.ndarray:
-    """Columns of x, row by row in memory, so that sums do not depend on how they were picked."""
+    """Return columns of x, row by row in memory, so that sums do not depend on how they were picked."""
     return np.ascontiguousarray(x[:, columns])
 
 
 def _flexing(r: dict, env: GraspEnv) -> np.ndarray:
-    """Torque [E, K] N.m, closing, of the first flexion joint of each finger beside the opposing ones."""
+    """Return torque [E, K] N.m, closing, of the first flexion joint of each finger beside the opposing ones."""
     joints = [env.hand.fingers[k].flexion[0] for k in env.hand.others]
     return r["torque"][:, joints] * env.hand.closing[joints].astype(np.float32)
 
 
 def _by_command(r: dict, held: np.ndarray, torque: np.ndarray) -> dict:
-    """Held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95
+    """Return held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95
     percentile) and the torque [E, K] of the flexion joints [N.m], their mean; empty tenths left out."""
     bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
     total, torque = r["force"].sum(1), torque.mean(1)
@@ -381,7 +382,7 @@ def _by_command(r: dict, held: np.ndarray, torque: np.ndarray) -> dict:
 
 
 def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
-    """What the paper's table of rewards says, of held episodes, and the intervals of what is judged."""
+    """Return what the paper's table of rewards says, of held episodes, and the intervals of what is judged."""
 
     def ends(name: str, digits: int = 3) -> str:
         pair = metrics.get(name)

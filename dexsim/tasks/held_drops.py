@@ -29,8 +29,8 @@ class Drops:
     held: np.ndarray
 
     def best(self, unit: float, start: np.ndarray) -> np.ndarray:
-        """The place [2] m around which the largest share was held: of several that differ by less than its standard
-        error, the nearest to `start` [2] m.
+        """Return the place [2] m around which the largest share was held: of several that differ by less than its
+        standard error, the nearest to `start` [2] m.
 
         Shares are means over the drops weighted by a Gaussian of AROUND times unit, in which one more that fell speaks
         against every place, so that few drops say little; their standard error sqrt(p (1 - p) sum(w^2)) / sum(w).
@@ -48,7 +48,7 @@ class Drops:
         return places[alike[((places[alike] - start) ** 2).sum(1).argmin()]]
 
     def __add__(self, more: Drops) -> Drops:
-        """Both together."""
+        """Return both together."""
         return Drops(np.vstack([self.place, more.place]), np.append(self.held, more.held))
 
 
@@ -60,8 +60,8 @@ def scattered(centre: np.ndarray, half: float, count: int, seed: int) -> torch.T
 
 
 def cupping(env: GraspEnv) -> Policy:
-    """A policy without learning: every joint goes from the open pose to the cupped one and as far again, until its
-    torque reaches 0.1 + 0.6 F_cmd of its maximum. What `GraspEnv.scripted_policy` turns thumb and fingers straight
+    """Return a policy without learning: every joint goes from the open pose to the cupped one and as far again, until
+    its torque reaches 0.1 + 0.6 F_cmd of its maximum. What `GraspEnv.scripted_policy` turns thumb and fingers straight
     at each other for, this does as the hand's maker, or the import, means it to close."""
     opened, cupped = (torch.as_tensor(env.hand.pose(name), dtype=torch.float32) for name in ("open", "cupped"))
     goal = torch.maximum(torch.minimum(2 * cupped - opened, env.q_high), env.q_low)

@@ -65,7 +65,8 @@ class Pads:
         mujoco.mj_kinematics(self.model, self.data)
 
     def torque(self, q: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Joint torques [J] N m that press with force [F, 3] N (palm frame) at the pads' centres, angles q [J]."""
+        """Return joint torques [J] N m that press with force [F, 3] N (palm frame) at the pads' centres, angles q
+        [J]."""
         self._set(q)
         mujoco.mj_comPos(self.model, self.data)
         jac, out = np.zeros((3, self.model.nv)), np.zeros(self.model.nv)
@@ -79,8 +80,9 @@ class Pads:
 def candidates(
     n: int, sizes: tuple[float, float], pads: Pads, rng: np.random.Generator
 ) -> tuple[GraspSet, torch.Tensor]:
-    """n hands with a cube between an opposing finger and others; targets still equal the angles. Also the direction and
-    share of force of each pad [n, F, 3], which sum to zero. Raises UserError for a hand that finds none."""
+    """Return n hands with a cube between an opposing finger and others; targets still equal the angles. Also the
+    direction and share of force of each pad [n, F, 3], which sum to zero. Raises UserError for a hand that finds
+    none."""
     hand = pads.hand
     rows: list[tuple[float, np.ndarray, np.ndarray]] = []
     shares: list[np.ndarray] = []
@@ -133,7 +135,7 @@ def candidates(
 
 
 def press(env: RotateEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """Targets [N, J] that press with force [N] N from angles q [N, J]."""
+    """Return targets [N, J] that press with force [N] N from angles q [N, J]."""
     torque = np.array([pads.torque(a.double().numpy(), (f * s).numpy())
                        for a, s, f in zip(q, share, force.double(), strict=True)])  # fmt: skip
     kp = env.servo.params[..., INDEX["kp"]].float()
@@ -165,8 +167,8 @@ def settle(
 
 
 def holds(env: RotateEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
-    """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under their targets, in worlds drawn anew, each
-    weighed in a direction of its own."""
+    """Return which grasps [N] stay within DRIFT and TURN for HOLD seconds under their targets, in worlds drawn anew,
+    each weighed in a direction of its own."""
     _begin(env, start)
     down = torch.randn(len(start), 3, generator=rng)
     gravity = env.engine.field("opt.gravity")

@@ -50,9 +50,9 @@ TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses
 def candidates(
     env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator, reach: Reach
 ) -> GraspSet:
-    """n open hands, each with an object (cubes with edges of sizes [m]; others in turns) above its palm and the joint
-    angles (`target`) that it will close to: fingertips against a cube's sides where they can, or those of a square
-    block as wide as another object's narrower side, about the cupped pose where they cannot."""
+    """Return n open hands, each with an object (cubes with edges of sizes [m]; others in turns) above its palm and the
+    joint angles (`target`) that it will close to: fingertips against a cube's sides where they can, or those of a
+    square block as wide as another object's narrower side, about the cupped pose where they cannot."""
     hand: Hand = env.hand
     J, sign = len(hand.joints), torch.as_tensor(hand.closing, dtype=torch.float32)
     u, common = 2 * torch.rand(n, J, generator=rng) - 1, 2 * torch.rand(n, 8, generator=rng) - 1
@@ -138,7 +138,7 @@ def settle(env: RotateEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
 
 
 def holds(env: RotateEnv, start: GraspSet) -> torch.Tensor:
-    """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under action zero, in worlds drawn anew."""
+    """Return which grasps [N] stay within DRIFT and TURN for HOLD seconds under action zero, in worlds drawn anew."""
     _begin(env, start)
     ok = torch.ones(len(start), dtype=torch.bool)
     for _ in range(int(round(HOLD / env.dt))):
@@ -149,7 +149,7 @@ def holds(env: RotateEnv, start: GraspSet) -> torch.Tensor:
 
 
 def _smallest(env: RotateEnv) -> torch.Tensor:
-    """Smallest extent of each object [m]; of a cube, whose edges differ, as large as may be."""
+    """Return smallest extent of each object [m]; of a cube, whose edges differ, as large as may be."""
     return torch.tensor([
         torch.inf if v.shape.name == CUBE else float(min(v.shape.extents)) * v.scale for v in env.objects.scene.variants
     ])  # fmt: skip
@@ -183,7 +183,7 @@ def _play(env: RotateEnv, seconds: float, towards: torch.Tensor | None = None) -
 
 
 def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:
-    """Something for the worlds to begin with: open hands, objects well above them."""
+    """Return a set for the worlds to begin with: open hands, objects well above them."""
     hand = hand_of(cfg)
     opened = torch.as_tensor(hand.pose("open"), dtype=torch.float32).repeat(n, 1)
     pose = torch.tensor([0.0, 0.0, 3 * hand.span, 1.0, 0.0, 0.0, 0.0]).repeat(n, 1)

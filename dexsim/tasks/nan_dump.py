@@ -134,7 +134,7 @@ class NanDump:
 
 
 def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
-    """What `keep_world` has to know of a field [N, ...]."""
+    """Return what `keep_world` has to know of a field [N, ...]."""
     if not source[0].is_contiguous() or source.element_size() % 4:
         raise ValueError(f"NanDump: a world's row of {tuple(source.shape)} {source.dtype} is not words in one piece")
     size = source.element_size()
@@ -142,7 +142,7 @@ def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a dump by name. Raises UserError for a file that is not one."""
+    """Return arrays of a dump by name. Raises UserError for a file that is not one."""
     try:
         data = files.arrays(path)
         json.loads(str(data["config"]))

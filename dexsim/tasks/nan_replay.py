@@ -27,7 +27,7 @@ come back.
 
 
 def replay(path: Path, device: str = "cpu", engine: str = "auto") -> HandEnv:
-    """The environment (one world) after the step that failed. Raises UserError."""
+    """Return the environment (one world) after the step that failed. Raises UserError."""
     data = load(path)
     env = make_env(json.loads(str(data["config"])), 1, device, 0, engine)
     e = env.engine

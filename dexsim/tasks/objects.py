@@ -91,12 +91,12 @@ class Objects:
         self._table.friction_factor = wp.from_torch(self._friction_factor)
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """Each world's object, live; the row of the table with its lowest and highest."""
+        """Return each world's object, live; the row of the table with its lowest and highest."""
         names = ("size", "mass", "com", "friction", "stiffness", "damping_ratio", "radius")
         return {"variant": (self.variant, 0, len(self.kind) - 1)} | {name: getattr(self, name) for name in names}
 
     def primitive_size(self, variant: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-        """MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by
+        """Return MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by
         component)."""
         return self._base_size[variant] * scale
 

@@ -63,7 +63,7 @@ class Signals(NamedTuple):
 
 
 def build(s: Signals, force_max: float) -> torch.Tensor:
-    """The actor's observation [N, D], rows of `rows`. force_max: F_max [N] of a fingertip at command 1."""
+    """Return the actor's observation [N, D], rows of `rows`. force_max: F_max [N] of a fingertip at command 1."""
     zero2 = torch.zeros_like(s.object_xy)
     return torch.cat([
         s.joint_position,
@@ -79,12 +79,12 @@ def build(s: Signals, force_max: float) -> torch.Tensor:
 
 
 def height_speed(z: torch.Tensor, before: torch.Tensor, period: float) -> torch.Tensor:
-    """Finite difference [N] m/s of the measured height over one control period [s]."""
+    """Return finite difference [N] m/s of the measured height over one control period [s]."""
     return (z - before) / period
 
 
 def slices(table: list[tuple[str, int, str, str]]) -> dict[str, slice]:
-    """Where each of `rows` lies."""
+    """Return where each of `rows` lies."""
     out, at = {}, 0
     for name, width, *_ in table:
         out[name] = slice(at, at + width)

@@ -19,8 +19,8 @@ ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 
 
 def actor(joints: int, fingers: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
-    """Table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers, touch pads and
-    measured joints without a drive."""
+    """Return table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers, touch pads
+    and measured joints without a drive."""
     return (
         ("joint_angle", joints, "rad", "measured"),
         ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
@@ -33,7 +33,7 @@ def actor(joints: int, fingers: int, pads: int, sensed: int = 0) -> tuple[tuple[
 
 
 def proprioception(joints: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
-    """The same without an object's pose; `history` of these, newest first."""
+    """Return the same without an object's pose; `history` of these, newest first."""
     return (
         ("joint_angle", joints, "rad", "measured"),
         ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
@@ -105,8 +105,8 @@ def rows(
 
 
 def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
-    """The actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is put
-    before `past`, whose oldest is left out; a fresh episode's history is its first frame."""
+    """Return the actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is
+    put before `past`, whose oldest is left out; a fresh episode's history is its first frame."""
     n, joints = s.joint_position.shape
     parts = {
         "joint_angle": s.joint_position, "joint_velocity": s.joint_velocity, "last_action": s.sent,
@@ -128,16 +128,15 @@ def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
 def sent(
     action: torch.Tensor, target: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, what: str
 ) -> torch.Tensor:
-    """What was last sent to the drives [N, J]. target: the targets over each joint's range (middle, half [J] rad) in
-    [-1, 1], in absolute mode the action itself; in relative mode a step alone would not tell how hard a finger is told
-    to press.
-    step: the action [N, J]."""
+    """Return what was last sent to the drives [N, J]. target: the targets over each joint's range (middle, half [J]
+    rad) in [-1, 1], in absolute mode the action itself; in relative mode a step alone would not tell how hard a finger
+    is told to press. step: the action [N, J]."""
     return action if what == "step" else (target - middle) / half
 
 
 def relative(seen: torch.Tensor, goal: torch.Tensor, how: str) -> torch.Tensor:
-    """R_object^T R_goal [N, 6, 4 or 0] from quaternions [N, 4] in one frame. A heading that both share cancels, so an
-    IMU that does not know north will do.
+    """Return R_object^T R_goal [N, 6, 4 or 0] from quaternions [N, 4] in one frame. A heading that both share cancels,
+    so an IMU that does not know north will do.
 
     As a quaternion: both orientations pass through rotation matrices, whose quaternion has the sign of its largest
     component, so the sign of the product jumps with the object's attitude. It is left so: the double cover is what
@@ -152,8 +151,8 @@ def relative(seen: torch.Tensor, goal: torch.Tensor, how: str) -> torch.Tensor:
 
 
 def next_goal(q: torch.Tensor, axis: torch.Tensor, turn: torch.Tensor, keep_tilt: bool) -> torch.Tensor:
-    """The goal after orientation q [N, 4] was reached: q turned by `turn` [4] (about the unit vector axis [3]), its
-    tilt against the axis removed unless `keep_tilt`."""
+    """Return the goal after orientation q [N, 4] was reached: q turned by `turn` [4] (about the unit vector axis [3]),
+    its tilt against the axis removed unless `keep_tilt`."""
     if not keep_tilt:
         q = rotation.upright(q, axis)
     return rotation.normalize(rotation.multiply(turn.expand_as(q), q))

@@ -17,8 +17,8 @@ def fingertip_press(
     hand: Hand, servo: dict, finger: str | None = None, stiffness: float = 7000.0, flexion: float = 0.2,
     drive: float = 1.0,
 ) -> float:  # fmt: skip
-    """Normal force [N] that one fingertip can press with, F_max: as hand.yaml's `force` says, a number, or from the
-    servo's torque limits: `press`, a simulated press on a ball (for pads that form a lattice), else the levers.
+    """Return normal force [N] that one fingertip can press with, F_max: as hand.yaml's `force` says, a number, or from
+    the servo's torque limits: `press`, a simulated press on a ball (for pads that form a lattice), else the levers.
 
     finger: by default the middle one of those beside the opposing fingers. drive: share of the torque that reaches the
     joints (the mean efficiency and strength of randomized servos). stiffness N/m, flexion rad: of the simulated press.
@@ -43,8 +43,8 @@ def fingertip_press(
 
 
 def by_levers(hand: Hand, finger: Finger, limit: list[float]) -> float:
-    """Static force [N] along a fingertip's normal at its end, open pose: tau_j = F n . dp/dq_j of every flexion joint
-    must stay within its limit [N m]. No friction, no weight."""
+    """Return static force [N] along a fingertip's normal at its end, open pose: tau_j = F n . dp/dq_j of every flexion
+    joint must stay within its limit [N m]. No friction, no weight."""
     model = hand.compiled
     data = mujoco.MjData(model)
     hand.couplings.put(data, hand.pose("open"))
@@ -65,8 +65,8 @@ def by_levers(hand: Hand, finger: Finger, limit: list[float]) -> float:
 
 
 def _pressed(hand: Hand, finger: Finger, limit: list[float], stiffness: float, flexion: float) -> float:
-    """Normal force [N] on a fixed ball when the finger's first flexion joint pulls at its torque limit, and the second
-    holds with no more than its own. Limits N m.
+    """Return normal force [N] on a fixed ball when the finger's first flexion joint pulls at its torque limit, and the
+    second holds with no more than its own. Limits N m.
 
     The finger is slightly bent (`flexion` rad in both joints), the ball (12 mm radius) lies against the
     middle of the pad's distal half; the other joints hold. Static: C MuJoCo until at rest.

@@ -58,7 +58,7 @@ class Plan:
         self._kinds = torch.tensor(kinds, dtype=torch.int32).to(dev)
 
     def draw(self) -> list[torch.Tensor]:
-        """[N, *shape] of each request, in order."""
+        """Return [N, *shape] of each request, in order."""
         s = self._sampler
         u = torch.rand(self._uniform, s.n, generator=s.rng, device=s.device)
         args = [wp.from_torch(x) for x in (self._kinds, self._table, s.width.reshape(1), u)]
@@ -94,7 +94,7 @@ class Sampler:
 
     @contextmanager
     def drawn_ahead(self, name: str) -> Iterator[None]:
-        """Within this, what is drawn is drawn by a dozen kernels, and not by six for each range.
+        """Draw, within this, what is drawn by a dozen kernels, and not by six for each range.
 
         The first time under a `name` notes what is asked for, in which order. From then on all of that is drawn at the
         beginning and handed out, as long as it is asked for in the same order; after something else, one by one again.
@@ -115,7 +115,7 @@ class Sampler:
             self._plans[name] = Plan(self, noted)
 
     def _given(self, name: str, shape: tuple[int, ...]) -> torch.Tensor | None:
-        """What was drawn ahead for this request, if it is the next."""
+        """Return what was drawn ahead for this request, if it is the next."""
         if self._noted is not None:
             self._noted.append((name, shape))
         if self._ahead:
@@ -167,7 +167,7 @@ class Sampler:
         return self.ranges[name]
 
     def draw(self, name: str, *shape: int) -> torch.Tensor:
-        """[N, *shape] samples of the range `name`, float32."""
+        """Return [N, *shape] samples of the range `name`, float32."""
         low, high, log = self.range(name)
         if (given := self._given(name, shape)) is not None:
             return given
@@ -177,23 +177,23 @@ class Sampler:
         return low + (high - low) * u
 
     def uniform(self, *shape: int) -> torch.Tensor:
-        """[N, *shape] uniform in [0, 1)."""
+        """Return [N, *shape] uniform in [0, 1)."""
         if (given := self._given(UNIFORM, shape)) is not None:
             return given
         return torch.rand(self.n, *shape, generator=self.rng, device=self.device)
 
     def normal(self, *shape: int) -> torch.Tensor:
-        """[N, *shape] standard normal."""
+        """Return [N, *shape] standard normal."""
         if (given := self._given(NORMAL, shape)) is not None:
             return given
         return torch.randn(self.n, *shape, generator=self.rng, device=self.device)
 
     def direction(self) -> torch.Tensor:
-        """[N, 3] unit vectors, uniform on the sphere."""
+        """Return [N, 3] unit vectors, uniform on the sphere."""
         v = self.normal(3)
         return v / v.norm(dim=1, keepdim=True).clamp(min=1e-9)
 
     def quaternion(self) -> torch.Tensor:
-        """[N, 4] rotations (w x y z), uniform."""
+        """Return [N, 4] rotations (w x y z), uniform."""
         q = self.normal(4)
         return q / q.norm(dim=1, keepdim=True).clamp(min=1e-9)

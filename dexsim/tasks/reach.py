@@ -52,7 +52,7 @@ class Reach:
         self.anchor = [anchor[:, list(f.joints)] for f in hand.fingers]
 
     def fitting(self, finger: int, centre: np.ndarray, yaw: float, edge: float) -> np.ndarray:
-        """Rows of a finger's table that lay its pad against an upright face of a cube, its joints clear of it.
+        """Return rows of a finger's table that lay its pad against an upright face of a cube, its joints clear of it.
         centre [3] m; yaw rad about the palm's normal; edge m."""
         c, s = math.cos(yaw), math.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

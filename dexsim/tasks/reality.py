@@ -34,12 +34,13 @@ KEYS = {"name", "seed", "sim", "solver", "contact", "servo", "sensors", "timing"
 
 
 def present(cfg: dict[str, Any]) -> bool:
-    """Whether a resolved config asks for another world."""
+    """Return whether a resolved config asks for another world."""
     return (cfg.get("reality") or {}).get("name", "none") != "none"
 
 
 def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
-    """The config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task draws.
+    """Return the config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task
+    draws.
 
     The world's servo replaces the policy's belief; its ranges replace those of training, name by name; drives are not
     randomized (it is one hand). Of a task that the world's file does not list, the ranges of training stay. What was
@@ -67,7 +68,7 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
 
 
 def _middle(cfg: dict[str, Any], column: str) -> float:
-    """Middle of the training's range of a drive's factor."""
+    """Return middle of the training's range of a drive's factor."""
     value = cfg["randomize"]["servo"].get(column, 1.0)
     value = value["log"] if isinstance(value, dict) else value
     return float(np.mean(value))
@@ -107,18 +108,19 @@ class Reality:
                 geom.solref = c["hand_solref"]
 
     def friction_factor(self, model: mujoco.MjModel, geoms: list[int]) -> torch.Tensor:
-        """Friction of each hand geom over the world's, [G]: by finger, 1 elsewhere."""
+        """Return friction of each hand geom over the world's, [G]: by finger, 1 elsewhere."""
         shares = self.cfg["contact"]["friction_by_finger"]
         by = {g: x for f, x in zip(self.hand.fingers, shares, strict=True) for g in f.geoms}
         return torch.tensor([by.get(model.geom(g).name, 1.0) for g in geoms])
 
     def substeps(self, nominal: int) -> int:
-        """Physics steps of this control period: nominal, give or take `timing.jitter` of it, the same on average."""
+        """Return physics steps of this control period: nominal, give or take `timing.jitter` of it, the same on
+        average."""
         spread = int(round(self.cfg["timing"]["jitter"] * nominal))
         return nominal + int(torch.randint(-spread, spread + 1, (), generator=self.rng)) if spread else nominal
 
     def late(self, n: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """(seconds [N] by which the target of this step is sent late, [N] whether it arrives at all)."""
+        """Return (seconds [N] by which the target of this step is sent late, [N] whether it arrives at all)."""
         t = self.cfg["timing"]
         return t["late"] * torch.rand(n, generator=self.rng), torch.rand(n, generator=self.rng) >= t["lost"]
 
@@ -136,7 +138,7 @@ class Reality:
 
 
 def draw(seed: int, servo: dict[str, Any], hand: Hand | None = None) -> dict[str, Any]:
-    """The numbers of another world, all from one seed. servo: the nominal table (the hand's servo file);
+    """Return the numbers of another world, all from one seed. servo: the nominal table (the hand's servo file);
     hand: whose (the xHand)."""
     hand = hand or load_hand("xhand")
     rng = np.random.default_rng(seed)
@@ -198,7 +200,7 @@ HEAD = """\
 
 
 def text(world: dict[str, Any]) -> str:
-    """The file of a drawn world."""
+    """Return the file of a drawn world."""
     body = yaml.safe_dump(world, sort_keys=False, width=90, default_flow_style=None)  # soft: lines of up to 120
     return HEAD.format(**world) + body
 

@@ -45,7 +45,7 @@ class Entry:
 
 @cache
 def built_in(folder: Path = CONFIGS / "task") -> dict[str, str]:
-    """The tasks of dexsim, name -> "module:Class": each settings file of a task names its class."""
+    """Return the tasks of dexsim, name -> "module:Class": each settings file of a task names its class."""
     found = {}
     for file in sorted(folder.glob("*.yaml")):
         named = re.search(r"^class: *(\S+)", file.read_text(encoding="utf-8"), re.M)
@@ -55,12 +55,12 @@ def built_in(folder: Path = CONFIGS / "task") -> dict[str, str]:
 
 
 def installed() -> dict[str, EntryPoint]:
-    """The tasks of other installed packages by name: their entry points in the group `dexsim.tasks`."""
+    """Return the tasks of other installed packages by name: their entry points in the group `dexsim.tasks`."""
     return door.installed(GROUP)
 
 
 def entries() -> Iterator[Entry]:
-    """All tasks that can be chosen by name."""
+    """Yield all tasks that can be chosen by name."""
     for name, where in built_in().items():
         yield Entry(name, where, "dexsim")
     for name, point in installed().items():
@@ -68,7 +68,7 @@ def entries() -> Iterator[Entry]:
 
 
 def is_class(choice: str) -> bool:
-    """Whether a choice of task is spelled "module:Class"."""
+    """Return whether a choice of task is spelled "module:Class"."""
     return door.is_named(choice)
 
 
@@ -79,7 +79,7 @@ def name_class(where: str, made: type[HandEnv] | None = None) -> str:
 
 
 def where_of(made: type) -> str:
-    """The "module:Class" of a class. Of one in the script that runs, the script's name is the module."""
+    """Return the "module:Class" of a class. Of one in the script that runs, the script's name is the module."""
     module = made.__module__
     if module == "__main__" and getattr(sys.modules["__main__"], "__file__", None):
         module = Path(str(sys.modules["__main__"].__file__)).stem
@@ -87,7 +87,8 @@ def where_of(made: type) -> str:
 
 
 def find(choice: str) -> str:
-    """The "module:Class" of a chosen task: a name, or a class, which is then named by the user. Raises UserError."""
+    """Return the "module:Class" of a chosen task: a name, or a class, which is then named by the user. Raises
+    UserError."""
     if is_class(choice):
         return name_class(choice)
     known = {entry.name: entry.where for entry in entries()}
@@ -101,7 +102,8 @@ def find(choice: str) -> str:
 
 
 def load(where: str, source: str = "") -> type[HandEnv]:
-    """The class "module:Class". Raises UserError: nobody that may name it has, it cannot be imported, or it is no task.
+    """Return the class "module:Class". Raises UserError: nobody that may name it has, it cannot be imported, or it is
+    no task.
 
     source: the file that names it, for the message.
     """
@@ -120,12 +122,12 @@ def load(where: str, source: str = "") -> type[HandEnv]:
 
 
 def provided(where: str) -> bool:
-    """Whether dexsim or an installed package provides a class, so that whoever names it may have it imported."""
+    """Return whether dexsim or an installed package provides a class, so that whoever names it may have it imported."""
     return where in built_in().values() or where in {point.value for point in installed().values()}
 
 
 def typing(where: str) -> str:
-    """What a command that is given a file of this task must say too: " task=module:Class", or nothing."""
+    """Return what a command that is given a file of this task must say too: " task=module:Class", or nothing."""
     return "" if provided(where) else f" task={where}"
 
 
@@ -137,8 +139,8 @@ def _imported(where: str, about: str) -> type[HandEnv]:
 
 
 def of_config(cfg: dict[str, Any]) -> str:
-    """The "module:Class" of a resolved config's task. Checkpoints from before name no class: the settings file of the
-    task that they chose does."""
+    """Return the "module:Class" of a resolved config's task. Checkpoints from before name no class: the settings file
+    of the task that they chose does."""
     task = cfg["task"]
     where = task.get("class")
     if where is None:
@@ -148,7 +150,7 @@ def of_config(cfg: dict[str, Any]) -> str:
 
 
 def task_class(cfg: dict[str, Any], source: str = "") -> type[HandEnv]:
-    """The class of a resolved config's task. Raises UserError; source: the file that the config is from."""
+    """Return the class of a resolved config's task. Raises UserError; source: the file that the config is from."""
     return load(of_config(cfg), source)
 
 
@@ -162,5 +164,5 @@ def terms(cfg: dict[str, Any]) -> dict[str, Any]:
 
 
 def about(made: type) -> str:
-    """The first line of a task's docstring."""
+    """Return the first line of a task's docstring."""
     return ((made.__doc__ or "").strip().splitlines() or [""])[0]

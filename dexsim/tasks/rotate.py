@@ -95,8 +95,8 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.begin_sensors(mask)
 
     def next_goal(self, q: torch.Tensor) -> torch.Tensor:
-        """The goal after orientation q [N, 4] was reached: q turned by the goal's angle about the palm's axis, its tilt
-        against that axis removed unless `goal.keep_tilt`."""
+        """Return the goal after orientation q [N, 4] was reached: q turned by the goal's angle about the palm's axis,
+        its tilt against that axis removed unless `goal.keep_tilt`."""
         return shared.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
 
     # -- how it goes and ends
@@ -119,7 +119,8 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.tipped = self._tilt_from_goal() > self.task["termination"]["tilt"]
 
     def _tilt_from_goal(self) -> torch.Tensor:
-        """Angle between the palm axis as the goal's and as the present orientation have it in the object's frame."""
+        """Return angle between the palm axis as the goal's and as the present orientation have it in the object's
+        frame."""
         a = rotation.rotate(rotation.conjugate(self.goal), self.axis.expand(self.num_envs, 3))
         b = rotation.rotate(rotation.conjugate(self.object_pose[:, 3:]), self.axis.expand(self.num_envs, 3))
         return torch.atan2(torch.linalg.cross(a, b).norm(dim=1), (a * b).sum(1))

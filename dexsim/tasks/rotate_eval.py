@@ -144,7 +144,7 @@ def evaluate(
 def _trials(
     env: RotateEnv, policy: Policy, cap: float, episodes: int, keep_frames: bool, progress: Progress | None
 ) -> tuple[dict, dict | None]:
-    """Arrays [E] of so many trials; the frames of the first."""
+    """Return arrays [E] of so many trials; the frames of the first."""
     parts: list[dict] = []
     while len(parts) * env.num_envs < episodes:
         done = len(parts) * env.num_envs
@@ -154,7 +154,7 @@ def _trials(
 
 
 def _kept_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progress: Progress | None) -> dict:
-    """Trials that begin with the objects kept out of the training."""
+    """Return trials that begin with the objects kept out of the training."""
     was, env.graphs = env.graphs, False  # a recorded step begins with those of the training
     env.judge_kept_out(True)
     try:
@@ -165,7 +165,7 @@ def _kept_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progres
 
 
 def _by_object(env: RotateEnv, parts: list[dict]) -> dict:
-    """Successes in a row by object, where there is more than one."""
+    """Return successes in a row by object, where there is more than one."""
     if len(env.names) < 2:
         return {}
     which, count = (np.concatenate([p[k] for p in parts]) for k in ("object", "successes"))
@@ -177,7 +177,7 @@ def _by_object(env: RotateEnv, parts: list[dict]) -> dict:
 
 
 def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: float, resamples: int, seed: int) -> dict:
-    """Metrics of E trials: successes [E], time [E] s until the fall or the cap, capped [E] bool."""
+    """Return metrics of E trials: successes [E], time [E] s until the fall or the cap, capped [E] bool."""
     successes, time = np.asarray(successes), np.asarray(time, float)
     average, median, per, fall = intervals.draws((successes, time), _statistics, seed, max(int(resamples), 1))
     total = successes.sum()
@@ -203,7 +203,7 @@ def _statistics(successes: np.ndarray, time: np.ndarray, axis: int = -1) -> np.n
 
 
 def _interval(x: np.ndarray) -> list[float | None]:
-    """2.5 and 97.5 percentiles; None where infinite."""
+    """Return 2.5 and 97.5 percentiles; None where infinite."""
     low, high = np.percentile(x, [2.5, 97.5], method="nearest")
     return [float(v) if np.isfinite(v) else None for v in (low, high)]
 
@@ -217,7 +217,7 @@ def _play(
     done: int,
     episodes: int,
 ) -> dict:
-    """One trial in every world."""
+    """Return one trial in every world."""
     n, dev, dt = env.num_envs, env.device, env.dt
     steps = int(round(cap / dt))
     env.reset_all()
@@ -284,7 +284,7 @@ def _play(
 
 
 def row_of(env: RotateEnv) -> tuple[str, ...]:
-    """The four settings of a row of the paper's table."""
+    """Return the four settings of a row of the paper's table."""
     o = env.task["observe"]
     none = env.task["perception"] == "proprioception"
     return (

@@ -161,12 +161,12 @@ class FingertipEnv(TipTrials, RotateEnv):
         self.patience.fill_(math.inf)
 
     def next_goal(self, q: torch.Tensor) -> torch.Tensor:
-        """The goal after the present one [N, 4]. q is not used: errors of one goal do not add to the next."""
+        """Return the goal after the present one [N, 4]. q is not used: errors of one goal do not add to the next."""
         return self._drawn_goal(self.goal)
 
     def _drawn_goal(self, last: torch.Tensor) -> torch.Tensor:
-        """`last` [N, 4] turned about a random axis in a random direction, so that it stays within `goal.reach` of the
-        start; where no turn does, by the one that leads there most."""
+        """Return `last` [N, 4] turned about a random axis in a random direction, so that it stays within `goal.reach`
+        of the start; where no turn does, by the one that leads there most."""
         every = rotation.normalize(rotation.multiply(self.turns[None], last[:, None]))  # [N, 2 A, 4]
         far = rotation.error(every, self.first[:, None].expand_as(every))
         score = torch.where(far <= self.reach_rad, self.sampler.uniform(every.shape[1]), -far)

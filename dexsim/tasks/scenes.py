@@ -98,7 +98,7 @@ class Base:
     limit: tuple[float, float] = (80.0, 8.0)
 
     def servos(self) -> dict[str, dict[str, float]]:
-        """Entries of a servo table for the six joints: drives without any imperfection."""
+        """Return entries of a servo table for the six joints: drives without any imperfection."""
         out = {}
         for k, name in enumerate(BASE):
             i = k // 3
@@ -324,7 +324,7 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _felt(model: mujoco.MjModel, body: int, tree: str) -> Part:
-    """What pads feel of a body: the convex hull of its colliding geoms."""
+    """Return what pads feel of a body: the convex hull of its colliding geoms."""
     points = np.concatenate([_corners(model, g) for g in _colliding(model, body)])
     name = f"{tree}/{model.body(body).name}"
     span = float(np.ptp(points, 0).max())

@@ -31,8 +31,8 @@ ROWS = ("edge", "hand", "target", "pose")
 
 
 def called(name: str) -> str:
-    """What a file of held poses calls an object of a task: a user's own by its file's or folder's name, wherever that
-    lies."""
+    """Return what a file of held poses calls an object of a task: a user's own by its file's or folder's name, wherever
+    that lies."""
     return Path(name).name if is_own(name) else name
 
 
@@ -54,7 +54,7 @@ class GraspSet:
             self.shape = torch.zeros(len(self.edge), dtype=torch.long, device=self.edge.device)
 
     def of(self, edit: Callable[[torch.Tensor], torch.Tensor]) -> GraspSet:
-        """Every array as `edit` makes it, of the same objects."""
+        """Return every array as `edit` makes it, of the same objects."""
         return GraspSet(*(edit(getattr(self, k)) for k in ROWS), shape=edit(self.shape), names=self.names)
 
     @classmethod
@@ -87,8 +87,8 @@ class GraspSet:
             np.savez_compressed(file, **out)
 
     def within(self, low: float, high: float) -> GraspSet:
-        """The poses of cubes with edges in [low, high] m, and all of other objects. Raises UserError when there are
-        none."""
+        """Return the poses of cubes with edges in [low, high] m, and all of other objects. Raises UserError when there
+        are none."""
         cube = self.names.index(CUBE) if CUBE in self.names else -1
         keep = (self.shape != cube) | ((self.edge >= low - 1e-6) & (self.edge <= high + 1e-6))
         if not bool(keep.any()):
@@ -97,7 +97,7 @@ class GraspSet:
         return self[keep]
 
     def derived(self, mirror: bool, scale: float) -> GraspSet:
-        """The same poses of the hand's mirror image (palm y -> -y), or of one with all lengths times scale."""
+        """Return the same poses of the hand's mirror image (palm y -> -y), or of one with all lengths times scale."""
         if not mirror and scale == 1.0:
             return self
         flip = torch.tensor([1, -1, 1, 1, -1, 1, -1.0]) if mirror else torch.ones(7)
@@ -105,8 +105,8 @@ class GraspSet:
         return GraspSet(self.edge * scale, self.hand.clone(), self.target.clone(), self.pose * flip * size)
 
     def numbered(self, names: tuple[str, ...], source: str) -> GraspSet:
-        """The poses of these objects, `shape` by their places in `names`. Raises UserError for one without poses;
-        source: where they come from."""
+        """Return the poses of these objects, `shape` by their places in `names`. Raises UserError for one without
+        poses; source: where they come from."""
         place = torch.tensor([names.index(n) if n in names else -1 for n in self.names], device=self.edge.device)
         out = replace(self, shape=place[self.shape], names=names)
         for k, name in enumerate(names):
@@ -118,7 +118,7 @@ class GraspSet:
         return out[out.shape >= 0]
 
     def to(self, device: str) -> GraspSet:
-        """The same on a device."""
+        """Return the same on a device."""
         return self.of(lambda v: v.to(device))
 
     def __getitem__(self, rows: torch.Tensor) -> GraspSet:
@@ -129,19 +129,19 @@ class GraspSet:
 
     @staticmethod
     def join(parts: list[GraspSet]) -> GraspSet:
-        """All poses of several sets of the same objects."""
+        """Return all poses of several sets of the same objects."""
         rows = (torch.cat([getattr(p, k) for p in parts]) for k in ROWS)
         return GraspSet(*rows, shape=torch.cat([p.shape for p in parts]), names=parts[0].names)
 
 
 def held_file(hand: Hand) -> Path:
-    """Where a hand's held poses are, or would be kept."""
+    """Return where a hand's held poses are, or would be kept."""
     return hand.folder / (hand.file.held_cubes or FOUND)
 
 
 def held_poses(hand: Hand, path: str | Path | None = None) -> GraspSet:
-    """Held poses of a file, or of the hand's own (mirrored and scaled as the hand is). Raises UserError: no file, or
-    one of a hand with other joints."""
+    """Return held poses of a file, or of the hand's own (mirrored and scaled as the hand is). Raises UserError: no
+    file, or one of a hand with other joints."""
     found = GraspSet.load(held_file(hand) if path is None else path)
     if found.hand.shape[1] != len(hand.joints):
         raise UserError(

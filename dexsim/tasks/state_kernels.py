@@ -43,7 +43,8 @@ class Seen:
 
 @cache
 def read_kernel(real: type) -> wp.Kernel:
-    """Joints, object, contact forces and fingertips of N worlds as float32; of a world that is not finite, zeros."""
+    """Return joints, object, contact forces and fingertips of N worlds as float32; of a world that is not finite,
+    zeros."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def read(

@@ -9,8 +9,8 @@ import warp as wp
 
 
 def filled(kind: Any, **values: Any) -> Any:
-    """A new struct of this kind, every field by name. Raises TypeError for other names. Tensors are shared, not copied,
-    except int64 where the kernel wants int32."""
+    """Return a new struct of this kind, every field by name. Raises TypeError for other names. Tensors are shared, not
+    copied, except int64 where the kernel wants int32."""
     made = kind()
     if set(values) != set(kind.vars):
         raise TypeError(f"{kind.key}: {sorted(set(values) ^ set(kind.vars))} missing or unknown")

@@ -88,7 +88,7 @@ class Task(HandEnv):
     # ----------------------------------------------------------------------------------------------
     @classmethod
     def config(cls) -> dict[str, Any]:
-        """The settings that a run of this task starts from: groups "task" and "randomize"."""
+        """Return the settings that a run of this task starts from: groups "task" and "randomize"."""
         out = copy.deepcopy(_start())
         weights: dict[str, float] = {}
         for owner in reversed(cls.__mro__):
@@ -281,12 +281,12 @@ class Task(HandEnv):
         return self._episode_length * self.dt
 
     def thing_pose(self, name: str) -> torch.Tensor:
-        """Pose [N, 7] of a further object of the scene."""
+        """Return pose [N, 7] of a further object of the scene."""
         at = self.q_of(f"{name}_free")
         return self.engine.t.qpos[:, at : at + 7].float()
 
     def joint_of(self, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Position [N] (rad or m) and speed [N] of a joint of an imported tree, "TREE/JOINT"."""
+        """Return position [N] (rad or m) and speed [N] of a joint of an imported tree, "TREE/JOINT"."""
         return self.engine.t.qpos[:, self.q_of(name)].float(), self.engine.t.qvel[:, self.v_of(name)].float()
 
     # -- episodes
@@ -351,7 +351,7 @@ class Task(HandEnv):
         sizes.copy_(self.objects.size)
 
     def pose(self, name: str) -> torch.Tensor:
-        """Joint angles [J] of the hand's pose "open" or "cupped", a base at 0."""
+        """Return joint angles [J] of the hand's pose "open" or "cupped", a base at 0."""
         angles = torch.zeros(self.num_actions, device=self.device)
         angles[: len(self.hand.joints)] = torch.as_tensor(self.hand.pose(name), dtype=torch.float32)
         return angles
@@ -364,7 +364,7 @@ class Task(HandEnv):
         target: torch.Tensor | None = None,
         also: Mapping[int, torch.Tensor] | None = None,
     ) -> torch.Tensor:
-        """Where mask holds: the hand in a pose (its name, or [J] or [N, J] rad), give or take
+        """Return where mask holds: the hand in a pose (its name, or [J] or [N, J] rad), give or take
         `randomize.initial.joint`, at rest, sent to `target` [N, J]; the object at object_pose [N, 7], which is
         returned. also: see `place`."""
         n = self.num_envs
@@ -380,8 +380,8 @@ class Task(HandEnv):
         return pose
 
     def drop_object(self, mask: torch.Tensor, above: float = 0.03, spread: float = 0.01) -> torch.Tensor:
-        """Where mask holds: the open hand, the object at rest in any orientation, `above` m over the palm and its own
-        radius, give or take `spread` m aside. Returns its pose [N, 7]."""
+        """Return where mask holds: the open hand, the object at rest in any orientation, `above` m over the palm and
+        its own radius, give or take `spread` m aside. Returns its pose [N, 7]."""
         s = self.sampler
         where = torch.as_tensor(self.places.catch, dtype=torch.float32, device=self.device).expand(self.num_envs, 3)
         where = where.clone()
@@ -390,8 +390,8 @@ class Task(HandEnv):
         return self.start(mask, "open", torch.cat([where, s.quaternion()], 1))
 
     def hold(self, mask: torch.Tensor) -> torch.Tensor:
-        """Where mask holds: a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its edge
-        is `randomize.object.size`, m. Returns its pose [N, 7]."""
+        """Return where mask holds: a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its
+        edge is `randomize.object.size`, m. Returns its pose [N, 7]."""
         s = self.sampler
         if self.grasps is None:
             edges = [self.unit * x for x in s.range("object.size")[:2]]
@@ -475,14 +475,14 @@ class Task(HandEnv):
         """Move the task's own memory on: after physics, before terminations and rewards."""
 
     def _params(self, part: str, term: Term) -> dict[str, Any]:
-        """A term's arguments as the settings have them."""
+        """Return a term's arguments as the settings have them."""
         if not term.params:
             return {}
         given = self.task.get(part, {}).get(term.name, {})
         return {name: given.get(name, usual) for name, usual in term.params.items()}
 
     def terminated(self) -> dict[str, torch.Tensor]:
-        """The ends that are switched on."""
+        """Return the ends that are switched on."""
         self.update()
         on = [x for x in self._terms["done"] if self.task["terminations"][x.name]]
         out = {x.name: x.method(self, **self._params("termination", x)) for x in on}
@@ -497,7 +497,7 @@ class Task(HandEnv):
         return {x.name: x.text for x in terms_of(type(self))["reward"]}
 
     def rewards(self) -> dict[str, torch.Tensor]:
-        """Terms of a weight other than 0, weighted."""
+        """Return terms of a weight other than 0, weighted."""
         weights = self.task["rewards"]
         paid = [x for x in self._terms["reward"] if weights.get(x.name)]
         out = {x.name: weights[x.name] * x.method(self, **self._params("reward", x)) for x in paid}
@@ -605,7 +605,7 @@ class Task(HandEnv):
     # -- what is said of it
     # --------------------------------------------------------------------------------------------------------
     def describe(self) -> dict:
-        """Tables for the first screen."""
+        """Return tables for the first screen."""
         t = self.task
         groups: dict[str, list] = {"actor": [], "critic": []}
         for row in self._sensed:
@@ -643,7 +643,7 @@ class Task(HandEnv):
 
 
 def _columns(value: torch.Tensor, n: int, what: str) -> torch.Tensor:
-    """[N, D] of [N] or [N, ...]. Raises UserError."""
+    """Return [N, D] of [N] or [N, ...]. Raises UserError."""
     if not isinstance(value, torch.Tensor) or value.dim() < 1 or value.shape[0] != n:
         shape = list(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
         raise UserError(f"{what}: gives {shape}, must be a tensor [{n}] or [{n}, ...], one row for each world")

@@ -145,8 +145,8 @@ def metric(unit: str = "", *, now: bool = False, name: str | None = None) -> Cal
 
 
 def terms_of(made: type) -> dict[str, list[Term]]:
-    """The terms of a class by kind, in the order in which they are declared; those of its bases first. A method of the
-    same name takes the place of a base's; without a decorator it removes it."""
+    """Return the terms of a class by kind, in the order in which they are declared; those of its bases first. A method
+    of the same name takes the place of a base's; without a decorator it removes it."""
     found: dict[str, Term | None] = {}
     for owner in reversed(made.__mro__):
         for name, value in vars(owner).items():
@@ -159,7 +159,7 @@ def terms_of(made: type) -> dict[str, list[Term]]:
 
 
 def span(value: Any, where: str, unit: str = "s") -> tuple[float, float]:
-    """The ends of a number or a pair, not negative. Raises UserError."""
+    """Return the ends of a number or a pair, not negative. Raises UserError."""
     pair = value if isinstance(value, (list, tuple)) else [value, value]
     good = len(pair) == 2 and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in pair)
     if not good or not 0 <= pair[0] <= pair[1]:
@@ -197,7 +197,7 @@ class Sensing:
         self.lag.copy_(torch.where(mask, drawn, self.lag))
 
     def __call__(self, value: torch.Tensor, env: Any, fresh: torch.Tensor, advance: bool) -> torch.Tensor:
-        """What is seen of a value [N, D]. fresh [N]: an episode begins; advance: a control step has passed."""
+        """Return what is seen of a value [N, D]. fresh [N]: an episode begins; advance: a control step has passed."""
         sampler = env.sampler
         if self.noise:
             value = value + self.noise * sampler.normal(value.shape[1])
@@ -230,7 +230,7 @@ class Sensing:
         return value
 
     def memory(self) -> dict[str, Any]:
-        """What one step leaves to the next."""
+        """Return what one step leaves to the next."""
         own: dict[str, Any] = {k: getattr(self, k) for k in ("past", "got", "seen") if getattr(self, k) is not None}
         if self.lag is not None:
             own["lag"] = self.lag, 0, 2**31
@@ -238,7 +238,7 @@ class Sensing:
 
 
 def _kept(value: torch.Tensor, count: int) -> torch.Tensor:
-    """Memory [N, count, D] that outlives the rollout that happens to come first."""
+    """Return memory [N, count, D] that outlives the rollout that happens to come first."""
     with torch.inference_mode(False):
         return torch.zeros(len(value), count, value.shape[1], dtype=value.dtype, device=value.device)
 
@@ -293,5 +293,5 @@ def memory(*shape: Size, dtype: torch.dtype = torch.float32, reset: bool = True)
 
 
 def memories_of(made: type) -> dict[str, Memory]:
-    """The declared memory of a class and its bases by name."""
+    """Return the declared memory of a class and its bases by name."""
     return {name: v for owner in reversed(made.__mro__) for name, v in vars(owner).items() if isinstance(v, Memory)}

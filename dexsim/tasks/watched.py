@@ -63,7 +63,8 @@ class Watched(dict):
 
 
 def unread(read: set[str], keys: list[str]) -> list[str]:
-    """Those of the dotted names that were not read: neither they, nor anything in them, nor all that they are in."""
+    """Return those of the dotted names that were not read: neither they, nor anything in them, nor all that they are
+    in."""
     out = []
     for key in keys:
         parts = key.split(".")

@@ -22,7 +22,7 @@ SAME = ("worlds", "task", "sim", "servo", "tactile", "randomize", "model_file", 
 
 
 def live(env: Kept) -> dict[str, tuple[torch.Tensor, int, int]]:
-    """(tensor, lowest, highest) of all memory by name; the bounds matter for whole numbers only."""
+    """Return (tensor, lowest, highest) of all memory by name; the bounds matter for whole numbers only."""
     out: dict[str, tuple[torch.Tensor, int, int]] = {}
     things = () if env.scene.object is None else (env.objects,)
     for part in (env.engine, env.servo, env.touch, *things, env):
@@ -36,7 +36,7 @@ def live(env: Kept) -> dict[str, tuple[torch.Tensor, int, int]]:
 
 
 def keep(env: Kept) -> dict[str, torch.Tensor]:
-    """A copy of the worlds, on their device, and of the environment's random state."""
+    """Return a copy of the worlds, on their device, and of the environment's random state."""
     return {name: tensor.clone() for name, (tensor, _, _) in live(env).items()} | {"rng": env.rng.get_state()}
 
 
@@ -72,19 +72,19 @@ def of_another_version(env: Kept, state: Mapping[str, torch.Tensor]) -> bool:
 
 
 def size(env: Kept) -> int:
-    """Bytes of all worlds."""
+    """Return bytes of all worlds."""
     return sum(tensor.numel() * tensor.element_size() for tensor, _, _ in live(env).values())
 
 
 def changed(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """The first setting of `SAME` that differs between two resolved configs; empty where none does."""
+    """Return the first setting of `SAME` that differs between two resolved configs; empty where none does."""
     other = [k for k in SAME if _plain(then.get(k)) != _plain(now.get(k))]
     kinds = [str(c.get("device") or "").partition(":")[0] for c in (then, now)]
     return other[0] if other else "device" if kinds[0] != kinds[1] else ""
 
 
 def _plain(node: Any) -> Any:
-    """Tuples as lists: a config that went through a file has lists."""
+    """Return tuples as lists: a config that went through a file has lists."""
     if isinstance(node, Mapping):
         return {k: _plain(v) for k, v in node.items()}
     return [_plain(v) for v in node] if isinstance(node, (list, tuple)) else node

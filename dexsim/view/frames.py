@@ -24,7 +24,7 @@ class Frames:
         self._model: Any = None
 
     def __call__(self, model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-        """The picture [H, W, 3] uint8 of a model at qpos [nq]. Raises NoRenderer."""
+        """Return the picture [H, W, 3] uint8 of a model at qpos [nq]. Raises NoRenderer."""
         if self._model is not model:
             self.close()
             model.vis.global_.offwidth, model.vis.global_.offheight = self.size
@@ -48,8 +48,8 @@ class Frames:
 
 
 def _renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
-    """MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is imported, and
-    chooses a window where nothing is said, so the choice is made here."""
+    """Return MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is
+    imported, and chooses a window where nothing is said, so the choice is made here."""
     contexts = importlib.import_module("mujoco.rendering.classic.gl_context")
     reasons = []
     for backend in system.renderers():

@@ -45,7 +45,7 @@ class Element:
 
 @functools.cache
 def schema() -> Element:
-    """The elements that MuJoCo reads, as it prints them."""
+    """Return the elements that MuJoCo reads, as it prints them."""
     above: list[Element] = []
     for line in mujoco.mj_printSchema(False, False).splitlines():
         head = re.match(r"^( *)(\S+) \(.\)\s*(.*)$", line)
@@ -62,7 +62,7 @@ def schema() -> Element:
 
 
 def value(rng: np.random.Generator) -> str:
-    """A size up to 10^9, some numbers, or words."""
+    """Return a size up to 10^9, some numbers, or words."""
     how = rng.integers(0, 5)
     if how <= 1:
         return str(int(10 ** rng.uniform(0, 9)))
@@ -74,7 +74,7 @@ def value(rng: np.random.Generator) -> str:
 
 
 def made(element: Element, rng: np.random.Generator, depth: int = 0) -> ET.Element:
-    """An element with some of its attributes and of what may stand in it."""
+    """Return an element with some of its attributes and of what may stand in it."""
     out = ET.Element(element.name)
     for name in element.attributes:
         if rng.random() < min(1.0, 3.0 / len(element.attributes)):

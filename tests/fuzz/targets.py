@@ -215,14 +215,14 @@ def network(path: Path) -> str:
 
 
 def model(path: Path) -> str:
-    """A model of MuJoCo's, as a diagnosis takes it."""
+    """Return a model of MuJoCo's, as a diagnosis takes it."""
     m = mechanism(path, corpus.SERVO | {"joints": {"*": {"kp": 1.0}}, "loop_encoder": "motor", "current_per_torque": 1})
     m.spec.compile()
     return ""
 
 
 def robot(path: Path) -> str:
-    """The same, to be imported as a hand."""
+    """Return the same, to be imported as a hand."""
     source.read(path)
     return ""
 
@@ -247,8 +247,8 @@ TARGETS: dict[str, Callable[[Path], str]] = {
 
 
 def verdict(kind: str, path: Path) -> str:
-    """"fine", "refused", or what is wrong with how the file was answered ("silent: ..." where a file was taken for
-    another than it is without a word)."""
+    """Return "fine", "refused", or what is wrong with how the file was answered ("silent: ..." where a file was taken
+    for another than it is without a word)."""
     try:
         silent = TARGETS[kind](path)
     except UserError as error:

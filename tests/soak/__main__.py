@@ -109,7 +109,8 @@ class Stopped(BaseException):
 
 @contextlib.contextmanager
 def stopping() -> Iterator[None]:
-    """Ctrl-C, SIGTERM and SIGHUP raise Stopped, once; those that the caller of this program ignores (nohup) do not."""
+    """Let Ctrl-C, SIGTERM and SIGHUP raise Stopped, once; those that the caller of this program ignores (nohup) do
+    not."""
     theirs = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     caught = [n for n, handler in theirs.items() if handler != signal.SIG_IGN]
 

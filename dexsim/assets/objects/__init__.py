@@ -55,7 +55,8 @@ def _library() -> dict[str, Shape]:
 
 
 def library() -> dict[str, Shape]:
-    """All shapes that ship with dexsim by name: box, sphere, capsule, then those of `shapes.SHAPES` in that order."""
+    """Return all shapes that ship with dexsim by name: box, sphere, capsule, then those of `shapes.SHAPES` in that
+    order."""
     return dict(_library())
 
 
@@ -65,8 +66,8 @@ def names(held_out: bool | None = None) -> list[str]:
 
 
 def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts: int = 1) -> Shape:
-    """A `Shape` of kind "grid" from a user's mesh file (a hollow one split into at most `parts` convex ones), or from a
-    list of at most three files of its convex parts.
+    """Return a `Shape` of kind "grid" from a user's mesh file (a hollow one split into at most `parts` convex ones), or
+    from a list of at most three files of its convex parts.
 
     See `dexsim.assets.objects.mesh.load_mesh`, which this calls.
     """

@@ -15,7 +15,7 @@ UNIT = 2e-6  # m, step of the stored distances (16 bits reach 65 mm)
 
 
 def bake_grid(hulls: Sequence[np.ndarray], spacing: float = SPACING, margin: float = MARGIN) -> Grid:
-    """The grid of exact distances to the union of `hulls`, rounded to `UNIT`."""
+    """Return the grid of exact distances to the union of `hulls`, rounded to `UNIT`."""
     points = np.concatenate(hulls)
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     shape = np.ceil((high - low) / spacing).astype(int) + 1
@@ -44,7 +44,7 @@ def grid_error(hulls: Sequence[np.ndarray], grid: Grid, band: float = 2e-3, n: i
 
 
 def shape_from_hulls(name: str, hulls: list[np.ndarray], held_out: bool = False, spacing: float = SPACING) -> Shape:
-    """A `Shape` of kind "grid" from hulls [V, 3] (m) that are in the shape frame already."""
+    """Return a `Shape` of kind "grid" from hulls [V, 3] (m) that are in the shape frame already."""
     # What is stored and what is baked must be the same numbers, so round to float32 first.
     hulls = [np.asarray(h, np.float32).astype(float) for h in hulls]
     volume, _, inertia = mass_properties(union_boundary(hulls))
@@ -63,7 +63,7 @@ def shape_from_hulls(name: str, hulls: list[np.ndarray], held_out: bool = False,
 
 
 def pack(shape: Shape) -> dict[str, np.ndarray]:
-    """Arrays to store for a shape of kind "grid".
+    """Return arrays to store for a shape of kind "grid".
 
     The distances are whole `UNIT`s in 16 bits; second differences (along x, then y) leave small numbers wherever
     the distance is linear, which is what makes the file compress.
@@ -92,7 +92,7 @@ def pack(shape: Shape) -> dict[str, np.ndarray]:
 
 
 def unpack(name: str, stored: dict[str, np.ndarray]) -> Shape:
-    """The shape that `pack` stored."""
+    """Return the shape that `pack` stored."""
     hulls = np.split(stored["hulls"].astype(float), np.cumsum(stored["hull_sizes"])[:-1])
     code = (stored["data_high"].astype(np.uint16) << 8 | stored["data_low"]).view(np.int16)
     for axis in (1, 0):

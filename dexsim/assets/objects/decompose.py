@@ -22,7 +22,7 @@ ITERATIONS, NODES, RESOLUTION = (
 
 
 def available() -> bool:
-    """Whether CoACD is installed."""
+    """Return whether CoACD is installed."""
     from importlib.util import find_spec
 
     return find_spec("coacd") is not None

@@ -16,13 +16,13 @@ _FLAT = 2e-6
 
 
 def hull_vertices(points: np.ndarray) -> np.ndarray:
-    """The corners of the convex hull of `points` [P, 3], in the order given, [V, 3]."""
+    """Return the corners of the convex hull of `points` [P, 3], in the order given, [V, 3]."""
     points = np.asarray(points, float)
     return points[np.sort(ConvexHull(points).vertices)]
 
 
 def hull_mesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convex hull of points [V, 3] as a closed mesh: vertices [n, 3], outward facing triangles [m, 3]."""
+    """Return convex hull of points [V, 3] as a closed mesh: vertices [n, 3], outward facing triangles [m, 3]."""
     hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     faces = faces.reshape(-1, 3)
@@ -49,7 +49,8 @@ def hull_planes(vertices: np.ndarray) -> np.ndarray:
 
 
 def hull_faces(vertices: np.ndarray) -> list[np.ndarray]:
-    """Faces of a convex hull as polygons [K, 3], counter-clockwise seen from outside, in the order of `hull_planes`."""
+    """Return faces of a convex hull as polygons [K, 3], counter-clockwise seen from outside, in the order of
+    `hull_planes`."""
     tol = _FLAT * np.ptp(vertices, axis=0).max()
     faces = []
     for plane in hull_planes(vertices):
@@ -85,7 +86,7 @@ def _cut(polygon: np.ndarray, plane: np.ndarray, tol: float) -> tuple[np.ndarray
 def _outside_of(
     polygon: np.ndarray, normal: np.ndarray, planes: np.ndarray, keep_shared: bool, tol: float
 ) -> list[np.ndarray]:
-    """The parts of a face (outward `normal`) that are not inside the polyhedron `planes`, as convex polygons.
+    """Return the parts of a face (outward `normal`) that are not inside the polyhedron `planes`, as convex polygons.
 
     A face lying in one of the planes is kept where the two look the same way and `keep_shared` (one of two hulls
     keeps a surface that both have), and dropped where they face each other (the seam of two touching hulls).
@@ -107,7 +108,7 @@ def _outside_of(
 
 
 def union_boundary(hulls: Sequence[np.ndarray]) -> np.ndarray:
-    """Triangles [T, 3, 3] of the boundary of the union of convex hulls, counter-clockwise seen from outside.
+    """Return triangles [T, 3, 3] of the boundary of the union of convex hulls, counter-clockwise seen from outside.
 
     Faces are cut exactly by the planes of the other hulls; where cut faces meet there may be T-junctions, which
     matter neither to integrals over the boundary nor to distances.
@@ -167,7 +168,8 @@ def simplify_hull(points: np.ndarray, limit: int) -> tuple[np.ndarray, float, fl
 
 
 def mass_properties(triangles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume (m^3), centre (m, [3]) and inertia per kg about the centre (m^2, [3, 3]) of a solid of uniform density.
+    """Return volume (m^3), centre (m, [3]) and inertia per kg about the centre (m^2, [3, 3]) of a solid of uniform
+    density.
 
     Sums signed tetrahedra from the origin to each boundary triangle (divergence theorem): for vertices a, b, c the
     second moment is V/20 (aa' + bb' + cc' + ss'), s = a + b + c.
@@ -183,7 +185,7 @@ def mass_properties(triangles: np.ndarray) -> tuple[float, np.ndarray, np.ndarra
 
 
 def _triangle_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Distance [P] from points [P, 3] to the nearest of triangles [T, 3, 3]."""
+    """Return distance [P] from points [P, 3] to the nearest of triangles [T, 3, 3]."""
     best = np.full(len(points), np.inf)
     # Over a triangle's interior: distance to its plane. (Products of matrices keep the temporaries at [P, T].)
     edges = np.roll(triangles, -1, axis=1) - triangles
@@ -210,7 +212,8 @@ def _triangle_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def signed_distance(hulls: Sequence[np.ndarray], points: np.ndarray, chunk: int = 8192) -> np.ndarray:
-    """Exact signed distance [P] (m, negative inside) from points [P, 3] to the boundary of the union of the hulls."""
+    """Return exact signed distance [P] (m, negative inside) from points [P, 3] to the boundary of the union of the
+    hulls."""
     points = np.asarray(points, float)
     triangles = union_boundary(hulls)
     planes = [hull_planes(h) for h in hulls]
@@ -225,7 +228,7 @@ def signed_distance(hulls: Sequence[np.ndarray], points: np.ndarray, chunk: int 
 
 
 def principal_axes(inertia: np.ndarray) -> np.ndarray:
-    """Rotation R [3, 3], columns the principal axes, chosen nearest to the axes the inertia is given in.
+    """Return rotation R [3, 3], columns the principal axes, chosen nearest to the axes the inertia is given in.
 
     An inertia that is diagonal already (to 1e-6 of its size) gives the identity.
     """

@@ -26,7 +26,7 @@ MOST_PARTS = 32  # convex parts of one object
 
 
 def _scale_hint(extent: float, scale: float) -> str:
-    """The factor that would bring an extent (as scaled, m) into range, in words."""
+    """Return the factor that would bring an extent (as scaled, m) into range, in words."""
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         # Units guess the file as it is, so undo the scale that was passed.
         if SMALLEST <= extent / scale * factor <= LARGEST:
@@ -37,7 +37,7 @@ def _scale_hint(extent: float, scale: float) -> str:
 
 
 def _named(scale: float) -> str:
-    """A scale as the commands take it."""
+    """Return a scale as the commands take it."""
     return f"object_scale={scale:.3g} (to import-object: scale={scale:.3g})"
 
 
@@ -96,7 +96,7 @@ def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _split(file: Path, triangles: np.ndarray, parts: int) -> tuple[list[np.ndarray], list[str]]:
-    """The hulls of a hollow mesh's convex parts, and notes on how well they follow it."""
+    """Return the hulls of a hollow mesh's convex parts, and notes on how well they follow it."""
     from dexsim.assets.objects.decompose import decompose
 
     vertices, faces = np.unique(triangles.reshape(-1, 3).round(9), axis=0, return_inverse=True)
@@ -110,7 +110,8 @@ def _split(file: Path, triangles: np.ndarray, parts: int) -> tuple[list[np.ndarr
 
 
 def _depth_of_surface(triangles: np.ndarray, hulls: list[np.ndarray], count: int = 3000) -> np.ndarray:
-    """How deep [count] m points of a surface lie in the union of hulls (negative: outside), evenly spread by area."""
+    """Return how deep [count] m points of a surface lie in the union of hulls (negative: outside), evenly spread by
+    area."""
     rng = np.random.default_rng(0)
     area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     chosen = triangles[rng.choice(len(triangles), count, p=area / area.sum())]
@@ -120,7 +121,7 @@ def _depth_of_surface(triangles: np.ndarray, hulls: list[np.ndarray], count: int
 
 
 def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts: int = 1) -> Shape:
-    """A `Shape` of kind "grid" from a mesh file, or from a list of at most three files with its convex parts.
+    """Return a `Shape` of kind "grid" from a mesh file, or from a list of at most three files with its convex parts.
 
     path: .stl, .obj, .ply or .off file, or a list of them whose parts share one frame; each part stands for its hull.
     scale: metres per unit of the file (0.001 for millimetres). parts: how many convex parts a hollow mesh may be split
@@ -151,8 +152,8 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
 
 
 def surface(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
-    """Triangles [T, 3, 3] (m) of the closed surface in a mesh file, outward, and notes. Raises UserError for what is
-    wrong with it."""
+    """Return triangles [T, 3, 3] (m) of the closed surface in a mesh file, outward, and notes. Raises UserError for
+    what is wrong with it."""
     return guard.call(_read, path, scale, what=f"mesh {path}", size=files.check(path, "mesh"))
 
 
@@ -204,7 +205,7 @@ def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: i
 
 
 def _shape_of_parts(name: str, hulls: list[np.ndarray]) -> Shape:
-    """What `shape_from_hulls` makes, of parts that touch."""
+    """Return what `shape_from_hulls` makes, of parts that touch."""
     from dexsim.assets.objects import parts
 
     hulls = [np.asarray(h, np.float32).astype(float) for h in hulls]

@@ -25,12 +25,12 @@ PARTS = 16  # convex parts of a hollow mesh, where nothing is said
 
 
 def is_own(name: str) -> bool:
-    """Whether the name of an object is a path: a mesh file, or a folder."""
+    """Return whether the name of an object is a path: a mesh file, or a folder."""
     return name.lower().endswith(MESHES) or "/" in name or os.sep in name
 
 
 def named(objects: Mapping[str, Any]) -> dict[str, Shape]:
-    """The shapes that a task's `objects` name, by name, those trained on first: of the library, or a user's own
+    """Return the shapes that a task's `objects` name, by name, those trained on first: of the library, or a user's own
     (`own`: their scale and parts). Raises UserError for a name that is neither."""
     from dexsim.assets.objects import library
 
@@ -86,8 +86,8 @@ def _listed(folder: Path) -> list[Path]:
 
 
 def own_shape(name: str, scale: float = 1.0, parts: int = PARTS) -> Shape:
-    """The shape of a mesh file (scale: metres per unit; parts: convex ones at most) or of an imported folder (as it was
-    imported), called `name`. Raises UserError as `load_mesh` does."""
+    """Return the shape of a mesh file (scale: metres per unit; parts: convex ones at most) or of an imported folder (as
+    it was imported), called `name`. Raises UserError as `load_mesh` does."""
     path = files.place(name)
     if os.path.isdir(path):
         files.check(path / FILE, "object")
@@ -120,7 +120,7 @@ def _cached(path: Path, stamp: int, scale: float, parts: int) -> Shape:
 
 
 def cache_folder() -> Path:
-    """Where worked-out meshes are kept: $DEXSIM_CACHE, or dexsim/ in the user's cache."""
+    """Return where worked-out meshes are kept: $DEXSIM_CACHE, or dexsim/ in the user's cache."""
     own = os.environ.get("DEXSIM_CACHE")
     base = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexsim"
     return base / "objects"
@@ -146,7 +146,7 @@ def save(shape: Shape, path: Path) -> None:
 
 
 def _read(path: Path) -> Shape:
-    """What `save` wrote. Raises UserError for anything else."""
+    """Return what `save` wrote. Raises UserError for anything else."""
     try:
         d = files.arrays(path)
         if int(d["format"]) != FORMAT:

@@ -17,7 +17,7 @@ STEP = 5e-4  # m between the points that stand for the surface
 
 
 def distance(hulls: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
-    """Signed distance [P] m (negative inside) of points [P, 3] to the union of hulls [V, 3].
+    """Return signed distance [P] m (negative inside) of points [P, 3] to the union of hulls [V, 3].
 
     Outside it is the largest distance to the planes of the nearest part: exact over faces, a lower bound near edges.
     Inside it is that to the nearest point of the surface, cuts left out, within 0.2 mm.
@@ -64,7 +64,7 @@ def boundary(hulls: Sequence[np.ndarray], step: float, seed: int = 0) -> np.ndar
 
 
 def grid(hulls: Sequence[np.ndarray], spacing: float, margin: float = MARGIN) -> Grid:
-    """The grid of `distance`."""
+    """Return the grid of `distance`."""
     points = np.concatenate(hulls)
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     shape = np.ceil((high - low) / spacing).astype(int) + 1

@@ -22,7 +22,7 @@ class Grid:
     data: np.ndarray  # [nx, ny, nz] m, float32
 
     def sample(self, points: np.ndarray) -> np.ndarray:
-        """Distance [P] at points [P, 3] by trilinear interpolation; points beyond the grid read its border."""
+        """Return distance [P] at points [P, 3] by trilinear interpolation; points beyond the grid read its border."""
         top = np.array(self.data.shape) - 1
         u = np.clip((np.asarray(points, float) - self.origin) / self.spacing, 0, top)
         cell = np.minimum(u.astype(int), top - 1)
@@ -34,7 +34,7 @@ class Grid:
         return value
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
-        """Gradient [P, 3] of `sample` by central differences over half a cell either way (1 / unit length)."""
+        """Return gradient [P, 3] of `sample` by central differences over half a cell either way (1 / unit length)."""
         step = 0.5 * self.spacing
         points = np.asarray(points, float)
         return np.stack([(self.sample(points + d) - self.sample(points - d)) / (2 * step) for d in step * np.eye(3)], 1)
@@ -70,7 +70,7 @@ class Shape:
 
 
 def primitive_mass_properties(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Volume [...] (m^3) and diagonal inertia per kg [..., 3] (m^2) of solid primitives of `size` [..., 3] (m).
+    """Return volume [...] (m^3) and diagonal inertia per kg [..., 3] (m^2) of solid primitives of `size` [..., 3] (m).
 
     Sizes as in MuJoCo. Box: (b^2 + c^2) / 3 for half lengths b, c. Sphere: 2 r^2 / 5. Capsule of radius r and half
     length h: a cylinder and two half spheres, whose centres lie 3 r / 8 beyond its ends.

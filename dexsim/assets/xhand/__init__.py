@@ -37,12 +37,13 @@ OBJECT_BIT, HAND_BIT = 1, 2
 
 
 def xml_path() -> Path:
-    """The committed MJCF; world frame = palm frame (x along the fingers, y to the little finger, z out of the palm)."""
+    """Return the committed MJCF; world frame = palm frame (x along the fingers, y to the little finger, z out of the
+    palm)."""
     return FOLDER / "xhand_right.xml"
 
 
 def hand_spec() -> mujoco.MjSpec:
-    """A fresh `mujoco.MjSpec` of the hand alone, to be extended with objects."""
+    """Return a fresh `mujoco.MjSpec` of the hand alone, to be extended with objects."""
     import mujoco
 
     return mujoco.MjSpec.from_file(str(xml_path()))
@@ -65,29 +66,29 @@ def joint_limits() -> np.ndarray:
 
 
 def efforts() -> np.ndarray:
-    """Largest joint torques [12], N m."""
+    """Return largest joint torques [12], N m."""
     return _joint_column("effort")[:, 0]
 
 
 def speeds() -> np.ndarray:
-    """Largest joint speeds [12], rad/s."""
+    """Return largest joint speeds [12], rad/s."""
     return _joint_column("speed")[:, 0]
 
 
 def pad_of(finger: str) -> str:
-    """Which of the two sensor pads a finger carries: "thumb" or "finger"."""
+    """Return which of the two sensor pads a finger carries: "thumb" or "finger"."""
     if finger not in FINGERS:
         raise ValueError(f"finger {finger!r} is not one of {', '.join(FINGERS)}")
     return "thumb" if finger == "thumb" else "finger"
 
 
 def taxel_path(finger: str) -> Path:
-    """The taxel table of a finger's pad."""
+    """Return the taxel table of a finger's pad."""
     return FOLDER / f"taxels_{pad_of(finger)}.csv"
 
 
 def taxel_table(finger: str) -> dict[str, np.ndarray]:
-    """Taxels of one finger in its distal body's frame.
+    """Return taxels of one finger in its distal body's frame.
 
     Keys: position [120, 3] m, normal [120, 3] unit, out of the pad, tangent [120, 3] unit (the taxel's x axis; its y
     axis is normal x tangent), area [120] m^2. Taxel k = column * 12 + row; rows run from the joint to the tip.
@@ -103,7 +104,8 @@ def taxel_table(finger: str) -> dict[str, np.ndarray]:
 
 
 def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
-    """Closed, convex, watertight fingertip (vertices [n, 3] m, outward triangles [m, 3]) in the distal body's frame.
+    """Return closed, convex, watertight fingertip (vertices [n, 3] m, outward triangles [m, 3]) in the distal body's
+    frame.
 
     It passes through the taxels (within 0.1 mm; the lattice surface is convex to
     0.04 mm); `tip_*` in the MJCF is the same solid with at most 64 vertices.
@@ -113,7 +115,7 @@ def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _tip_skin(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """`tip_skin_mesh` of all fingers with this pad."""
+    """Return `tip_skin_mesh` of all fingers with this pad."""
     from dexsim.assets.objects.geometry import hull_mesh
     from dexsim.assets.xhand.surface import PADS, Lattice, tip_points, to_link, to_sensor
 

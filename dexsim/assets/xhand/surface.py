@@ -64,12 +64,12 @@ class Lattice:
         return np.stack([s.ev(u, v) for s in self._spline], axis=-1)
 
     def normal(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Unit outward normals [..., 3]: d/du (across) x d/dv (along), which points out of the pad."""
+        """Return unit outward normals [..., 3]: d/du (across) x d/dv (along), which points out of the pad."""
         n = np.cross(*self._tangents(u, v))
         return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
     def regular(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Where the two tangents are at least 11 degrees apart, so that the normal is well defined [...] bool.
+        """Return where the two tangents are at least 11 degrees apart, so that the normal is well defined [...] bool.
 
         The thumb lattice's last row runs into its first and last column almost in one line.
         """
@@ -83,13 +83,14 @@ class Lattice:
         return du, dv
 
     def grid(self, nu: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters [nu, nv] of a fine grid that contains the lattice lines' ends and is mirror symmetric."""
+        """Return parameters [nu, nv] of a fine grid that contains the lattice lines' ends and is mirror symmetric."""
         u = np.linspace(self.u[0], self.u[-1], nu)
         v = np.linspace(self.v[0], self.v[-1], nv)
         return np.meshgrid(u, v, indexing="ij")
 
     def taxel_normals(self) -> np.ndarray:
-        """Unit outward normals [10, 12, 3]; the mean of the adjoining facets' where the spline's is ill defined."""
+        """Return unit outward normals [10, 12, 3]; the mean of the adjoining facets' where the spline's is ill
+        defined."""
         at = np.meshgrid(self.u, self.v, indexing="ij")
         p = self.points
         facet = np.cross(p[1:, 1:] - p[:-1, :-1], p[:-1, 1:] - p[1:, :-1])
@@ -101,7 +102,8 @@ class Lattice:
         return np.where(self.regular(*at)[..., None], self.normal(*at), mean)
 
     def taxel_areas(self) -> np.ndarray:
-        """Area of the lattice cell of each taxel [10, 12] m^2: a quarter of every adjoining facet, cut at mid-lines."""
+        """Return area of the lattice cell of each taxel [10, 12] m^2: a quarter of every adjoining facet, cut at
+        mid-lines."""
         p = self.points
         nc, nr = p.shape[:2]
         fine = np.empty((2 * nc - 1, 2 * nr - 1, 3))
@@ -125,7 +127,7 @@ def _chord(points: np.ndarray, axis: int) -> np.ndarray:
 
 def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
                under: float = -2e-5) -> tuple[np.ndarray, np.ndarray]:
-    """Dense points on the distal fingertip: (skin [n, 3], rest [m, 3]) in sensor axes.
+    """Return dense points on the distal fingertip: (skin [n, 3], rest [m, 3]) in sensor axes.
 
     The skin is the lattice surface. The rest (a skirt towards the joint, and the back shell) is ours: as wide and
     deep as the link's bounds, rounded, and kept under the tangent planes of the skin so that the hull of both
@@ -147,7 +149,7 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
     depth = pad.waist - pad.back
 
     def rounded(x: np.ndarray) -> np.ndarray:
-        """Within the link's rounded bounds."""
+        """Tell whether points are within the link's rounded bounds."""
         ok = (x[:, 1] >= pad.start - 1e-9) & (x[:, 1] <= pad.tip)
         low = np.clip(pad.waist - x[:, 2], 0, None) / depth
         end = np.clip(x[:, 1] - b1, 0, None) / (pad.tip + 0.0005 - b1)

@@ -51,7 +51,8 @@ class PadFacts:
     judged: bool = True
 
     def believed(self, setting: str) -> float | None:
-        """What was believed of a setting of the whole world (`PadSettings.shared`), None where this pad cannot say."""
+        """Return what was believed of a setting of the whole world (`PadSettings.shared`), None where this pad cannot
+        say."""
         told = {"object.friction": (self.friction, self.slid), "contact.stiffness": (self.stiffness, True)}
         value, known = told[setting]
         return value if self.judged and known else None
@@ -68,29 +69,30 @@ class PadSettings:
 
 
 def wide(fit: Fit, believed: float | None) -> Fit:
-    """A fit whose range also holds what was believed."""
+    """Return a fit whose range also holds what was believed."""
     return fit if believed is None else (fit[0], min(fit[1], believed), max(fit[2], believed))
 
 
 def absent(fit: Fit, believed: float) -> Fit:
-    """What the other effect of a set would be in the place of the one named: best guess that it is not there, in a
-    range that holds it."""
+    """Return what the other effect of a set would be in the place of the one named: best guess that it is not there, in
+    a range that holds it."""
     return believed, min(fit[1], believed), max(fit[2], believed)
 
 
 def fitted(p: dict[str, Any], believed: float | None, factor: float = 1.0) -> Fit:
-    """(value, low, high) of a parameter, widened to what was believed (in the parameter's unit), times a factor."""
+    """Return (value, low, high) of a parameter, widened to what was believed (in the parameter's unit), times a
+    factor."""
     value, low, high = (float(p[k]) for k in ("value", "low", "high"))
     return times((factor, factor, factor), wide((value, low, high), believed))
 
 
 def times(a: Fit | None, b: Fit) -> Fit:
-    """Products of values and of ends."""
+    """Return products of values and of ends."""
     return b if a is None else (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
 def ranged(fit: Fit, lowest: float, highest: float) -> dict[str, float]:
-    """A fit as the file holds it, inside what is physical."""
+    """Return a fit as the file holds it, inside what is physical."""
     value, low, high = (float(f"{np.clip(x, lowest, highest):.6g}") for x in fit)
     return {"value": value, "low": min(low, value), "high": max(high, value)}
 
@@ -110,7 +112,7 @@ class Variant:
     laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)
 
     def by_law(self) -> list[Variant]:
-        """The variant by its other laws, each with its constants in the place of those of the same columns."""
+        """Return the variant by its other laws, each with its constants in the place of those of the same columns."""
         label = lambda name: f"{self.label}, {name}" if self.label else name  # noqa: E731
         kept = lambda by: tuple(f for f in self.fixed if f[0] not in {name for name, _ in by})  # noqa: E731
         return [replace(self, label=label(name), fixed=(*kept(by), *by), laws=()) for name, by in self.laws]
@@ -137,7 +139,7 @@ class FittedEffect:
         return "m" if self.case.scales.slide else "rad"
 
     def entry(self, key: str, unit: str, add: float = 0.0, times: float = 1.0) -> dict[str, Any]:
-        """A parameter as `diagnosis.json` has it, (x + add) * times."""
+        """Return a parameter as `diagnosis.json` has it, (x + add) * times."""
         value, low, high = ((x + add) * times for x in (self.value[key], *self.interval[key]))
         return entry(value, low, high, unit)
 
@@ -157,18 +159,18 @@ class ByTorque:
     length: str
 
     def entry(self, unit: str, times: float = 1.0, over: float = 1.0) -> dict[str, Any]:
-        """The coefficient as `diagnosis.json` has it, times x / over."""
+        """Return the coefficient as `diagnosis.json` has it, times x / over."""
         return entry(times * self.value / over, times * self.low / over, times * self.high / over, unit)
 
 
 def entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
-    """A number with its interval as `diagnosis.json` has it."""
+    """Return a number with its interval as `diagnosis.json` has it."""
     low, high = min(low, high), max(low, high)
     return {"value": float(value), "low": float(low), "high": float(high), "unit": unit}
 
 
 def word(value: str) -> dict[str, Any]:
-    """A parameter that is a word."""
+    """Return a parameter that is a word."""
     return {"value": value, "low": None, "high": None, "unit": ""}
 
 
@@ -181,7 +183,7 @@ def param(
     start: float = 0.0,
     unit: str = "1",
 ) -> Param:
-    """A `Param` of one column or several."""
+    """Return a `Param` of one column or several."""
     columns = (column,) if isinstance(column, str) else tuple(column)
     return Param(key, columns, mode, float(low), float(high), float(start), unit)
 
@@ -232,28 +234,28 @@ class Effect:
     on_rotor: ClassVar[tuple[str, ...]] = ()  # columns with which it is given the rotor's inertia, if no model has one
 
     def variants(self, s: Scales) -> list[Variant]:
-        """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
+        """Return the ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
         raise NotImplementedError
 
     def unseen(self, s: Scales) -> str:
-        """Why a joint's motion cannot show it; empty where it can."""
+        """Return why a joint's motion cannot show it; empty where it can."""
         return "" if self.variants(s) else "these recordings cannot show it"
 
     def without(self, s: Scales) -> dict[str, str]:
-        """Kinds of it that are left out on a joint that can show others, each with the reason."""
+        """Return kinds of it that are left out on a joint that can show others, each with the reason."""
         return {}
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
-        """[n] how strongly it acts at each measured sample: its own torque, or the signal that it changes."""
+        """Return [n] how strongly it acts at each measured sample: its own torque, or the signal that it changes."""
         return np.ones_like(case.regimes["speed"])
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        """Parameters by the keys of `diagnosis.json`, with 90 % intervals."""
+        """Return parameters by the keys of `diagnosis.json`, with 90 % intervals."""
         raise NotImplementedError
 
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
-        """What it adds to the torque per unit of its coefficient, as columns [m] of what inverse dynamics filtered; by
-        `by_torque`, behind it in brackets what else its law was given. own: what is fitted."""
+        """Return what it adds to the torque per unit of its coefficient, as columns [m] of what inverse dynamics
+        filtered; by `by_torque`, behind it in brackets what else its law was given. own: what is fitted."""
         return {}
 
     @property
@@ -262,46 +264,47 @@ class Effect:
         return self.shows
 
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
-        """The same where logged torque showed it and not the motion: for those of `search.inverse_dynamics`."""
+        """Return the same where logged torque showed it and not the motion: for those of `search.inverse_dynamics`."""
         raise NotImplementedError
 
     def size_by_torque(self, found: ByTorque) -> str:
-        """Its size for the line about logged torque, with its unit; empty where the coefficient says it."""
+        """Return its size for the line about logged torque, with its unit; empty where the coefficient says it."""
         return ""
 
     def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        """Whether a coefficient of inverse dynamics can be what it is called. joint: as of `ByTorque`; slowest: the
-        lowest cutoff [Hz] of what was filtered."""
+        """Return whether a coefficient of inverse dynamics can be what it is called. joint: as of `ByTorque`; slowest:
+        the lowest cutoff [Hz] of what was filtered."""
         return True
 
     def impossible_by_torque(self, value: float, joint: dict[str, float]) -> str:
-        """Why such a coefficient is told as a refusal where it is not possible; empty where it is not. The arguments:
-        as of `possible_by_torque`."""
+        """Return why such a coefficient is told as a refusal where it is not possible; empty where it is not. The
+        arguments: as of `possible_by_torque`."""
         return ""
 
     def columns_beside(self, variant: Variant, joints: Sequence[str]) -> dict[str, float]:
-        """Servo columns that go with a kind of it beside its fitted ones: what that kind sets, and of one that another
-        joint has part in, the number of that joint among the mechanism's."""
+        """Return servo columns that go with a kind of it beside its fitted ones: what that kind sets, and of one that
+        another joint has part in, the number of that joint among the mechanism's."""
         out = {name: value for name, value in variant.fixed if name in SERVO_INDEX}
         if "coupling_from" in out:
             out["coupling_from"] = float(joints.index(variant.note["from_joint"]))
         return out
 
     def lacks(self, variant: Variant) -> tuple[str, str] | None:
-        """Of what training has no law as it was fitted, and what it is given in its place; None where it has all."""
+        """Return of what training has no law as it was fitted, and what it is given in its place; None where it has
+        all."""
         return None
 
     def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
-        """Servo columns in the place of those `approximated`. row: the plant's, as fitted."""
+        """Return servo columns in the place of those `approximated`. row: the plant's, as fitted."""
         return {}
 
     def said(self, finding: Finding, believed: dict[str, float]) -> str:
-        """What it does, in words, with its direction where its size tells that. believed: columns of the joint,
+        """Return what it does, in words, with its direction where its size tells that. believed: columns of the joint,
         its model's friction included."""
         return self.words
 
     def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        """Whether it is a torque that follows the pose and changes slowly along it."""
+        """Return whether it is a torque that follows the pose and changes slowly along it."""
         return False
 
     def impossible(self, values: dict[str, float], case: Case) -> str:
@@ -309,16 +312,16 @@ class Effect:
         return ""
 
     def doubts(self, case: Case, runs: Sequence[int]) -> list[str]:
-        """Reasons of its own to doubt it, from the recordings that were used."""
+        """Return reasons of its own to doubt it, from the recordings that were used."""
         return []
 
     def begun_from(self, columns: dict[str, float], case: Case) -> list[tuple[float, ...]]:
-        """Where a fit of its first variant begins to be the same torque as these columns' values are; empty where none
-        is."""
+        """Return where a fit of its first variant begins to be the same torque as these columns' values are; empty
+        where none is."""
         return []
 
     def excludes(self, mine: Variant, other: Effect, theirs: Variant) -> bool:
-        """Whether it and another effect replace one another: both at once mean nothing."""
+        """Return whether it and another effect replace one another: both at once mean nothing."""
         return False
 
     def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
@@ -352,31 +355,31 @@ class TouchEffect:
     words_beside: ClassVar[dict[str, str]] = {}  # parameters that are words
 
     def possible(self, search: PadSearch) -> bool:
-        """Whether the recordings of a pad can show it."""
+        """Return whether the recordings of a pad can show it."""
         return True
 
     def begin(self, search: PadSearch) -> list[dict[str, float]]:
-        """Values of its parameters to begin from."""
+        """Return values of its parameters to begin from."""
         return [dict(zip(self.fits, s, strict=True)) for s in self.starts]
 
     def in_place(self, values: dict[str, float], base: TouchTrial, current: TouchTrial) -> dict[str, float]:
-        """Where its fit begins in the place of a member of `current`; values: of its own trial so far; base: `current`
-        without that member."""
+        """Return where its fit begins in the place of a member of `current`; values: of its own trial so far; base:
+        `current` without that member."""
         return values
 
     def changes(self, run: PadRun, t: TouchTrial, base: dict[str, float]) -> np.ndarray:
-        """[S] by how much it changes the readings of a recording [N]; base: values at which nothing is there."""
+        """Return [S] by how much it changes the readings of a recording [N]; base: values at which nothing is there."""
         neutral = t.values | {k: base[k] for k in self.fits}
         if self.stage == "cell" and run.load is not None:
             return np.interp(run.t, run.grid, np.abs(contact(run, t.values)[0] - contact(run, neutral)[0]))
         return np.abs(readings(run, t.values, t.gains, t.order) - readings(run, neutral, t.gains, t.order)).max(1)
 
     def doubt(self, finding: Finding) -> str:
-        """A reason of its own to doubt a finding; empty for none."""
+        """Return a reason of its own to doubt a finding; empty for none."""
         return ""
 
     def drift(self, finding: Finding, fact: PadFacts) -> Fit | None:
-        """Factor on all gains of the pad over the recordings; None where it is none."""
+        """Return factor on all gains of the pad over the recordings; None where it is none."""
         return None
 
     def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:

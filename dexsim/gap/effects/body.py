@@ -178,8 +178,8 @@ class Payload(Effect):
 
 
 def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """[3] m: where the added mass sits in the last link's frame, with its interval. Along the hinge the joint feels
-    nothing: there it is taken to sit as the link's own centre does."""
+    """Return [3] m: where the added mass sits in the last link's frame, with its interval. Along the hinge the joint
+    feels nothing: there it is taken to sit as the link's own centre does."""
     c = case.constants
     assert c.places is not None  # such a variant is only of a joint that has them
     value = c.centre + raw["com_out"] * c.places[0] + raw["com_across"] * c.places[1]

@@ -70,7 +70,8 @@ Entry = TypeVar("Entry", Effect, TouchEffect)
 
 
 def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[str]) -> tuple[Entry, ...]:
-    """An entry of each class of a kind that stands in the files of these families: to write it there is to add it."""
+    """Return an entry of each class of a kind that stands in the files of these families: to write it there is to add
+    it."""
     found: list[Entry] = [
         c()
         for family in families
@@ -81,8 +82,8 @@ def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[
 
 
 def _brought(kind: type[Entry]) -> list[Entry]:
-    """Those of installed packages: entry points of the group `dexsim.effects`. Raises UserError for one that is no
-    effect."""
+    """Return those of installed packages: entry points of the group `dexsim.effects`. Raises UserError for one that is
+    no effect."""
     out: list[Entry] = []
     for name, point in door.installed("dexsim.effects").items():
         made = door.load(point.value, f"effect {name} (entry point of dexsim.effects)")
@@ -94,7 +95,7 @@ def _brought(kind: type[Entry]) -> list[Entry]:
 
 
 def in_order(found: Sequence[Entry], first: Sequence[str]) -> tuple[Entry, ...]:
-    """Entries with those of the ids `first` before all others."""
+    """Return entries with those of the ids `first` before all others."""
     return tuple(sorted(found, key=lambda e: first.index(e.id) if e.id in first else len(first)))
 
 
@@ -133,9 +134,9 @@ TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
 
 
 def at_one_load(case: Case, runs: Sequence[int]) -> bool:
-    """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and
-    one that does not are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its
-    mean."""
+    """Return whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with
+    it and one that does not are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of
+    its mean."""
     slides = case.regimes["speed"] > JUDGE.slides * case.scales.speed
     load = np.abs(case.regimes["_load"][slides & np.isin(case.plant.run_of, runs)])
     return bool(len(load)) and float(load.std()) < JUDGE.one_load * float(load.mean())
@@ -147,12 +148,12 @@ others."""
 
 
 def members(name: str) -> frozenset[str]:
-    """The effects of one class of `CLASSES`."""
+    """Return the effects of one class of `CLASSES`."""
     return frozenset(e for e, x in EFFECTS.items() if name in x.classes)
 
 
 def separating(effects: Sequence[str]) -> str:
-    """The experiment that tells effects of one class apart; the first one's own where they are of none."""
+    """Return the experiment that tells effects of one class apart; the first one's own where they are of none."""
     for name, experiment in CLASSES.items():
         if set(effects) <= members(name):
             return experiment
@@ -160,51 +161,53 @@ def separating(effects: Sequence[str]) -> str:
 
 
 def confusable(a: str, b: str) -> bool:
-    """Whether two effects of joints are of one class that some recordings cannot separate."""
+    """Return whether two effects of joints are of one class that some recordings cannot separate."""
     return bool({*EFFECTS[a].classes} & {*EFFECTS[b].classes}) if a in EFFECTS and b in EFFECTS else False
 
 
 def nested(a: str, b: str) -> bool:
-    """Whether one of two effects is the other with a size of nothing: one torque while the joint moves."""
+    """Return whether one of two effects is the other with a size of nothing: one torque while the joint moves."""
     return a in EFFECTS[b].nests or b in EFFECTS[a].nests
 
 
 def inseparable(effect: str, case: Case, runs: Sequence[int]) -> list[str]:
-    """Effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`BLIND`)."""
+    """Return effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`BLIND`)."""
     blind = [c for c in EFFECTS[effect].classes if c in BLIND and BLIND[c](case, runs)]
     return [e for e in EFFECTS if e != effect and {*EFFECTS[e].classes} & {*blind}]
 
 
 def touch_confusable(a: str, b: str) -> bool:
-    """Whether two effects of touch are of one class that some recordings cannot separate."""
+    """Return whether two effects of touch are of one class that some recordings cannot separate."""
     return bool({*TOUCH_EFFECTS[a].classes} & {*TOUCH_EFFECTS[b].classes})
 
 
 def touch_compatible(effect: TouchEffect, ids: Sequence[str]) -> bool:
-    """Whether an effect of touch may be there beside others: none replaces another."""
+    """Return whether an effect of touch may be there beside others: none replaces another."""
     return not any(e in effect.excludes or effect.id in TOUCH_EFFECTS[e].excludes for e in ids)
 
 
 def compatible(a: Effect, mine: Variant, b: Effect, theirs: Variant) -> bool:
-    """Whether two effects may be there at once: they act on columns of their own, and neither replaces the other."""
+    """Return whether two effects may be there at once: they act on columns of their own, and neither replaces the
+    other."""
     if a.excludes(mine, b, theirs) or b.excludes(theirs, a, mine):
         return False
     return not ({c for p in mine.params for c in p.columns} & {c for p in theirs.params for c in p.columns})
 
 
 def model_columns() -> frozenset[str]:
-    """Columns of the plant that are fields of the model."""
+    """Return columns of the plant that are fields of the model."""
     return frozenset(c for e in CATALOGUE for c in e.model_columns)
 
 
 def modelled(finding: Finding) -> bool:
-    """Whether a finding is of an effect that the plant has a law of: not a bad channel, nor a push from outside."""
+    """Return whether a finding is of an effect that the plant has a law of: not a bad channel, nor a push from
+    outside."""
     e = entry(finding)
     return e is not None and e.simulated
 
 
 def entry(finding: Finding) -> Effect | TouchEffect | None:
-    """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
+    """Return the catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
     if finding.joints:
         return EFFECTS.get(finding.effect)
     return TOUCH_EFFECTS.get(finding.effect)

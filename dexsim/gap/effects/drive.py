@@ -59,7 +59,7 @@ class TorqueLimit(Effect):
 
 
 def lost(s: Scales, m: dict[str, np.ndarray], limit: float, no_load_speed: float) -> np.ndarray:
-    """[n] torque that the drive would give by its believed limits and does not give by these."""
+    """Return [n] torque that the drive would give by its believed limits and does not give by these."""
     asked, v = m["_asked"], m["_speed"]
 
     def give(most: float, fastest: float) -> np.ndarray:
@@ -267,8 +267,8 @@ class Thermal(Effect):
 
 
 def temperature_follows(case: Case, runs: Sequence[int]) -> str:
-    """What the temperature follows, in words: the clock since the first recording (then whatever drifts looks like
-    heat), or the gain that the drive was set to; empty where it follows neither."""
+    """Return what the temperature follows, in words: the clock since the first recording (then whatever drifts looks
+    like heat), or the gain that the drive was set to; empty where it follows neither."""
     if "temperature" not in case.regimes or not len(runs):
         return ""
     warm, clock = [], []
@@ -289,7 +289,7 @@ def temperature_follows(case: Case, runs: Sequence[int]) -> str:
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's, with ties at their middle rank; 0 where one does not change."""
+    """Return Spearman's, with ties at their middle rank; 0 where one does not change."""
     if np.ptp(a) <= 0 or np.ptp(b) <= 0:
         return 0.0
 

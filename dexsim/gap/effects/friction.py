@@ -178,7 +178,7 @@ class StribeckFriction(Effect):
 
 
 def _falling(d: Columns, speed: float) -> np.ndarray:
-    """[m] dry friction of one that falls with speed [rad/s], exp(-(v / speed)^2)."""
+    """Return [m] dry friction of one that falls with speed [rad/s], exp(-(v / speed)^2)."""
     return d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / speed) ** 2)))
 
 
@@ -245,7 +245,7 @@ class LoadFriction(Effect):
 
 
 def give(s: Scales) -> float:
-    """How far any dry friction may give way before it slides [rad or m]."""
+    """Return how far any dry friction may give way before it slides [rad or m]."""
     return BELIEF.gives_slide if s.slide else BELIEF.gives
 
 
@@ -294,12 +294,12 @@ class Presliding(Effect):
 
 
 def _gives(d: Columns, way: float) -> np.ndarray:
-    """[m] dry friction of one that is taken up over a way [rad], less what is there at once."""
+    """Return [m] dry friction of one that is taken up over a way [rad], less what is there at once."""
     return d.column(lambda q, v, load: taken_up(q, way) - np.sign(v))
 
 
 def taken_up(q: np.ndarray, distance: float) -> np.ndarray:
-    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
+    """Return [n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
     exactly (P. Dahl 1968)."""
     z, out = 0.0, np.empty(len(q))
     steps = np.diff(q, prepend=q[0])

@@ -47,7 +47,7 @@ class TactileGain(TouchEffect):
 
 
 def gains(finding: Finding, pad: PadSettings, doubt: bool) -> str:
-    """Gains into a pad's settings; returns what is left out, in words."""
+    """Return gains into a pad's settings; returns what is left out, in words."""
     p, taxels, fact = finding.parameters["gain"], finding.parameters.get("taxels", {}), pad.fact
     whole = fact.common or fact.rest
     if whole is not None:

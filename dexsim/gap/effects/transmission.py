@@ -54,7 +54,7 @@ class Backlash(Effect):
 
 
 def near_sign_change(case: Case, x: np.ndarray, seconds: float) -> np.ndarray:
-    """[n] 1 about where x [n] changes sign within a run: a quarter of `seconds` before, the rest after."""
+    """Return [n] 1 about where x [n] changes sign within a run: a quarter of `seconds` before, the rest after."""
     t, run = case.plant.t, case.plant.run_of
     out = np.zeros(len(t))
     change = np.flatnonzero((np.sign(x[1:]) != np.sign(x[:-1])) & (run[1:] == run[:-1]))

@@ -46,8 +46,8 @@ class Noise:
     lowered: tuple[str, ...] = ()
 
     def at_most(self, left: dict[str, float]) -> Noise:
-        """The floor, where repeats differ by what was found (a drive that is warmer in one of them): what they differ
-        by beyond it [rad or m, by joint] is then less, and is the floor."""
+        """Return the floor, where repeats differ by what was found (a drive that is warmer in one of them): what they
+        differ by beyond it [rad or m, by joint] is then less, and is the floor."""
         lower = {j: x for j, x in left.items() if JUDGE.within * x < self.joints[j]}
         if not lower:
             return self
@@ -166,8 +166,8 @@ def candidates(
     told: Mapping[str, logged_torque.Told],
     joints: Sequence[str],
 ) -> tuple[dict[str, list[Candidate]], dict[str, str]]:
-    """(of each joint the ways in which it may be written, joints of which what was found is none of them, with the
-    reason). told: friction that the recorded torque tells, which goes over each; joints: of the mechanism.
+    """Return (of each joint the ways in which it may be written, joints of which what was found is none of them, with
+    the reason). told: friction that the recorded torque tells, which goes over each; joints: of the mechanism.
 
     Not what a recorded motion forbids. No free run keeps step with a joint that rings by itself: of it what was found
     is written, unless the error of what was held out surely rises by it. That explains an error that does not fall, not
@@ -213,8 +213,8 @@ def _nothing(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
 def _write(
     a: JointAnswer, trial: Trial, joints: Sequence[str], whole: bool
 ) -> Callable[[ServoTable, mujoco.MjSpec], list[str]]:
-    """What writes a fitted hypothesis of a joint, with intervals, into the files' content; whole: all of it that they
-    have a place for."""
+    """Return what writes a fitted hypothesis of a joint, with intervals, into the files' content; whole: all of it that
+    they have a place for."""
     found = trial is a.best
     bounds = a.bounds if found else a.search.widen(trial, intervals(trial.fit, a.search.blocks, huber=a.search.r.huber))
 
@@ -240,7 +240,7 @@ def _rings(a: JointAnswer) -> float:
 def _take_back(
     d: Diagnosis, answers: Sequence[JointAnswer], findings: list[Finding], rings: dict[str, float]
 ) -> set[str]:
-    """Joints whose findings did not help on what was held out: they keep none of them, and are left as they were
+    """Return joints whose findings did not help on what was held out: they keep none of them, and are left as they were
     believed. rings: of `_rings`, by joint: no free run keeps step with those."""
     refuted = set()
     for a in answers:
@@ -273,7 +273,7 @@ def _take_back(
 
 
 def _less(a: float, b: float) -> bool:
-    """Whether an error (rms) is less than another, the squares of which do not tie."""
+    """Return whether an error (rms) is less than another, the squares of which do not tie."""
     return a**2 < (1 - SEARCH.tie) * b**2
 
 
@@ -313,7 +313,7 @@ def _judged(
     quiet: bool,
     noise: Noise,
 ) -> Judged:
-    """Errors over all joints on what was held out."""
+    """Return errors over all joints on what was held out."""
     slide, names = all(x.case.constants.slide for x in answers), [kept.runs[i].name for i in kept.test]
 
     def position(on: Sequence[np.ndarray], how: str) -> dict[str, Any]:
@@ -363,7 +363,7 @@ def _loud(answers: Sequence[JointAnswer], kept: Kept, noise: Noise) -> tuple[str
 def _error(
     name: str, before: Sequence[float | None], after: Sequence[float | None], recordings: Sequence[str], how: str
 ) -> dict[str, Any]:
-    """An entry of `held_out`. before, after: value, low and high."""
+    """Return an entry of `held_out`. before, after: value, low and high."""
     keys = ("before", "before_low", "before_high", "after", "after_low", "after_high")
     values = dict(zip(keys, [*before, *after], strict=True))
     order = ("before", "after", "before_low", "before_high", "after_low", "after_high")
@@ -371,8 +371,8 @@ def _error(
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Finding]) -> list[str]:
-    """Joints without a finding of which what was held out is missed by far more than the noise, and what was fitted is
-    not: what is missing (a limit, a sag) shows there alone, and what is held out must not be fitted."""
+    """Return joints without a finding of which what was held out is missed by far more than the noise, and what was
+    fitted is not: what is missing (a limit, a sag) shows there alone, and what is held out must not be fitted."""
     found = {j for f in findings for j in f.joints}
     return [
         j
@@ -382,10 +382,10 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Findi
 
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
-    """Why findings that do not lessen the error of a free run over what was held out (after / before: `ratio`) are
-    doubted, not dropped; empty where they are refuted. One stick more or less sends a free run another way; and a limit
-    may just not have been reached there. What the recorded torque has told of a joint is known: nothing that is not
-    shown goes beyond it."""
+    """Return why findings that do not lessen the error of a free run over what was held out (after / before: `ratio`)
+    are doubted, not dropped; empty where they are refuted. One stick more or less sends a free run another way; and a
+    limit may just not have been reached there. What the recorded torque has told of a joint is known: nothing that is
+    not shown goes beyond it."""
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
@@ -413,8 +413,8 @@ def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> li
 
 
 def _elsewhere(channel: Finding, kept: Kept) -> bool:
-    """Whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or with all
-    of it: that casts no doubt on what the other recordings tell of it."""
+    """Return whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or
+    with all of it: that casts no doubt on what the other recordings tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
     judged = {run.name for run in kept.runs}
     return bool(channel.when) and all(
@@ -423,8 +423,8 @@ def _elsewhere(channel: Finding, kept: Kept) -> bool:
 
 
 def _linkages(findings: list[Finding], answers: Sequence[JointAnswer]) -> list[Finding]:
-    """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is
-    the end that is dragged, where one of them feels only the pull; the name is as sure as its surer end."""
+    """Return the findings with every linkage once: two joints of which each is dragged by the other are its two ends.
+    Kept is the end that is dragged, where one of them feels only the pull; the name is as sure as its surer end."""
     pulled = {
         a.case.joint
         for a in answers
@@ -450,7 +450,7 @@ def _linkages(findings: list[Finding], answers: Sequence[JointAnswer]) -> list[F
 
 
 def _weight(f: Finding, rings: dict[str, float]) -> float:
-    """How much of the error on what was held out a finding removes; of a joint that rings (`_rings`), of how it
+    """Return how much of the error on what was held out a finding removes; of a joint that rings (`_rings`), of how it
     rings."""
     h, share = f.held_out, rings.get(f.joints[0]) if f.joints else None
     return (h["before"] - h["after"] if share is None else share * h["before"]) if h else 0.0
@@ -483,7 +483,7 @@ def add_behind(d: Diagnosis, findings: list[Finding], by_torque: Sequence[logged
 
 
 def _followed(d: Diagnosis, joint: str) -> bool:
-    """Whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
+    """Return whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
     out."""
     named = any(f.confidence >= JUDGE.firm and joint in f.joints and f.held_out
                 for f in d.findings)  # fmt: skip
@@ -535,8 +535,8 @@ def decide(d: Diagnosis) -> None:
 
 
 def _decided(d: Diagnosis) -> Verdict:
-    """Which findings are hints, the verdict with the error that it goes by, and how much of the gap is left. Nothing
-    else decides any of these."""
+    """Return which findings are hints, the verdict with the error that it goes by, and how much of the gap is left.
+    Nothing else decides any of these."""
     felt = d.touch
     mine, of_touch = held_out.settle(d.findings), [] if felt is None else held_out.settle(felt.findings)
     joints, error = ("unusable", None) if d.judged is None else _of_joints(mine, d.judged, _floor(d))
@@ -560,7 +560,7 @@ def _decided(d: Diagnosis) -> Verdict:
 
 
 def _unjudged(data: dict[str, Any], by: Judged | None) -> str:
-    """Which regimes only what was held out visits, where they are left out of the verdict or may be why it is
+    """Return which regimes only what was held out visits, where they are left out of the verdict or may be why it is
     unknown."""
     regimes = data["held_out"].get("not_judged")
     left_out = by is not None and by.shown is not None and data["held_out"]["how"] == by.shown[0]["how"]
@@ -570,13 +570,13 @@ def _unjudged(data: dict[str, Any], by: Judged | None) -> str:
 
 
 def _floor(d: Diagnosis) -> float:
-    """Of the joints' position error [rad or m]; 0 where none is judged."""
+    """Read the joints' position error [rad or m]; 0 where none is judged."""
     return d.data["noise_floor"]["position_rad"] or 0.0
 
 
 def _of_joints(findings: Sequence[Finding], by: Judged, floor: float) -> tuple[str, dict[str, Any]]:
-    """The word for the joints, and the error that it goes by: that of the torque where nothing but that names anything,
-    that of the effort where nothing but its reading is wrong, of the motion otherwise."""
+    """Return the word for the joints, and the error that it goes by: that of the torque where nothing but that names
+    anything, that of the effort where nothing but its reading is wrong, of the motion otherwise."""
     behind = [f for f in held_out.firm(findings) if by.torque is not None and _by_torque(f)]
     named = [f for f in held_out.firm(findings) if not _by_torque(f)]
     if behind and not named and by.torque is not None:
@@ -598,12 +598,12 @@ def _of_joints(findings: Sequence[Finding], by: Judged, floor: float) -> tuple[s
 
 
 def _by_torque(f: Finding) -> bool:
-    """Whether a finding was judged by its torque alone (`add_behind`)."""
+    """Return whether a finding was judged by its torque alone (`add_behind`)."""
     return bool(f.held_out) and (f.held_out or {}).get("error", "").startswith("effort")
 
 
 def _of_touch(felt: TouchResult, findings: Sequence[Finding]) -> str | None:
-    """The word for touch alone; None where it was not judged."""
+    """Return the word for touch alone; None where it was not judged."""
     named = [f for f in findings if not f.hint]
     if felt.before is None:
         return "explained" if named else None
@@ -615,7 +615,7 @@ def _of_touch(felt: TouchResult, findings: Sequence[Finding]) -> str | None:
 
 
 def _of_both(joints: str, touch: str) -> str:
-    """The word for joints and touch."""
+    """Return the word for joints and touch."""
     if joints in ("unusable", "none"):
         return touch
     return joints if touch in ("none", joints) else "partly_explained"
@@ -648,8 +648,8 @@ def _left_of_gap(d: Diagnosis, error: dict[str, Any]) -> float | None:
 
 
 def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:
-    """Effect id (and kind of it, where others of it are considered) -> why it was not considered on any joint or pad
-    (or on which), in the catalogue's order.
+    """Return effect id (and kind of it, where others of it are considered) -> why it was not considered on any joint or
+    pad (or on which), in the catalogue's order.
 
     cases: `plant.case.Case`."""
     out: dict[str, str] = {}
@@ -686,7 +686,7 @@ def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] 
 
 
 def _by_joint(given: dict[str, str]) -> str:
-    """Reasons by joint, said once where they are one; joints without one are left out."""
+    """Return reasons by joint, said once where they are one; joints without one are left out."""
     lacking = {j: r for j, r in given.items() if r}
     if len(lacking) == len(given) and len(set(lacking.values())) == 1:
         return next(iter(lacking.values()))
@@ -695,7 +695,8 @@ def _by_joint(given: dict[str, str]) -> str:
 
 
 def not_fitted(cases: Sequence) -> list[str]:
-    """Columns that the servo's file says are unknown and that are not refitted, by joints: what is done instead."""
+    """Return columns that the servo's file says are unknown and that are not refitted, by joints: what is done
+    instead."""
     by: dict[str, list[str]] = {}
     for c in cases:
         for name in c.unknown:
@@ -712,7 +713,7 @@ def not_fitted(cases: Sequence) -> list[str]:
 
 
 def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
-    """The verdict in one or two sentences."""
+    """Return the verdict in one or two sentences."""
     h = data["held_out"]
     metric = h["error"]
     effort, unit = metric.startswith("effort"), _unit(metric)
@@ -776,7 +777,7 @@ def _where_judged(h: dict) -> str:
 
 
 def _unit(metric: str) -> str:
-    """The thousandth in which an error is told, of `held_out.error`."""
+    """Return the thousandth in which an error is told, of `held_out.error`."""
     if metric.startswith("effort"):
         return "mN" if metric.endswith("_N") else "mN.m"
     if metric.startswith("tactile"):
@@ -785,7 +786,7 @@ def _unit(metric: str) -> str:
 
 
 def _first_of_all(findings: list[Finding], bad: list[Finding], d: Diagnosis) -> str:
-    """What comes before the verdict: signals that are not what they say (`bad`), and pushes from outside."""
+    """Return what comes before the verdict: signals that are not what they say (`bad`), and pushes from outside."""
     said = (
         f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} "
         f"({bad[0].regime}). "
@@ -800,7 +801,7 @@ def _first_of_all(findings: list[Finding], bad: list[Finding], d: Diagnosis) -> 
 
 
 def _names(named: list[Finding], d: Diagnosis) -> str:
-    """The two largest effects, where they sit, and how many more there are."""
+    """Return the two largest effects, where they sit, and how many more there are."""
     parts = []
     for f in named[:2]:
         words = words_of(f, d.mechanism)
@@ -820,7 +821,7 @@ FINGERS = {"thumb": "the thumb", "mid": "the middle finger", "pinky": "the littl
 
 
 def spoken(f: Finding, m: Mechanism | None) -> str:
-    """Where a finding sits as a person says it: a hand's joints by finger, another mechanism's by name."""
+    """Return where a finding sits as a person says it: a hand's joints by finger, another mechanism's by name."""
     if len(f.joints) != 1:
         return place(f, m)
     joint = f.joints[0]
@@ -837,7 +838,7 @@ def spoken(f: Finding, m: Mechanism | None) -> str:
 
 
 def words_of(f: Finding, m: Mechanism | None) -> str:
-    """What an effect does, in words, with its direction where its size tells that."""
+    """Return what an effect does, in words, with its direction where its size tells that."""
     joint, effect = next(iter(f.joints), None), entry(f)
     assert effect is not None  # what has words is of the catalogue
     if joint is None or not isinstance(effect, Effect):
@@ -852,7 +853,7 @@ def words_of(f: Finding, m: Mechanism | None) -> str:
 
 
 def place(f: Finding, m: Mechanism | None) -> str:
-    """Where a finding sits, in words."""
+    """Return where a finding sits, in words."""
     if f.joints:
         return ", ".join(f.joints)
     if f.taxels and m is not None:
@@ -869,7 +870,7 @@ def place(f: Finding, m: Mechanism | None) -> str:
 
 
 def _size(f: Finding) -> str:
-    """The first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
+    """Return the first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
     name, p = next(iter(f.parameters.items()), (None, None))
     if name is None or p is None or p["value"] is None or isinstance(p["value"], str):
         return ""

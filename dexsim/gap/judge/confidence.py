@@ -58,8 +58,8 @@ class Evidence:
 
 
 def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> bool:
-    """Whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far as it
-    is believed."""
+    """Return whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far
+    as it is believed."""
     sizes = [p for p in params if p.key not in SHAPES]
     for p in sizes:
         low, high = spread[p.key]
@@ -77,8 +77,8 @@ def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case
 
 
 def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> str:
-    """Key of a size whose 90 % interval reaches, away from nothing, to the end of what is looked for: how large it is
-    is not known; empty where none does."""
+    """Return key of a size whose 90 % interval reaches, away from nothing, to the end of what is looked for: how large
+    it is is not known; empty where none does."""
     for p in params:
         if p.key in SHAPES:
             continue
@@ -119,13 +119,13 @@ def trusted(before: float, after: float, noise: float) -> float:
 
 
 def kept_of(left: float) -> float:
-    """The same of the share `left` that stays unexplained."""
+    """Return the same of the share `left` that stays unexplained."""
     return 1.0 - JUDGE.left_costs * min(left / JUDGE.removed, 1.0)
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
-    """Why an effect is too small to be sure of: it leaves the error held out (rms, without and with it) where nothing
-    is asked for, or is small beside what others removed of the error before; empty where it is not."""
+    """Return why an effect is too small to be sure of: it leaves the error held out (rms, without and with it) where
+    nothing is asked for, or is small beside what others removed of the error before; empty where it is not."""
     if without <= JUDGE.within * noise:
         return "without it the error held out is hardly above the noise"
     if not alone and without**2 - after**2 < JUDGE.least_share * max(before, without) ** 2:
@@ -134,9 +134,9 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
 
 
 def unresolved(without: float, after: float, quantum: float) -> str:
-    """Why an effect is below what the encoder resolves: what it does to the motion held out, rms, is less than half a
-    count (`quantum`, rad or m), so that a reading seldom changes for it; empty where it is not. without, after: rms
-    error without and with the effect."""
+    """Return why an effect is below what the encoder resolves: what it does to the motion held out, rms, is less than
+    half a count (`quantum`, rad or m), so that a reading seldom changes for it; empty where it is not. without, after:
+    rms error without and with the effect."""
     moved = float(np.sqrt(max(without**2 - after**2, 0.0)))
     return (
         ""
@@ -146,7 +146,8 @@ def unresolved(without: float, after: float, quantum: float) -> str:
 
 
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
-    """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
+    """Return the confidence of one finding by itself: its share, what it earned, what stays unexplained, and its
+    reasons."""
     c = e.share * e.earned * trusted(before, after, noise)
     if e.members > 1:  # of what the others leave it has to explain most
         c *= trusted(without, after, noise)

@@ -138,7 +138,7 @@ class Written:
     replayed: Replayed | None = None
 
     def candidate(self, joint: str) -> Candidate:
-        """What is written of a joint."""
+        """Return what is written of a joint."""
         return next(c for c in self.candidates[joint] if c.name == self.chosen[joint])
 
     def plain(self, joint: str) -> bool:
@@ -146,14 +146,14 @@ class Written:
         return self.chosen[joint] == "plain"
 
     def beaten(self, joint: str, noise: float) -> bool:
-        """Whether the plain model of a joint is written although something was found, and follows better in the
+        """Return whether the plain model of a joint is written although something was found, and follows better in the
         search's own plant too. noise: of the joint [rad or m]."""
         plant = {c.name: c.plant for c in self.candidates[joint]}
         alike = max((1 + BELIEF.tolerance) * plant.get("plain", math.inf), JUDGE.within * noise)
         return self.plain(joint) and plant.get("found", 0.0) > alike
 
     def reason(self, case: Case) -> str:
-        """Why the plain model of a joint is written and not what was found, in words."""
+        """Return why the plain model of a joint is written and not what was found, in words."""
         k, unit, mine = 1e3, "mm" if case.scales.slide else "mrad", self.errors[case.joint]
         where = "in the engine that trains" if self.by_replay else "in the search's own plant"
         return (
@@ -163,7 +163,7 @@ class Written:
 
 
     def text(self, unit: str = "mrad") -> str:
-        """The headline in a sentence; unit: what a thousandth of the position's is called."""
+        """Return the headline in a sentence; unit: what a thousandth of the position's is called."""
         assert self.replayed is not None  # as looked at by who asks
         return (
             f"The files as they are written, replayed in the engine that trains, leave {1e3 * self.replayed.error:.3g} "
@@ -171,8 +171,8 @@ class Written:
         )
 
     def differences(self, judged: Mapping[str, Mapping[str, float]]) -> list[str]:
-        """Joints on which the replay differs from the search's own plant by more than a tenth, each with the reason, in
-        words. judged: `sigma` of each."""
+        """Return joints on which the replay differs from the search's own plant by more than a tenth, each with the
+        reason, in words. judged: `sigma` of each."""
         out = []
         for joint, engine in self.replayed.joints.items() if self.replayed is not None else ():
             written, noise = self.candidate(joint), judged[joint]["sigma"]
@@ -205,7 +205,8 @@ def choose(errors: Mapping[str, float], noise: float) -> str:
 def files(
     m: Mechanism, cases: Sequence[Case], choice: Mapping[str, Candidate]
 ) -> tuple[ServoTable, mujoco.MjSpec, list[str]]:
-    """(servo table, model, what changed of the model, in words): what is handed on with one candidate a joint."""
+    """Return (servo table, model, what changed of the model, in words): what is handed on with one candidate a
+    joint."""
     table, spec, said = copy.deepcopy(m.table), m.spec.copy(), []
     table.fitted = {c.joint: {} for c in cases}
     for case in cases:
@@ -220,8 +221,8 @@ def files(
 
 
 def rows_of(table: ServoTable, run: Run, joints: Sequence[str]) -> np.ndarray:
-    """[J, C] servo columns in one run, of a table that was fitted: as `mechanism.of_recording` lays them over what the
-    recording says itself."""
+    """Return [J, C] servo columns in one run, of a table that was fitted: as `mechanism.of_recording` lays them over
+    what the recording says itself."""
     rows = run.servo.nominal(joints).copy()
     mine = table.nominal(joints)
     for joint, factors in (table.fitted or {}).items():
@@ -242,8 +243,8 @@ def worlds_of(
     table: ServoTable,
     windows: Windows,
 ) -> list[World]:
-    """One world a window (a whole run, or the part of it that was held out), driven by a fitted table and begun as
-    `play replay=` begins."""
+    """Return one world a window (a whole run, or the part of it that was held out), driven by a fitted table and begun
+    as `play replay=` begins."""
     out = []
     at_rest = m.spec.compile()
     rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
@@ -306,8 +307,8 @@ def free_runs(
     engine: str = "auto",
     torque: bool = False,
 ) -> list:
-    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive
-    and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead."""
+    """Return reported positions [T, J] of each world at every step, from its first position and speed on, as one batch
+    a drive and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         # as long as the longest of a batch all of it runs
@@ -388,8 +389,8 @@ def _batch(
 def _path(
     engine: Any, servo: Servo, worlds: Sequence[World], joints: Sequence[str], t: np.ndarray
 ) -> Callable[[int], None]:
-    """What leads joints along their recordings in step k: their state before the servo acts, their acceleration after
-    it (`_stepped` calls it twice)."""
+    """Return what leads joints along their recordings in step k: their state before the servo acts, their acceleration
+    after it (`_stepped` calls it twice)."""
     mine = [servo.joints.index(j) for j in joints]
     offset, scale = (servo.column(f"position_{x}")[:, mine].cpu().numpy() for x in ("offset", "scale"))
     each = [w.led.at(t, o, s) for w, o, s in zip(worlds, offset, scale, strict=True) if w.led is not None]
@@ -415,8 +416,8 @@ def _stepped(
     given: torch.Tensor | None,
     lead: Callable[[int], None],
 ) -> torch.Tensor:
-    """The positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise; given
-    [S, N, J]: filled with the drives' torques; lead: of `_path`."""
+    """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
+    given [S, N, J]: filled with the drives' torques; lead: of `_path`."""
     steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
@@ -523,7 +524,7 @@ class Changes:
 
 
 def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: np.ndarray) -> np.ndarray:
-    """[N, J] torque [N.m] that holds the joints at rest at qpos [N, nq]: gravity less springs."""
+    """Return [N, J] torque [N.m] that holds the joints at rest at qpos [N, nq]: gravity less springs."""
     data, out = mujoco.MjData(model), []
     for q in qpos:
         data.qpos[:], data.qvel[:] = q, 0.0
@@ -563,7 +564,7 @@ def write_best(
     times = [a + STEP * np.arange(round((b - a) / STEP) + 1) for a, b in zip(starts, ends, strict=True)]
 
     def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
-        """rms by joint of each choice."""
+        """Return rms by joint of each choice."""
         given = [files(m, cases, {j: by[j][name] for j, name in x.items()}) for x in choices]
         groups: dict[str, list[int]] = {}  # those that change the model alike share an engine
         for i, (_, spec, said) in enumerate(given):
@@ -579,7 +580,7 @@ def write_best(
         return [{c.joint: rms(c, found[i]) for c in cases} for i in range(len(choices))]
 
     def rms(case: Case, q: Sequence[np.ndarray]) -> float:
-        """Over all readings of a joint in recordings that tell of it."""
+        """Return the error of a joint over all readings in recordings that tell of it."""
         j = m.joints.index(case.joint)
         parts = [
             _missed(r, case.joint, t, x[: len(t), j])
@@ -646,13 +647,14 @@ def composed(
 
 
 def _start(r: Recording, start: float) -> float:
-    """Where a replay begins [s] of what was recorded from `start` on: with the recording where that is its begin."""
+    """Return where a replay begins [s] of what was recorded from `start` on: with the recording where that is its
+    begin."""
     first = float(r.states.position.t[0])
     return 0.0 if start - first < STEP and first <= SOON else start
 
 
 def _missed(r: Recording, joint: str, t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[2] sum of squares and number of what a free run q [T] at t [T] s misses of a joint's readings."""
+    """Return [2] sum of squares and number of what a free run q [T] at t [T] s misses of a joint's readings."""
     state = r.states.position.between(t[0] - 1e-9, t[-1] + 1e-9)
     d = state.value[:, r.joints.index(joint)] - np.interp(state.t, t, q)
     return np.array([np.nansum(d**2), np.isfinite(d).sum()]) if np.isfinite(q).all() else np.array([np.inf, 1.0])

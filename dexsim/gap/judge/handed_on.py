@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 def handed(p: Param, case: Case) -> bool:
-    """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its
+    """Return whether training is given a fitted parameter: not the figures of the plant's own that only absorb its
     inaccuracy."""
     return not (
         p.nuisance
@@ -59,8 +59,8 @@ def handed(p: Param, case: Case) -> bool:
 
 
 def undamped(trial: Trial, kp: float) -> float:
-    """What the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) = kp q -
-    kp age v. The loop that trains acts on the position of now, so it is given kd without it."""
+    """Return what the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) =
+    kp q - kp age v. The loop that trains acts on the position of now, so it is given kd without it."""
     return next(
         (kp * float(x) for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.columns == ("feedback_delay",)),
         0.0,
@@ -73,7 +73,7 @@ BY_WARMTH = frozenset(name for e in CATALOGUE for name in e.by_warmth)
 
 
 def approximate_columns(case: Case, trial: Trial) -> dict[str, float]:
-    """Servo columns in the place of fitted ones that training has no like of."""
+    """Return servo columns in the place of fitted ones that training has no like of."""
     fitted = {name for p in trial.fit.params for name in p.columns}
     wanted = [e for e in CATALOGUE if fitted & {*e.approximated}]
     if not wanted:
@@ -85,9 +85,9 @@ def approximate_columns(case: Case, trial: Trial) -> dict[str, float]:
 
 
 def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
-    """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of
-    the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it
-    from."""
+    """Return servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is,
+    which of the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take
+    it from."""
     out: dict[str, float] = {}
     fitted = {name for p in trial.fit.params for name in p.columns}
     for x in trial.members:
@@ -111,8 +111,8 @@ def on_motor(case: Case, trial: Trial) -> float:
 
 
 def moved_friction(case: Case, trial: Trial) -> dict[str, float]:
-    """What goes from the model's joint to the servo's columns, which act on the motor, with `on_motor`: friction N.m,
-    damping N.m.s/rad."""
+    """Return what goes from the model's joint to the servo's columns, which act on the motor, with `on_motor`: friction
+    N.m, damping N.m.s/rad."""
     share = on_motor(case, trial)
     if share <= 0.0:
         return {}
@@ -171,13 +171,13 @@ def servo_changes(
 
 
 def values_of(trial: Trial) -> dict[str, dict[str, float]]:
-    """Fitted values of each member by parameter."""
+    """Return fitted values of each member by parameter."""
     known = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
     return {x.id: {p.key: float(known[f"{x.id}.{p.key}"]) for p in x.variant.params} for x in trial.members}
 
 
 def missing_of(case: Case, trial: Trial) -> tuple[str, ...]:
-    """What of a fitted hypothesis training cannot be given, as effect@joint, with what it is given instead if
+    """Return what of a fitted hypothesis training cannot be given, as effect@joint, with what it is given instead if
     anything."""
     out = []
     for x in trial.members:
@@ -190,9 +190,9 @@ def missing_of(case: Case, trial: Trial) -> tuple[str, ...]:
 
 
 def earned(finding: Finding) -> float:
-    """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or
-    more off the error on what was held out (against all others fitted again without it), less by what other names claim
-    of it, which would go on in another way where nothing was recorded."""
+    """Return 0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a
+    tenth or more off the error on what was held out (against all others fitted again without it), less by what other
+    names claim of it, which would go on in another way where nothing was recorded."""
     error, others = finding.held_out or {}, sum(float(x["confidence"]) for x in finding.alternatives)
     if not error or error["before"] is None or error["after"] is None:
         return 0.0
@@ -311,7 +311,8 @@ KINDLESS = frozenset(FEATURES) - {"rare"}  # of the servo's features: a deadband
 
 
 def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tuple[np.ndarray, np.ndarray]:
-    """(torque [S] N.m that the measured motion of a run needs beyond the hypothesis, whether it can be read there [S]).
+    """Return (torque [S] N.m that the measured motion of a run needs beyond the hypothesis, whether it can be read
+    there [S]).
 
     Where the joint hardly moves, dry friction hides any torque.
     """
@@ -369,7 +370,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
 
 
 def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[S, 4] what the numbers multiply."""
+    """Return [S, 4] what the numbers multiply."""
     return np.stack([np.ones_like(q), q, v, v * np.abs(v)], 1)
 
 
@@ -383,7 +384,7 @@ def fit_stand_in(
     span_test: dict[int, tuple[float, float]] | None = None,
     seed: int = 0,
 ) -> StandIn | None:
-    """The stand-in of one joint; None where it would not take JUDGE.earns off the held-out error."""
+    """Return the stand-in of one joint; None where it would not take JUDGE.earns off the held-out error."""
     xs, ys, parts = [], [], []
     for r in train:
         torque, on = residual_torque(case, runs, trial, r)
@@ -428,7 +429,7 @@ def _held_out(
     test: list[int],
     span_test: dict[int, tuple[float, float]] | None,
 ) -> tuple[float, float]:
-    """Held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
+    """Return held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
     plant = case.plant
     windows = plant.windows(None, test, span=span_test)
     fixed = [f for m in trial.members for f in m.variant.fixed]

@@ -82,7 +82,8 @@ def visits(runs: Sequence[Run], cases: Sequence[Case]) -> tuple[list[str], np.nd
 
 
 def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Case]) -> Split:
-    """What is fitted and what is held out. held: runs that were asked to be held out; group: condition of each run."""
+    """Return what is fitted and what is held out. held: runs that were asked to be held out; group: condition of each
+    run."""
     names, time = visits(runs, cases)
     if held:
         train = [i for i in range(len(runs)) if i not in held]
@@ -123,14 +124,14 @@ STANDS = 0.02
 
 
 def _goes_on(run: Run, at: float) -> bool:
-    """Whether a joint still moves from `at` s on."""
+    """Return whether a joint still moves from `at` s on."""
     late = run.t - run.t[0] >= at
     return bool(late.any() and (np.ptp(run.q[late], 0) > STANDS * np.ptp(run.q, 0)).any())
 
 
 def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> int | None:
-    """The condition that leaves the fewest regimes without a recording to fit, of those the one that visits most; the
-    last of them. None where there are too few conditions."""
+    """Return the condition that leaves the fewest regimes without a recording to fit, of those the one that visits
+    most; the last of them. None where there are too few conditions."""
     numbers = sorted(set(group))
     if len(numbers) < 3:
         return None
@@ -158,16 +159,16 @@ def _ends(
     found: dict[str, np.ndarray],
     plant: JointPlant,
 ) -> dict[int, float]:
-    """Where the end of a fitted recording begins that is held out too [s], by run: those that visit regimes which
-    `test` does not, before that moment and after."""
+    """Return where the end of a fitted recording begins that is held out too [s], by run: those that visit regimes
+    which `test` does not, before that moment and after."""
     out: dict[int, float] = {}
     missing = [k for k in range(len(time)) if time[k, test].sum() < JUDGE.visited <= time[k, train].sum()]
     on = list(found.values())
     begins = {run: (1 - JUDGE.kept_end) * runs[run].duration for run in train}
 
     def served(run: int) -> list[int]:
-        """Of the missing regimes those that the recording visits at its end and before: seen at its begin alone they
-        would not be judged."""
+        """Return of the missing regimes those that the recording visits at its end and before: seen at its begin alone
+        they would not be judged."""
         t = runs[run].t - runs[run].t[0]
         step = float(np.median(np.diff(t)))
         late = t >= begins[run]
@@ -189,7 +190,7 @@ def _ends(
 
 
 def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: Sequence[int]) -> list[str]:
-    """Regimes that what is held out visits and no fitted recording does."""
+    """Return regimes that what is held out visits and no fitted recording does."""
     here, there = time[:, list(test)].sum(1), time[:, list(train)].sum(1)
     alone = (here > JUDGE.visited) & (there < JUDGE.visited)
     return [name for name, so in zip(names, alone, strict=True) if so]
@@ -219,8 +220,8 @@ DRAWS = 400  # of a bootstrap
 
 
 def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
-    """(noise floor of the position error, how): from repeats of the same commands, else from split samples, else from
-    the encoder's quantum. Root mean square over joints."""
+    """Return (noise floor of the position error, how): from repeats of the same commands, else from split samples, else
+    from the encoder's quantum. Root mean square over joints."""
     each, how = floors(runs, cases)
     if how == "repeats":
         return float(np.sqrt(np.mean([each[c.joint] ** 2 for c in cases]))), how
@@ -230,8 +231,8 @@ def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
 
 
 def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
-    """(noise floor of each joint's position error, how): from repeats where there are any, never below the noise of its
-    samples.
+    """Return (noise floor of each joint's position error, how): from repeats where there are any, never below the noise
+    of its samples.
 
     Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can
     explain."""
@@ -243,7 +244,7 @@ def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
 
 
 def repeats(runs: list[Run]) -> list[tuple[Run, Run]]:
-    """Pairs of runs of the same commands; pieces of one recording are aligned only by where they were cut."""
+    """Return pairs of runs of the same commands; pieces of one recording are aligned only by where they were cut."""
     return [(a, b) for i, a in enumerate(runs) for b in runs[i + 1 :] if a.name != b.name and same_commands(a, b)]
 
 
@@ -264,8 +265,8 @@ def by_motion(runs: list[Run], cases: list[Case]) -> dict[int, dict[str, float]]
 def floor_beyond(
     case: Case, runs: list[Run], params: list[Param], x: np.ndarray, fixed: Sequence[tuple[str, float]] = ()
 ) -> float:
-    """Noise floor of a joint's position error [rad or m] from what repeats differ by beyond what a fit says that they
-    do (a drive that was warmer in one of them moves otherwise, and that is no noise); never below the noise of its
+    """Return noise floor of a joint's position error [rad or m] from what repeats differ by beyond what a fit says that
+    they do (a drive that was warmer in one of them moves otherwise, and that is no noise); never below the noise of its
     samples, inf without repeats."""
     number = {id(run): k for k, run in enumerate(runs)}
     pairs = [p for p in repeats(runs) if not {number[id(r)] for r in p} & case.plant.left_out]
@@ -293,7 +294,7 @@ def _common(a: Run, b: Run) -> np.ndarray:
 
 
 def _apart(pairs: Sequence[tuple[_Left, _Left]]) -> float:
-    """Standard deviation by which what (run, times [S] s, values [S]) have in pairs of repeats scatters."""
+    """Return standard deviation by which what (run, times [S] s, values [S]) have in pairs of repeats scatters."""
     d = []
     for (a, ta, xa), (b, tb, xb) in pairs:
         t = _common(a, b)
@@ -304,7 +305,8 @@ def _apart(pairs: Sequence[tuple[_Left, _Left]]) -> float:
 def rms_interval(
     squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = BLOCK
 ) -> tuple[float, float, float]:
-    """(rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all joints."""
+    """Return (rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all
+    joints."""
     sums, counts = [], []
     for s, t in zip(squares, times, strict=True):
         b = ((t - t[0]) / block).astype(int) if len(t) else np.zeros(0, int)
@@ -345,14 +347,14 @@ def whispered(f: Finding) -> Finding:
 
 
 def firm(findings: Sequence[Finding]) -> list[Finding]:
-    """The findings of physics that are more than hints."""
+    """Return the findings of physics that are more than hints."""
     return [f for f in findings if f.held_out and not f.hint]
 
 
 def lowers(f: Finding) -> bool:
-    """Whether a finding lowers the error on what was held out, by more than the interval of what it removes. What acts
-    in a few moments alone, as a limit does, removes nothing in draws without them: an interval that begins at nothing
-    (`SEARCH.tie`) is no loss then, and the part that it removes of the whole decides (`JUDGE.part`)."""
+    """Return whether a finding lowers the error on what was held out, by more than the interval of what it removes.
+    What acts in a few moments alone, as a limit does, removes nothing in draws without them: an interval that begins at
+    nothing (`SEARCH.tie`) is no loss then, and the part that it removes of the whole decides (`JUDGE.part`)."""
     h = f.held_out or {}
     if "removed_low" not in h or h["removed_low"] > 0:
         return bool(h["after"] < h["before"] or "removed_low" in h)
@@ -360,7 +362,7 @@ def lowers(f: Finding) -> bool:
 
 
 def wrong_signals(findings: Sequence[Finding]) -> list[Finding]:
-    """The findings that a signal is not what it says, where they are more than hints."""
+    """Return the findings that a signal is not what it says, where they are more than hints."""
     return [f for f in findings if f.wrong_signal and f.confidence >= JUDGE.firm]
 
 
@@ -374,11 +376,11 @@ def verdict(
     quiet: bool = False,
     loud: bool = False,
 ) -> str:
-    """The one word. findings: after `settle`; floor, before, after: of the error on what was held out; before_low: of
-    its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether every joint is
-    followed to its own floor; loud: whether some recording is surely missed by more than its own repeats differ by.
-    Where the rest is followed to the floor a wrong signal is the answer: something was
-    amiss, and it has a name. Names of which none surely lowers the error explain nothing."""
+    """Return the one word. findings: after `settle`; floor, before, after: of the error on what was held out;
+    before_low: of its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether
+    every joint is followed to its own floor; loud: whether some recording is surely missed by more than its own repeats
+    differ by. Where the rest is followed to the floor a wrong signal is the answer: something was amiss, and it has a
+    name. Names of which none surely lowers the error explain nothing."""
     named = firm(findings)
     if not any(map(lowers, named)):
         if not loud and (
@@ -398,8 +400,8 @@ def verdict(
 def gain_interval(
     without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = BLOCK
 ) -> tuple[float, float]:
-    """90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both at
-    times [n] s on what was held out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the
+    """Return 90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both
+    at times [n] s on what was held out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the
     whole error: draws without the few moments in which a limit acts show nothing, not a loss. (0, 0) without
     samples."""
     if not len(without):
@@ -418,11 +420,11 @@ def _blocks(times: np.ndarray, block: float) -> np.ndarray:
 
 
 def telling(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, noise: float) -> np.ndarray:
-    """[n] which samples of what was held out can speak of an effect. without, with_it: squared errors [n] without and
-    with it at times [n] s; noise: of one sample. Where a limit is reached in what was held out alone, or one stick more
-    sends a free run another way, neither follows, and half a second of that outweighs the rest: half-second blocks that
-    are missed by more than `JUDGE.far` x the noise, alike with the effect and without (half of `JUDGE.part`), are left
-    out, as long as they are few (`JUDGE.most_left_out`)."""
+    """Return [n] which samples of what was held out can speak of an effect. without, with_it: squared errors [n]
+    without and with it at times [n] s; noise: of one sample. Where a limit is reached in what was held out alone, or
+    one stick more sends a free run another way, neither follows, and half a second of that outweighs the rest:
+    half-second blocks that are missed by more than `JUDGE.far` x the noise, alike with the effect and without (half of
+    `JUDGE.part`), are left out, as long as they are few (`JUDGE.most_left_out`)."""
     if not len(without):
         return np.ones(0, bool)
     b = _blocks(times, BLOCK)

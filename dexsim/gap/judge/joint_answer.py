@@ -133,9 +133,9 @@ class JointAnswer:
 
     @classmethod
     def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: Kept) -> JointAnswer:
-        """The answer without those of several effects on the joint that what was held out refutes, the one that harms
-        most first. `outcome` stays as it is: others may still be searched by it, and must not learn of what was kept
-        out."""
+        """Return the answer without those of several effects on the joint that what was held out refutes, the one that
+        harms most first. `outcome` stays as it is: others may still be searched by it, and must not learn of what was
+        kept out."""
         answer = cls(case, search, outcome, kept)
         while (better := answer._without_refuted()) is not None:
             earlier, answer = answer, cls(case, search, replace(answer.outcome, best=better), kept)
@@ -143,9 +143,9 @@ class JointAnswer:
         return answer
 
     def _without_refuted(self) -> Trial | None:
-        """The best hypothesis without the effect whose absence follows what was held out best; None where each lowers
-        that error, or may remove as much of it as a name has to. No free run keeps step with what makes a joint ring,
-        and a reading of the effort moves nothing."""
+        """Return the best hypothesis without the effect whose absence follows what was held out best; None where each
+        lowers that error, or may remove as much of it as a name has to. No free run keeps step with what makes a joint
+        ring, and a reading of the effort moves nothing."""
         if len(self.best.members) < 2 or not len(self.after):
             return None
         best, least = None, float(np.mean(self.after))
@@ -159,11 +159,11 @@ class JointAnswer:
         return best
 
     def _without_id(self, effect: str) -> np.ndarray:
-        """Position (rows,) of a free run by the best hypothesis without an effect of this id."""
+        """Return position (rows,) of a free run by the best hypothesis without an effect of this id."""
         return self._without(next(mm for mm in self.best.members if mm.id == effect))[1]
 
     def _without(self, mm: Member) -> tuple[Trial, np.ndarray, np.ndarray]:
-        """(the best hypothesis without an effect, position and effort (rows,) of its free run)."""
+        """Return (the best hypothesis without an effect, position and effort (rows,) of its free run)."""
         if mm.id not in self._trials:
             rest = tuple(x for x in self.best.members if x is not mm)
             trial = without(self.search, self.best, mm) if rest else self.none
@@ -245,9 +245,9 @@ class JointAnswer:
         surely: float,
         before: float | None = None,
     ) -> confidence.Evidence:
-        """The evidence of one effect: was, left: rms error of what was held out without and with it; surely: share of
-        the squared error that it removes in all but a twentieth of its draws; before: error before anything was named,
-        where that is not of all that was held out."""
+        """Return the evidence of one effect: was, left: rms error of what was held out without and with it; surely:
+        share of the squared error that it removes in all but a twentieth of its draws; before: error before anything
+        was named, where that is not of all that was held out."""
         effort_only, borne_out = mm.effect.effort_only, surely >= JUDGE.borne_out
         before = rms(self.before) if before is None else before
         spread = self._fitted(mm, self.widest)[1]
@@ -264,8 +264,8 @@ class JointAnswer:
         return evidence
 
     def _harmed(self, without_it: Trial) -> str:
-        """Why an effect is a hint only: what it gains in some recordings it loses in others, as what differs from run
-        to run does; empty where it helps or does nothing in nearly every draw of the recordings."""
+        """Return why an effect is a hint only: what it gains in some recordings it loses in others, as what differs
+        from run to run does; empty where it helps or does nothing in nearly every draw of the recordings."""
         lost, mine = (self.search.by_run(t) for t in (without_it, self.best))
         runs = np.flatnonzero(lost > 0)
         if len(runs) < 3:
@@ -276,7 +276,7 @@ class JointAnswer:
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
     def _fitted(self, mm: Member, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
+        """Return values and intervals of one effect's parameters, of `bounds` [P, 2]."""
         best = self.best
         index = [[p.key for p in best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
         raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
@@ -301,10 +301,10 @@ class JointAnswer:
         borne_out: bool,
         before: float,
     ) -> confidence.Evidence:
-        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was held out
-        without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the motion
-        then tells nothing of it). borne_out: whether what was held out surely shows it; before: error of the motion
-        before anything was named."""
+        """Return how sure the name is, and every reason to doubt it. error_without, after: rms error on what was held
+        out without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the
+        motion then tells nothing of it). borne_out: whether what was held out surely shows it; before: error of the
+        motion before anything was named."""
         case, outcome = self.case, self.outcome
         # the one effect of the reading: nothing else explains the effort
         before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (before, case.sigma)
@@ -360,7 +360,7 @@ class JointAnswer:
         return np.array(folds).reshape(len(folds), len(index))
 
     def floor_beyond(self) -> float:
-        """What repeats differ by beyond what was found [rad or m]; inf without repeats."""
+        """Return what repeats differ by beyond what was found [rad or m]; inf without repeats."""
         fixed = [f for mm in self.best.members for f in mm.variant.fixed]
         return held_out.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, fixed)
 
@@ -391,7 +391,7 @@ class JointAnswer:
         )
 
     def curve(self) -> Curve | None:
-        """The stretch where the believed simulator is worst."""
+        """Return the stretch where the believed simulator is worst."""
         return (
             _curve(self.case, self.kept.runs, self.rows, self.q_before, self.q_after, int(np.argmax(self.before)))
             if len(self.rows)
@@ -408,9 +408,9 @@ class JointAnswer:
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
-    """Intervals [P, 2] about a fit, by how well it follows what was held out (left: x the noise): what follows to the
-    noise is known better than by all that might be off in it, what does not only looks like it and is something else.
-    The law is from concealed cases (docs/concepts/gap.md)."""
+    """Return intervals [P, 2] about a fit, by how well it follows what was held out (left: x the noise): what follows
+    to the noise is known better than by all that might be off in it, what does not only looks like it and is something
+    else. The law is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:
         return bounds
     low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
@@ -420,9 +420,9 @@ def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
 
 
 def traded(fit: Fitted) -> np.ndarray:
-    """[P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the link's),
-    however well all is followed: the variance that the beliefs' own, as far as the residuals leave it, adds to that of
-    the sizes alone. 0 for beliefs."""
+    """Return [P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the
+    link's), however well all is followed: the variance that the beliefs' own, as far as the residuals leave it, adds to
+    that of the sizes alone. 0 for beliefs."""
     low, high = (np.array([getattr(p, k) for p in fit.params]) for k in ("low", "high"))
     span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
     J = fit.jacobian * span
@@ -439,18 +439,18 @@ def traded(fit: Fitted) -> np.ndarray:
 
 
 def rms(squares: np.ndarray) -> float:
-    """Root of the mean of squares; 0 for none."""
+    """Return root of the mean of squares; 0 for none."""
     return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
 
 
 def nuisances(joint: str, trial: Trial) -> dict[str, float]:
-    """The refitted beliefs of one joint by the keys of `diagnosis.json`."""
+    """Return the refitted beliefs of one joint by the keys of `diagnosis.json`."""
     return {f"{p.key}_factor@{joint}" if p.mode == "factor" else f"{p.key}@{joint}": round(float(x), 6)
             for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
 
 
 def without(search: JointSearch, best: Trial, member: Member) -> Trial:
-    """The best hypothesis without one member, refitted."""
+    """Return the best hypothesis without one member, refitted."""
     rest = tuple(x for x in best.members if x is not member)
     sizes = np.cumsum([len(x.variant.params) for x in best.members])[:-1]
     values = np.split(search._values(best), sizes)
@@ -506,15 +506,15 @@ class Jitter:
 
 
 def certain(gain: float, beside: float, noise: float) -> bool:
-    """Whether jitter is reported. gain: of the log likelihood; beside: what stays with it that is correlated, to
+    """Return whether jitter is reported. gain: of the log likelihood; beside: what stays with it that is correlated, to
     compare with the noise: where that is more, something else is missing that looks alike (an unmodelled resonance
     does)."""
     return gain >= JUDGE.jitter and beside <= noise
 
 
 def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]]:
-    """Of each window of n samples: the residual [n] of a fitted hypothesis, H' H and H' K_k H [n, n] (H in ms), and the
-    time between its samples [n, n] s; none where the commands' times do nothing."""
+    """Return of each window of n samples: the residual [n] of a fitted hypothesis, H' H and H' K_k H [n, n] (H in ms),
+    and the time between its samples [n, n] s; none where the commands' times do nothing."""
     plant = search.case.plant
     keep = np.zeros(len(search.short.window), bool)
     keep[np.unique(np.linspace(0, len(keep) - 1, min(WINDOWS, len(keep))).astype(int))] = True
@@ -549,13 +549,13 @@ def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.nda
 
 
 def estimate_jitter(search: JointSearch, trial: Trial) -> Jitter | None:
-    """The jitter that the residuals of a fitted hypothesis hold; None where they hold none for certain."""
+    """Return the jitter that the residuals of a fitted hypothesis hold; None where they hold none for certain."""
     windows = _windows(search, trial)
     if not windows:
         return None
 
     def cost(z: np.ndarray, jitter: float) -> float:
-        """Minus the log likelihood of all windows; z: logs of a, b, tau and of each g."""
+        """Return minus the log likelihood of all windows; z: logs of a, b, tau and of each g."""
         a, b, width, *alike = np.exp(np.clip(z, -12, 12))
         total = 0.0
         for r, h, slow, d in windows:

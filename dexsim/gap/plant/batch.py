@@ -47,13 +47,13 @@ class Lane:
         self._host: dict[str, wp.array] = {}
 
     def room(self, name: str, size: int) -> wp.array:
-        """Memory of the device for `size` numbers, the same for the same name."""
+        """Return memory of the device for `size` numbers, the same for the same name."""
         if name not in self._room or self._room[name].shape[0] < size:
             self._room[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device=self.device)
         return self._room[name]
 
     def host(self, name: str, size: int) -> wp.array:
-        """Page-locked memory of the CPU for `size` numbers."""
+        """Return page-locked memory of the CPU for `size` numbers."""
         if name not in self._host or self._host[name].shape[0] < size:
             self._host[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device="cpu", pinned=self.pinned)
         return self._host[name]
@@ -63,8 +63,8 @@ class Lane:
         return wp.array(ptr=of.ptr + 8 * at, shape=shape, dtype=wp.float64, device=self.device)
 
     def up(self, given: Sequence[np.ndarray]) -> list[wp.array]:
-        """The arrays on the device, by one copy; valid until this is called again, which must not be before the stream
-        was waited for."""
+        """Return the arrays on the device, by one copy; valid until this is called again, which must not be before the
+        stream was waited for."""
         ends = np.cumsum([0, *(x.size for x in given)])
         here, there = self.host("in", int(ends[-1])), self.room("in", int(ends[-1]))
         np.concatenate([np.ravel(x) for x in given], out=here.numpy()[: ends[-1]])
@@ -100,8 +100,8 @@ class Known:
     def answers(
         self, keys: Sequence[bytes], simulate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and torques [H, n] of the keys. simulate(which [h]) makes those [h, n] of the keys with these
-        numbers; it is asked for each that is not known, once."""
+        """Return positions and torques [H, n] of the keys. simulate(which [h]) makes those [h, n] of the keys with
+        these numbers; it is asked for each that is not known, once."""
         with self._lock:
             rows = {key: self._rows[key] for key in keys if key in self._rows}
         new = {key: k for k, key in reversed(list(enumerate(keys))) if key not in rows}
@@ -150,7 +150,7 @@ class Windows:
         return len(self.sample_row)
 
     def heads(self, counts: np.ndarray) -> Windows:
-        """Of each window the begin, up to its sample of this number [W], 1 at least."""
+        """Return of each window the begin, up to its sample of this number [W], 1 at least."""
         place = np.arange(self.n) - self.window[self.sample_window, 3]
         keep = place < counts[self.sample_window]
         window = self.window.copy()
@@ -257,7 +257,7 @@ class JointPlant:
         self.series, self._d, self._version = series, {}, next(_VERSIONS)
 
     def refined(self, times: int) -> JointPlant:
-        """The same joint in steps `times` as short, the series between their samples on straight lines."""
+        """Return the same joint in steps `times` as short, the series between their samples on straight lines."""
         out = copy.copy(self)
         out.dt, out._d, out._version = self.dt / times, {}, next(_VERSIONS)
         sizes = [(b - a - 1) * times + 1 for a, b in zip(self._grid[:-1], self._grid[1:], strict=True)]
@@ -273,7 +273,7 @@ class JointPlant:
         return out
 
     def grid(self, run: int) -> slice:
-        """Rows of a run in the series."""
+        """Return rows of a run in the series."""
         return slice(self._grid[run], self._grid[run + 1])
 
     @property
@@ -281,7 +281,7 @@ class JointPlant:
         return len(self._t)
 
     def rows(self, run: int) -> slice:
-        """Rows of a run in the measurements."""
+        """Return rows of a run in the measurements."""
         return slice(self._rows[run], self._rows[run + 1])
 
     def windows(
@@ -294,7 +294,7 @@ class JointPlant:
         every_run: bool = False,
         between: bool = False,
     ) -> Windows:
-        """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
+        """Return windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
 
         span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint;
         between: also samples between its readings.
@@ -355,7 +355,7 @@ class JointPlant:
 
     def simulate(self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None,
                  open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
+        """Return reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
 
         params [H, R, C]: plant parameters by run; inits [H, 2], or [H, W, 2] by window: added to the initial position
         and velocity.
@@ -431,8 +431,8 @@ class JointPlant:
     def _inputs(
         self, windows: Windows, group: tuple[int, ...], device: str
     ) -> tuple[np.ndarray, np.ndarray | slice, np.ndarray, list[wp.array]]:
-        """(the windows that are of these runs, their samples, steps of each, the kernel's arrays of them), made once a
-        device."""
+        """Return (the windows that are of these runs, their samples, steps of each, the kernel's arrays of them), made
+        once a device."""
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
@@ -476,17 +476,17 @@ class JointPlant:
             compute.run(launch, compute.parts(steps, H))
 
     def base(self) -> np.ndarray:
-        """[R, C] nominal parameters by run."""
+        """Return [R, C] nominal parameters by run."""
         return np.stack(self.nominal)
 
 
 def _of(inits: np.ndarray, windows: np.ndarray) -> np.ndarray:
-    """[H, 1 or W', 2] of where each guess begins [H, 1 or W, 2], that of these windows [W']."""
+    """Return [H, 1 or W', 2] of where each guess begins [H, 1 or W, 2], that of these windows [W']."""
     return inits if inits.shape[1] == 1 else inits[:, windows]
 
 
 def _stretch(rows: np.ndarray) -> np.ndarray | slice:
-    """Row numbers that grow, as a slice where none is left out: a fifth of the time to copy."""
+    """Return row numbers that grow, as a slice where none is left out: a fifth of the time to copy."""
     return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) and rows[-1] - rows[0] + 1 == len(rows) else rows
 
 
@@ -495,7 +495,7 @@ def _up(x: np.ndarray, dtype: Any = wp.float64, device: str = "cpu", copy: bool 
 
 
 def recorded(*arrays: wp.array) -> pk.Recorded:
-    """The kernel's struct of its arrays, in the order of `kernel.FIELDS`."""
+    """Return the kernel's struct of its arrays, in the order of `kernel.FIELDS`."""
     out = pk.Recorded()
     for name, x in zip(pk.FIELDS, arrays, strict=True):
         setattr(out, name, x)
@@ -503,8 +503,8 @@ def recorded(*arrays: wp.array) -> pk.Recorded:
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:
-    """[C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor [kg.m2]:
-    where the row has none."""
+    """Return [C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor
+    [kg.m2]: where the row has none."""
     row = NEUTRAL.copy()
     row[: len(servo_row)] = servo_row
     row[INDEX["rotor"]] = row[INDEX["rotor"]] or rotor

@@ -69,9 +69,9 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
 
 
 def quiet_noise(signals: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], quantum: float) -> float | None:
-    """Standard deviation of the measurement noise of a joint that rings by itself, from half seconds in which it does
-    not; None where it does not ring. signals: times [S] s, positions [S] and what these miss local cubics by (`misfit`)
-    [S - 2 BESIDE], of recordings.
+    """Return standard deviation of the measurement noise of a joint that rings by itself, from half seconds in which it
+    does not; None where it does not ring. signals: times [S] s, positions [S] and what these miss local cubics by
+    (`misfit`) [S - 2 BESIDE], of recordings.
 
     A joint that rings faster than its readings misses any smooth curve as noise does, and sample by sample the two
     cannot be told apart. But a sensor is not noisier at one time than at another but by how fast it moves (readings'
@@ -103,8 +103,8 @@ WHITE = (0.3, -0.05, 0.0)
 
 
 def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> float | None:
-    """Standard deviation of the measurement noise of joint j, if it rings all the time, by the other joints' encoders;
-    None where it does not seem to. own: by its samples; limits [J]: of the drives' torque.
+    """Return standard deviation of the measurement noise of joint j, if it rings all the time, by the other joints'
+    encoders; None where it does not seem to. own: by its samples; limits [J]: of the drives' torque.
 
     A joint that rings without a pause shows no noise of its own. It scatters by far more than the others of its
     machine that move as far (`BELIEF.noisier`; readings whose times vary are noisier where a joint moves), and not as
@@ -126,8 +126,8 @@ def usual_noise(runs: Sequence[Run], j: int, own: float, limits: np.ndarray) -> 
 
 
 def _kurtosis(x: np.ndarray) -> float:
-    """Fourth moment over the square of the second of the second differences of a signal x [S], what is far out left
-    out; a normal distribution's where it is too short to tell."""
+    """Return fourth moment over the square of the second of the second differences of a signal x [S], what is far out
+    left out; a normal distribution's where it is too short to tell."""
     second = np.abs(np.diff(x, 2))
     second = second[second < 4 * np.median(second) / 0.6745] if len(second) else second
     if len(second) < FEWEST_OF_ALL:
@@ -146,14 +146,14 @@ def _torque_scatter(runs: Sequence[Run], j: int, others: Sequence[int], limits: 
 
 
 def _way(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[J] how far joints with positions q [S, J] at t [S] s go in half a second, in the mean."""
+    """Return [J] how far joints with positions q [S, J] at t [S] s go in half a second, in the mean."""
     later = np.minimum(np.searchsorted(t, t + HALF_SECOND), len(t) - 1)
     return np.abs(q[later] - q).mean(0)
 
 
 def _coloured(x: np.ndarray) -> np.ndarray:
-    """[3] autocorrelation of the third differences of a signal x [S], 2 to 4 samples apart; white noise's where it is
-    too short to tell. What a sudden motion adds is cut off."""
+    """Return [3] autocorrelation of the third differences of a signal x [S], 2 to 4 samples apart; white noise's where
+    it is too short to tell. What a sudden motion adds is cut off."""
     third = np.diff(x, 3)
     cut = 3 * float(np.median(np.abs(third))) / 0.6745 if len(third) else 0.0
     if len(third) < FEWEST_OF_ALL or cut <= 0.0:
@@ -165,7 +165,7 @@ def _coloured(x: np.ndarray) -> np.ndarray:
 def demand(
     row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np.ndarray, clip: bool = True
 ) -> np.ndarray:
-    """Motor torque [S] that the believed law gives along the measured motion, delay and lag aside. N.m"""
+    """Return motor torque [S] that the believed law gives along the measured motion, delay and lag aside. N.m"""
     p = lambda n: row[SERVO_INDEX[n]]  # noqa: E731
     pd = p("kp") * (cmd - q) - p("kd") * v
     return torque_along(pd, v, p("torque_limit"), p("no_load_speed"), voltage, limited=clip)
@@ -191,7 +191,7 @@ def build(
     dt: float = 1e-3,
     only: set[str] | None = None,
 ) -> list[Case]:
-    """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
+    """Return one case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     joints = runs[0].joints
     voltage = runs[0].servo.drive == "voltage"
     m = moved(model, runs, lambda j, plant: plant, device, dt, only)
@@ -223,9 +223,10 @@ def moved(
     added: bool = True,
     rooms: SimpleQueue[np.ndarray] | None = None,
 ) -> Motion:
-    """The joints (of `only`) along all runs. use(j, plant): what is made of each one's plant, which is not kept here;
-    added: also what a mass that is added, or a tilt, would do to them. rooms: memory for the series of plants that
-    nobody keeps, taken from there and given back after `use`: fresh memory costs as much as what is written to it."""
+    """Return the joints (of `only`) along all runs. use(j, plant): what is made of each one's plant, which is not kept
+    here; added: also what a mass that is added, or a tilt, would do to them. rooms: memory for the series of plants
+    that nobody keeps, taken from there and given back after `use`: fresh memory costs as much as what is written to
+    it."""
     joints = runs[0].joints
     J = len(joints)
     servo = runs[0].servo
@@ -280,7 +281,7 @@ def moved(
 
 
 def _taken(rooms: SimpleQueue[np.ndarray] | None) -> np.ndarray | None:
-    """One of `rooms`; None where there is none."""
+    """Return one of `rooms`; None where there is none."""
     try:
         return None if rooms is None else rooms.get_nowait()
     except Empty:
@@ -288,7 +289,7 @@ def _taken(rooms: SimpleQueue[np.ndarray] | None) -> np.ndarray | None:
 
 
 def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
-    """What a recording prescribes of joint j's drive, by name of `SERIES`."""
+    """Return what a recording prescribes of joint j's drive, by name of `SERIES`."""
     exact = {}
     if run.supply is not None and servo.supply_voltage:
         exact["supply"] = _mean(run.supply / servo.supply_voltage, run.t, 0.05)
@@ -304,13 +305,13 @@ def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
 
 
 def _inertia(mech: Sequence[tuple[np.ndarray, np.ndarray]], j: int) -> float:
-    """A joint's inertia about itself, typical of all runs [kg.m2]."""
+    """Return a joint's inertia about itself, typical of all runs [kg.m2]."""
     return float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
 
 
 def _believed(run: Run, joints: Sequence[str]) -> np.ndarray:
-    """[J, C] servo columns of a recording, with what is believed of a drive of which nothing is said: that it brakes
-    with its full torque."""
+    """Return [J, C] servo columns of a recording, with what is believed of a drive of which nothing is said: that it
+    brakes with its full torque."""
     rows = run.servo.nominal(joints)
     for row, joint in zip(rows, joints, strict=True):
         if not _stated(run.servo, joint, "braking_slope"):
@@ -323,8 +324,8 @@ def _stated(table: ServoTable, joint: str, column: str) -> bool:
 
 
 def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
-    """Median over recordings of each one's median over its pieces (a contact cuts one into several): noise is the
-    sensor's, and a recording that moves too fast to tell the two apart counts once."""
+    """Return median over recordings of each one's median over its pieces (a contact cuts one into several): noise is
+    the sensor's, and a recording that moves too fast to tell the two apart counts once."""
     by: dict[str, list[float]] = {}
     for run, value in zip(runs, values, strict=True):
         by.setdefault(run.name, []).append(value)
@@ -436,19 +437,19 @@ def _case(
 
 
 def _big(x: np.ndarray, percentile: float = 95) -> float:
-    """A typical large size of x [n]; 0 of nothing."""
+    """Return a typical large size of x [n]; 0 of nothing."""
     return float(np.percentile(np.abs(x), percentile)) if len(x) else 0.0
 
 
 def _nominal(rows: Sequence[np.ndarray], j: int) -> dict[str, float]:
-    """What is believed of joint j's drive, by column: the median of the recordings, limits that are none made
+    """Return what is believed of joint j's drive, by column: the median of the recordings, limits that are none made
     finite."""
     nominal = {name: float(np.median([r[j][i] for r in rows])) for i, name in enumerate(SERVO_NAMES)}
     return nominal | {k: min(nominal[k], 1e9) for k in ("torque_limit", "no_load_speed")}
 
 
 def _effort_noise(plant: JointPlant, runs: Sequence[Run], j: int) -> float:
-    """rms of the recorded torque's noise [N.m]; 0 where it was recorded for less than half of the time."""
+    """Return rms of the recorded torque's noise [N.m]; 0 where it was recorded for less than half of the time."""
     if np.isfinite(plant.torque).mean() <= 0.5:
         return 0.0
     e = [noise(run.t, np.nan_to_num(run.torque[:, j]))[0] for run in runs if run.torque is not None]
@@ -456,8 +457,8 @@ def _effort_noise(plant: JointPlant, runs: Sequence[Run], j: int) -> float:
 
 
 def _warmth(runs: Sequence[Run], j: int) -> float:
-    """degC by which joint j's drive is warmer or colder than its data sheet, at most; 0 where its temperature hardly
-    changes or is not recorded."""
+    """Return degC by which joint j's drive is warmer or colder than its data sheet, at most; 0 where its temperature
+    hardly changes or is not recorded."""
     logged = [run.temperature[:, j] for run in runs if run.temperature is not None]  # of all runs or none
     if not logged:
         return 0.0
@@ -466,14 +467,14 @@ def _warmth(runs: Sequence[Run], j: int) -> float:
 
 
 def _open_figures(table: ServoTable, joint: str) -> tuple[dict[str, tuple[float, float]], tuple[str, ...]]:
-    """(columns that are believed in a range, those of which nothing is believed)."""
+    """Return (columns that are believed in a range, those of which nothing is believed)."""
     values = {name: table.value(joint, name) for name in SERVO_NAMES}
     ranges = {n: (v.low, v.high) for n, v in values.items() if not v.unknown and v.low < v.high}
     return ranges, tuple(n for n, v in values.items() if v.unknown)
 
 
 def _drags_of(runs: Sequence[Run], others: Sequence[int]) -> dict[str, np.ndarray]:
-    """How far the joints that may drag this one have moved since a recording's first sample."""
+    """Return how far the joints that may drag this one have moved since a recording's first sample."""
 
     def moved_by(run: Run, k: int) -> np.ndarray:
         return run.qs[:, others[k]] - run.qs[0, others[k]] if k < len(others) else np.zeros(len(run.t))
@@ -482,7 +483,7 @@ def _drags_of(runs: Sequence[Run], others: Sequence[int]) -> dict[str, np.ndarra
 
 
 def _rates(runs: Sequence[Run], torques: Sequence[np.ndarray], j: int) -> dict[str, np.ndarray]:
-    """How fast joint j's command and torque change."""
+    """Return how fast joint j's command and torque change."""
     command = [np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs]
     torque = [np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)]
     return {"_command_rate": np.concatenate(command), "_torque_rate": np.concatenate(torque)}
@@ -502,7 +503,7 @@ def _regimes(
     runs: Sequence[Run],
     j: int,
 ) -> dict[str, np.ndarray]:
-    """Variables [n] of each measured sample, that a residual may depend on."""
+    """Return variables [n] of each measured sample, that a residual may depend on."""
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
     since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _rows_by_run(run_of)])
     out = {
@@ -529,12 +530,12 @@ def _regimes(
 
 
 def _rows_by_run(run_of: np.ndarray) -> list[np.ndarray]:
-    """Rows [n] of each run, in their order."""
+    """Return rows [n] of each run, in their order."""
     return [np.flatnonzero(run_of == r) for r in np.unique(run_of)]
 
 
 def _since_reversal(t: np.ndarray, v: np.ndarray, small: float) -> np.ndarray:
-    """[n] s at times t [n] since the speed v [n] changed its sign, at most 9; less than `small` is no speed."""
+    """Return [n] s at times t [n] since the speed v [n] changed its sign, at most 9; less than `small` is no speed."""
     sign = np.where(np.abs(v) < small, 0, np.where(v > 0, 1, -1))
     moves = np.flatnonzero(sign)
     turns = moves[1:][sign[moves[1:]] != sign[moves[:-1]]]
@@ -559,8 +560,8 @@ def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, ar
 
 
 def dragged_by(case: Case, others: Sequence[Case]) -> Case:
-    """The case with other joints, at most `DRAGGERS` of the same recordings, in the place of the last of those that may
-    drag it."""
+    """Return the case with other joints, at most `DRAGGERS` of the same recordings, in the place of the last of those
+    that may drag it."""
     first = DRAGGERS - len(others)
     plant, regimes, series = copy.copy(case.plant), dict(case.regimes), case.plant.series.copy()
     for n, other in enumerate(others, first):
@@ -576,7 +577,7 @@ def dragged_by(case: Case, others: Sequence[Case]) -> Case:
 
 
 def _draggers(model: mujoco.MjModel, joints: Sequence[str], j: int, runs: Sequence[Run]) -> list[int]:
-    """Other joints that move, the nearest in the kinematic tree first."""
+    """Return other joints that move, the nearest in the kinematic tree first."""
     moved = [o for o in range(len(joints)) if o != j and max(np.ptp(r.qs[:, o]) for r in runs) > 0.01]
     body = [int(model.jnt_bodyid[model.joint(n).id]) for n in joints]
 
@@ -598,16 +599,17 @@ def _draggers(model: mujoco.MjModel, joints: Sequence[str], j: int, runs: Sequen
 
 
 def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: np.ndarray, voltage: bool) -> np.ndarray:
-    """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed:
-    by commands of those moments, which are finer than the samples. N.m"""
+    """Return [n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is
+    prescribed: by commands of those moments, which are finer than the samples. N.m"""
     cmd = run.command_at(times)
     q, v = SERIES_INDEX["q"], SERIES_INDEX["v"]
     return np.abs(np.stack([demand(rows[j], voltage, cmd[:, j], x[:, q], x[:, v]) for j, x in enumerate(series)], 1))
 
 
 def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
-    """A joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of which
-    the first four are simulated, and the one that is believed to drag goes first), not among the mechanism's joints."""
+    """Return a joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of
+    which the first four are simulated, and the one that is believed to drag goes first), not among the mechanism's
+    joints."""
     row = row.copy()
     if row[SERVO_INDEX["coupling"]]:
         name = (run.counted or run.joints)[int(row[SERVO_INDEX["coupling_from"]])]
@@ -622,7 +624,7 @@ def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
 
 
 def _mean(x: np.ndarray, t: np.ndarray, seconds: float) -> np.ndarray:
-    """Moving mean over +- seconds."""
+    """Return moving mean over +- seconds."""
     n = max(int(round(seconds / max(float(np.median(np.diff(t))), 1e-6))), 1)
     kernel = np.ones(2 * n + 1) / (2 * n + 1)
     return np.convolve(np.pad(x, n, mode="edge"), kernel, mode="valid")
@@ -646,7 +648,7 @@ PASSES = 2  # of building the cases along the motion that they show
 def refined_cases(
     model: mujoco.MjModel, runs: list[Run], device: str, dt: float, only: set[str] | None = None
 ) -> list[Case]:
-    """A case a joint (of `only`), built along refined motions (`Run.fine`) where there are several joints."""
+    """Return a case a joint (of `only`), built along refined motions (`Run.fine`) where there are several joints."""
     if len(runs[0].joints) < 2:
         return build(model, runs, device, dt)
     rooms: SimpleQueue[np.ndarray] = SimpleQueue()
@@ -673,15 +675,16 @@ def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ..
 
 
 def coupled(cases: Sequence[Case]) -> bool:
-    """Whether the joints' motions reach each other through the mechanism."""
+    """Return whether the joints' motions reach each other through the mechanism."""
     return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > SEARCH.coupled * c.scales.tau for c in cases)
 
 
 def refine_motion_by_fits(
     model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted: Sequence[Any], device: str, dt: float
 ) -> list[Case]:
-    """The cases of all joints built anew along motions refined with what was fitted to each (trials, in the order of
-    the cases). Where a joint's encoder was found not to show its position, the others are moved by where it is."""
+    """Return the cases of all joints built anew along motions refined with what was fitted to each (trials, in the
+    order of the cases). Where a joint's encoder was found not to show its position, the others are moved by where it
+    is."""
     at = []
     for case, trial in zip(cases, fitted, strict=True):
         with_fixed = expand(case.plant, trial.fit.params, trial.fit.x[None])
@@ -709,7 +712,7 @@ def refine_motion_by_fits(
 
 
 def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Motion (times, q, v, a) as an encoder shows it -> as it is, by plant parameters [C]."""
+    """Return motion (times, q, v, a) as an encoder shows it -> as it is, by plant parameters [C]."""
     t, q, v, a = shown
     p = {name: row[i] for name, i in INDEX.items()}
     x = (q - p["position_offset"]) / p["position_scale"]

@@ -227,8 +227,8 @@ class Param:
 def expand(
     plant: JointPlant, params: list[Param], x: np.ndarray, fixed: Sequence[tuple[str, float]] = ()
 ) -> np.ndarray:
-    """[H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after; fixed:
-    constants (column, value) that stand in the place of what is believed."""
+    """Return [H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after;
+    fixed: constants (column, value) that stand in the place of what is believed."""
     base = plant.base()
     for name, value in fixed:
         base[:, INDEX[name]] = value
@@ -245,7 +245,7 @@ def expand(
 
 
 def neutral_of(param: Param, case: Case) -> float:
-    """Value of a parameter at which its effect is not there."""
+    """Return value of a parameter at which its effect is not there."""
     if param.mode == "add":
         return 0.0
     if param.mode == "factor":
@@ -255,7 +255,7 @@ def neutral_of(param: Param, case: Case) -> float:
 
 
 def at_bound(params: Sequence[Param], values: dict[str, float], case: Case) -> str:
-    """Key of a parameter that stopped at a bound of what is physical; empty where none did."""
+    """Return key of a parameter that stopped at a bound of what is physical; empty where none did."""
     for p in params:
         if p.key in ("phase", "rebound", "rotor"):
             continue

@@ -23,7 +23,8 @@ def free_run(
     fixed: Sequence[tuple[str, float]] = (),
     underway: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulated position and motor torque [n] at the windows' samples, from their first sample on without correction.
+    """Return simulated position and motor torque [n] at the windows' samples, from their first sample on without
+    correction.
 
     underway: the position at which a window begins in motion, and its speed there, are fitted to its first `FIRST`
     seconds: what a few samples on one side say of a speed is off by far where a target has just jumped."""
@@ -35,8 +36,8 @@ def free_run(
 
 
 def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """Position and torque [1, n] of one guess [1, R, C], windows that begin in motion from where their first samples
-    say they did."""
+    """Return position and torque [1, n] of one guess [1, R, C], windows that begin in motion from where their first
+    samples say they did."""
     sigma, window, t = case.sigma, windows.sample_window, case.plant.t[windows.sample_row]
     first = np.flatnonzero(np.r_[True, np.diff(window) != 0]) if len(window) else np.zeros(0, int)
     moving = np.abs(case.regimes["_speed"][windows.sample_row[first]]) > JUDGE.turning * case.scales.speed

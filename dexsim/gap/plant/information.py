@@ -75,14 +75,14 @@ class Precision:
         return self.steps < 1.0
 
     def within(self) -> str:
-        """What it could be told by, in words."""
+        """Return what it could be told by, in words."""
         scale = {"%": 100, "% of its torque": 100, "ms": 1e3, "mrad": 1e3}[self.figure.unit]
         return f"{scale * self.figure.step * self.steps:.2g} {self.figure.unit}"
 
 
 def informed(case: Case, floor: float = 0.0) -> list[Precision]:
-    """How well recordings could tell each figure of a joint. floor [rad]: by what repeats differ, where that is more
-    than the noise."""
+    """Return how well recordings could tell each figure of a joint. floor [rad]: by what repeats differ, where that is
+    more than the noise."""
     plant = case.plant
     base = plant.base()
     windows = plant.windows(WINDOW)
@@ -125,7 +125,7 @@ def informed(case: Case, floor: float = 0.0) -> list[Precision]:
 
 
 def own_step(figure: Figure, case: Case) -> float:
-    """The step of a figure that is no share of itself, in its column's unit."""
+    """Return the step of a figure that is no share of itself, in its column's unit."""
     if figure.column == "coulomb_friction":
         return figure.step * case.scales.tau
     if figure.column == "viscous_friction":
@@ -138,7 +138,7 @@ SUM = {"damping", "viscous friction"}
 
 
 def advice(known: Sequence[Precision]) -> list[tuple[str, str]]:
-    """(figure that recordings do not tell, what to record for it) in words."""
+    """Return (figure that recordings do not tell, what to record for it) in words."""
     out = []
     for x in known:
         if not x.possible:

@@ -882,8 +882,8 @@ def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, x: Sta
 
 @cache
 def plant_kernel() -> wp.Kernel:
-    """The kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and guess;
-    dt: step of the grid [s]."""
+    """Return the kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and
+    guess; dt: step of the grid [s]."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def plant(first_window: int, first: int, dt: f64, c: Recorded):

@@ -18,9 +18,9 @@ _ROW = wp.types.vector(len(SERIES), wp.float64)
 
 
 def on_lines(at: np.ndarray, known: np.ndarray, x: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """[n, E] columns x [m, E] known at times [m] that grow, at other times [n]: on straight lines between, held at the
-    ends: `np.interp` of each column. All columns of a `SERIES` are taken row by row, which is how they lie in memory,
-    and without the interpreter; out [n, E]: where to."""
+    """Return [n, E] columns x [m, E] known at times [m] that grow, at other times [n]: on straight lines between, held
+    at the ends: `np.interp` of each column. All columns of a `SERIES` are taken row by row, which is how they lie in
+    memory, and without the interpreter; out [n, E]: where to."""
     out = np.empty((len(at), x.shape[1])) if out is None else out
     in_a_row = out.flags.c_contiguous and out.dtype == np.float64  # the kernel is given no more than where they begin
     if x.shape[1] != len(SERIES) or min(len(known) - 1, len(at)) < 1 or not in_a_row or not np.isfinite(x).all():
@@ -42,7 +42,7 @@ def on_lines(at: np.ndarray, known: np.ndarray, x: np.ndarray, out: np.ndarray |
 
 @cache
 def _kernel() -> wp.Kernel:
-    """The kernel, loaded: one thread a time."""
+    """Return the kernel, loaded: one thread a time."""
 
     @wp.kernel(module="unique", module_options=_ROUNDED, enable_backward=False)
     def lines(

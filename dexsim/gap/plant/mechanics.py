@@ -44,7 +44,7 @@ class JointConstants:
 
 
 def leaf_of(model: mujoco.MjModel, body: int) -> int:
-    """The last link after `body`: the deepest body of its subtree that has mass."""
+    """Return the last link after `body`: the deepest body of its subtree that has mass."""
     best, depth = body, 0
     for b in range(body, model.nbody):
         d, p = 0, b
@@ -58,8 +58,8 @@ def leaf_of(model: mujoco.MjModel, body: int) -> int:
 def along(
     model: mujoco.MjModel, run: Run, joints: tuple[str, ...], added: bool = True
 ) -> tuple[np.ndarray, np.ndarray, list[JointConstants]]:
-    """Series of each joint along a run. added: also what a mass that is added, or a tilt, would do; else those columns
-    are 0.
+    """Return series of each joint along a run. added: also what a mass that is added, or a tilt, would do; else those
+    columns are 0.
 
     Returns times [G0] s, values [J, G0, E] with the mechanical columns of `SERIES` filled, and the constants.
     """
@@ -155,8 +155,8 @@ def _constants(
     inertia: np.ndarray,
     gravity: float,
 ) -> JointConstants:
-    """What does not change along a motion. joint, body, leaf: numbers in the model; inertia [n]: along the motion;
-    gravity: its largest torque."""
+    """Return what does not change along a motion. joint, body, leaf: numbers in the model; inertia [n]: along the
+    motion; gravity: its largest torque."""
     dof = model.jnt_dofadr[joint]
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-1e9, 1e9)
     return JointConstants(
@@ -180,8 +180,8 @@ def _constants(
 def _evaluated(
     model: mujoco.MjModel, qadr: np.ndarray, dadr: np.ndarray, q: np.ndarray, v: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What MuJoCo makes of positions and speeds [n, J] of some joints, the others at rest: its fields [n, ...] by name,
-    contacts, constraints and gravity (which comes in by columns of its own) left out."""
+    """Return what MuJoCo makes of positions and speeds [n, J] of some joints, the others at rest: its fields [n, ...]
+    by name, contacts, constraints and gravity (which comes in by columns of its own) left out."""
     names = ("M", "qfrc_bias", "qfrc_spring", "xaxis", "xanchor", "subtree_com", "xipos", "xmat")
     model, n = copy.copy(model), len(q)
     bit = mujoco.mjtDisableBit
@@ -203,7 +203,7 @@ def _evaluated(
 
 
 def _full(model: mujoco.MjModel, sparse: np.ndarray) -> np.ndarray:
-    """Inertia matrices [n, nv, nv] of MuJoCo's sparse ones, their lower triangles by rows."""
+    """Return inertia matrices [n, nv, nv] of MuJoCo's sparse ones, their lower triangles by rows."""
     rows = np.repeat(np.arange(model.nv), model.M_rownnz)
     columns = np.concatenate(
         [model.M_colind[at : at + k] for at, k in zip(model.M_rowadr, model.M_rownnz, strict=True)]
@@ -215,9 +215,9 @@ def _full(model: mujoco.MjModel, sparse: np.ndarray) -> np.ndarray:
 
 
 def _places(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int], leaves: np.ndarray) -> np.ndarray:
-    """[J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a joint
-    feels it: out from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a joint
-    feels nothing)."""
+    """Return [J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a
+    joint feels it: out from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a
+    joint feels nothing)."""
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
     out = np.empty((len(ids), 2, 3))
@@ -234,7 +234,8 @@ def _places(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int], leav
 def _turned(
     axis: np.ndarray, arm: np.ndarray, mass: np.ndarray | float, gravity: np.ndarray, slide: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gravity's bias torque of a mass at `arm` from a hinge as the joint turns by d: cos * cos(d) + sin * sin(d).
+    """Return gravity's bias torque of a mass at `arm` from a hinge as the joint turns by d: cos * cos(d) + sin *
+    sin(d).
 
     The torque is -m g . (axis x r), and r turns about the axis, which leaves the part along it. Also m |axis x r|^2.
     """
@@ -246,7 +247,8 @@ def _turned(
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n, 3] cross products, as `np.cross` has them, in a third of its time for the few thousand of a recording."""
+    """Return [n, 3] cross products, as `np.cross` has them, in a third of its time for the few thousand of a
+    recording."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

@@ -82,19 +82,19 @@ class Run:
             self.qs, self.vs, self.as_ = local_polynomial(self.t, self.q)
 
     def local(self, width: float) -> LocalPolynomial:
-        """What smooths signals [S, J] at this run's times in windows of +- width s."""
+        """Return what smooths signals [S, J] at this run's times in windows of +- width s."""
         if self.smoother is None or self.smoother[0] is not self.t or self.smoother[1] != width:
             self.smoother = self.t, width, LocalPolynomial(self.t, width)
         return self.smoother[2]
 
     def command_at(self, t: np.ndarray) -> np.ndarray:
-        """[n, J] the target in force at each time (the first target before any)."""
+        """Return [n, J] the target in force at each time (the first target before any)."""
         k = np.clip(np.searchsorted(self.cmd_t, t, side="right") - 1, 0, len(self.cmd_t) - 1)
         return self.cmd[k]
 
 
 def conditions(runs: list[Run]) -> list[int]:
-    """A group number for each run: runs with the same commands (repeats) share one."""
+    """Return a group number for each run: runs with the same commands (repeats) share one."""
     groups: list[int] = []
     representatives: list[Run] = []
     for run in runs:
@@ -109,7 +109,7 @@ def conditions(runs: list[Run]) -> list[int]:
 
 
 def same_commands(a: Run, b: Run) -> bool:
-    """Whether two runs were sent the same targets (and have the same drive), so that they are repeats."""
+    """Return whether two runs were sent the same targets (and have the same drive), so that they are repeats."""
     if a.joints != b.joints or a.servo.to_dict() != b.servo.to_dict() or abs(a.duration - b.duration) > 0.5:
         return False
     t = np.linspace(0.05, 0.95, 200) * min(a.duration, b.duration)

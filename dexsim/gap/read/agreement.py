@@ -38,7 +38,7 @@ class Seen:
 
 
 def seen(run: Run, j: int) -> Seen:
-    """What a run shows of joint j."""
+    """Return what a run shows of joint j."""
     t, q = run.readings(j)
     if run.joints[j] in run.left_out or len(t) < 50 or t[-1] - t[0] < 4 * REACH:
         return Seen(None, None, None)
@@ -59,8 +59,8 @@ def seen(run: Run, j: int) -> Seen:
 
 
 def _lag(run: Run, j: int, grid: np.ndarray, t: np.ndarray, q: np.ndarray) -> float | None:
-    """s by which the position follows its target, negative where it comes first; None where a correlation of speeds
-    does not tell."""
+    """Return s by which the position follows its target, negative where it comes first; None where a correlation of
+    speeds does not tell."""
     reach = round(REACH / STEP)
     wide = np.arange(grid[0] - REACH, grid[-1] + REACH + STEP / 2, STEP)[: len(grid) + 2 * reach]
     rate = lambda x: np.convolve(np.gradient(x), np.ones(5) / 5, "same")  # noqa: E731
@@ -78,8 +78,8 @@ def _lag(run: Run, j: int, grid: np.ndarray, t: np.ndarray, q: np.ndarray) -> fl
 
 
 def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]]:
-    """(recording, kind of finding, text) of each that contradicts the others in what holds of one machine. Two that
-    contradict each other are both named."""
+    """Return (recording, kind of finding, text) of each that contradicts the others in what holds of one machine. Two
+    that contradict each other are both named."""
     each = [(r, seen(r, r.joints.index(joint))) for r in runs if joint in r.joints]
     out = []
     alike = all(r.servo.to_dict() == runs[0].servo.to_dict() for r in runs)  # another gain has another lag
@@ -109,7 +109,7 @@ def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]
 
 
 def _said(joint: str, what: str, mine: float, theirs: Sequence[float], factor: float) -> tuple[str, str]:
-    """(kind of finding, text) of a value that contradicts those of other recordings."""
+    """Return (kind of finding, text) of a value that contradicts those of other recordings."""
     rest = f"in {len(theirs)} other recordings" if len(theirs) > 1 else "in the other recording"
     if what == "lag":
         span = " to ".join(dict.fromkeys(f"{1e3 * x:.0f}" for x in (min(theirs), max(theirs))))
@@ -142,7 +142,7 @@ class Stage:
 
 
 def stages(runs: Sequence[Run], joint: str) -> list[Stage]:
-    """The delays along the drive of a joint, as far as its signals are recorded: target, duty, effort, motion.
+    """Return the delays along the drive of a joint, as far as its signals are recorded: target, duty, effort, motion.
 
     Of each stage the delay is that at which a least squares explains it best by the one before: duty or effort by
     target, position and speed (a PD law), effort by duty and speed (an armature), torque by acceleration and speed (a
@@ -161,7 +161,7 @@ def stages(runs: Sequence[Run], joint: str) -> list[Stage]:
 
 
 def _delay(run: Run, j: int, before: str, after: str) -> float | None:
-    """s by which a stage follows the one before in a run."""
+    """Return s by which a stage follows the one before in a run."""
     run.smooth()
     series = {"duty": run.duty, "effort": run.torque}
     x, y = series.get(before), series.get(after)

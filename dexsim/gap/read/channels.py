@@ -47,7 +47,7 @@ Spans = list[tuple[float, float]]  # s
 def finding(
     kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float | None = None
 ) -> Finding:
-    """A finding that a signal is not what it says."""
+    """Return a finding that a signal is not what it says."""
     told = SIGNAL.told if confidence is None else confidence
     return Finding(WRONG_SIGNAL, told, f"{kind}: {text}", [joint] if joint else (), topics=topics, when=when)
 
@@ -58,13 +58,13 @@ def driven_openly(runs: list[Run]) -> set[tuple[str, str]]:
 
 
 def far_target(f: AuditFinding, name: str, openly: Set[tuple[str, str]]) -> bool:
-    """Whether what the audit found in the recording `name` is that targets lie far off on a joint that is driven so:
-    it knows no gains."""
+    """Return whether what the audit found in the recording `name` is that targets lie far off on a joint that is driven
+    so: it knows no gains."""
     return f.kind == "unit" and f.topic == COMMANDS and (name, f.joint) in openly
 
 
 def spoiled(recordings: list[Recording], openly: Set[tuple[str, str]] = frozenset()) -> dict[tuple[str, str], str]:
-    """(recording, joint) whose position or target the audit found wrong -> why. openly: of `driven_openly`."""
+    """Return (recording, joint) whose position or target the audit found wrong -> why. openly: of `driven_openly`."""
     out: dict[tuple[str, str], str] = {}
     for r in recordings:
         for f in r.findings:
@@ -80,7 +80,7 @@ def spoiled(recordings: list[Recording], openly: Set[tuple[str, str]] = frozense
 
 
 def secondary(findings: list[Finding]) -> list[Finding]:
-    """The findings without those that follow from another: an effort's sign is read against the position."""
+    """Return the findings without those that follow from another: an effort's sign is read against the position."""
     spoiled = [f for f in findings if f.regime.split(":")[0] in SPOILS and "position" in f.regime]
     wrong = {j for f in spoiled for j in f.joints}
     of_sign = ("sign_mismatch", "lost_sign")
@@ -89,9 +89,9 @@ def secondary(findings: list[Finding]) -> list[Finding]:
 
 def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]
             ) -> tuple[list[Finding], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
-    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by
-    run in s in which nothing is known of a joint). `known`: what the audit has named already. Repeated readings are
-    taken out of the runs, which can then be used, but for those stretches."""
+    """Return (findings that runs, model and commands show together, (run, joint) that must be left out -> why,
+    stretches by run in s in which nothing is known of a joint). `known`: what the audit has named already. Repeated
+    readings are taken out of the runs, which can then be used, but for those stretches."""
     found: dict[tuple[str, str], Finding] = {}
     out = dict(known)
     targets = [Targets(run) for run in runs]
@@ -149,7 +149,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
 
 
 def _on_rows(run: Run, j: int, on: np.ndarray) -> np.ndarray:
-    """[S] bool of a run's samples from that of joint j's readings."""
+    """Return [S] bool of a run's samples from that of joint j's readings."""
     if run.read is None:
         return on
     out = np.zeros(len(run.t), bool)
@@ -192,14 +192,14 @@ class Targets:
         self._even: tuple[np.ndarray, np.ndarray, slice] | None = None
 
     def before(self, delay: float = 0.0) -> np.ndarray:
-        """[S, J] `delay` s before each sample."""
+        """Return [S, J] `delay` s before each sample."""
         if delay not in self._at:
             self._at[delay] = self.run.command_at(self.run.t - delay if delay else self.run.t)
         return self._at[delay]
 
     def even(self) -> tuple[np.ndarray, np.ndarray, slice]:
-        """(even grid [n] s over the longest stretch without a pause, targets [n + BEFORE + AFTER, J] from AFTER steps
-        before it to BEFORE steps behind it, samples of the stretch); no targets where it is too short."""
+        """Return (even grid [n] s over the longest stretch without a pause, targets [n + BEFORE + AFTER, J] from AFTER
+        steps before it to BEFORE steps behind it, samples of the stretch); no targets where it is too short."""
         if self._even is None:
             t = self.run.t
             edges = np.r_[0, np.flatnonzero(np.diff(t) > PAUSE) + 1, len(t)]
@@ -232,9 +232,9 @@ def _wrong(
     way: float | None = None,
     unlike: Sequence[str] = (),
 ) -> _Wrong | None:
-    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is. targets:
-    the run's, where they are found already; way: its direction there (`directions`); unlike: runs in which that is
-    another."""
+    """Return what is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is.
+    targets: the run's, where they are found already; way: its direction there (`directions`); unlike: runs in which
+    that is another."""
     targets = targets or Targets(run)
     way = directions([run], [targets], run.joints[j])[0] if way is None else way
     joint, q, cmd = run.joints[j], run.q[:, j], targets.before()[:, j]
@@ -295,7 +295,7 @@ def _wrong(
 def drop(
     runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], model: mujoco.MjModel, held: Sequence[int] = ()
 ) -> list[Run]:
-    """The runs without what must be left out of them.
+    """Return the runs without what must be left out of them.
 
     A joint that others of the recordings tell of stays in a run in which it is spoiled, as one of `Run.left_out`: it is
     not judged there, and what the joints beside it feel of it is that of its targets (where those are spoiled too, of a
@@ -368,13 +368,13 @@ def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
 
 
 def _outside(x: np.ndarray, limits: np.ndarray) -> float:
-    """How far beyond a range the values go, 0 or less where they do not."""
+    """Return how far beyond a range the values go, 0 or less where they do not."""
     return float(max(x.max() - limits[1], limits[0] - x.min()))
 
 
 def _within_drive(run: Run, j: int) -> bool:
-    """Whether the believed drive can give what its gain makes of every target: one without a loop of its own is told
-    its torque so, as a target far off through a small gain."""
+    """Return whether the believed drive can give what its gain makes of every target: one without a loop of its own is
+    told its torque so, as a target far off through a small gain."""
     row = run.servo.nominal(run.joints)[j]
     asked = row[INDEX["kp"]] * (float(np.abs(run.cmd[:, j]).max()) + float(np.abs(run.q[:, j]).max()))
     return bool(0 < asked <= (1.0 if run.servo.drive == "voltage" else row[INDEX["torque_limit"]]))
@@ -385,8 +385,8 @@ def _farthest(x: np.ndarray, limits: np.ndarray) -> float:
 
 
 def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
-    """Far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn outside: the
-    model's range may be the one in degrees.)"""
+    """Find values far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn
+    outside: the model's range may be the one in degrees.)"""
     wide = 0.1 * (limits[1] - limits[0])
     outside = lambda x: _outside(x, limits) > SIGNAL.far * (limits[1] - limits[0])  # noqa: E731
     inside = (q / TURN).min() > limits[0] - wide and (q / TURN).max() < limits[1] + wide
@@ -394,10 +394,10 @@ def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
 
 
 def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
-    """(largest correlation of the position with its target of up to `LAGS` s before, and with the target's negative).
-    In a narrow band both are large: a lag of half a period looks like another sign. A joint beyond its resonance lags
-    by more than a quarter period, and goes less far than its target for that: its own target may be `LONG_LAGS`
-    before."""
+    """Return (largest correlation of the position with its target of up to `LAGS` s before, and with the target's
+    negative). In a narrow band both are large: a lag of half a period looks like another sign. A joint beyond its
+    resonance lags by more than a quarter period, and goes less far than its target for that: its own target may be
+    `LONG_LAGS` before."""
 
     def most(lags: np.ndarray) -> tuple[float, float]:
         on = targets.run.t >= targets.run.cmd_t[0] + lags[-1]  # from where on all of them are known
@@ -414,9 +414,9 @@ def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
 
 
 def directions(runs: Sequence[Run], targets: Sequence[Targets], joint: str) -> list[float]:
-    """Of each run, 1 where the joint follows its target, -1 where it follows the target's negative, half of it where a
-    narrow band lets it seem so, 0 where it cannot tell or lacks the joint. Of several, one
-    that cannot tell has the direction that the slowest of the others shows, and so has a much faster one."""
+    """Return of each run, 1 where the joint follows its target, -1 where it follows the target's negative, half of it
+    where a narrow band lets it seem so, 0 where it cannot tell or lacks the joint. Of several, one that cannot tell has
+    the direction that the slowest of the others shows, and so has a much faster one."""
     out = []
     for run, at in zip(runs, targets, strict=True):
         way = 0.0
@@ -446,13 +446,14 @@ FASTER = 2.0
 
 
 def _rate(run: Run, joint: str) -> float:
-    """How fast a target goes to and fro [1/s]: its speed over its size, rms."""
+    """Return how fast a target goes to and fro [1/s]: its speed over its size, rms."""
     cmd = run.command_at(run.t)[:, run.joints.index(joint)]
     return float(np.sqrt(np.mean((np.diff(cmd) / np.diff(run.t)) ** 2)) / max(float(np.std(cmd)), 1e-9))
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """That of two series [n], neither of them constant: the steps of `np.corrcoef`, without its checks of shapes."""
+    """Return that of two series [n], neither of them constant: the steps of `np.corrcoef`, without its checks of
+    shapes."""
     x = np.array([a, b])
     x -= x.mean(1)[:, None]
     products = np.dot(x, x.T) * np.true_divide(1, len(a) - 1)
@@ -461,15 +462,16 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _clocked(run: Run, j: int, targets: Targets) -> bool:
-    """Whether other joints of the run, of whom most that can tell do not lead, show that its clocks belong together."""
+    """Return whether other joints of the run, of whom most that can tell do not lead, show that its clocks belong
+    together."""
     others = [k for k in range(len(run.joints)) if k != j and directions([run], [targets], run.joints[k])[0] == 1]
     leads = [_lead(run, k, targets) > SIGNAL.early for k in others]
     return len(leads) > 1 and sum(leads) < 0.5 * len(leads)
 
 
 def _early_edges(run: Run, j: int) -> float:
-    """s by which the joint moves before the edges of its target, in the median of those before and after which both
-    stood still; 0 where there are few such, or most come first."""
+    """Return s by which the joint moves before the edges of its target, in the median of those before and after which
+    both stood still; 0 where there are few such, or most come first."""
     t, q = run.readings(j)
     c, at = run.cmd[:, j], run.cmd_t
     jump = np.diff(c)
@@ -514,8 +516,9 @@ def _lead(run: Run, j: int, targets: Targets | None = None) -> float:
 
 
 def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float | None:
-    """When [s] the position stops for good although its target goes on; None where it does not, and where dry friction
-    may hold it: where its target goes no further away than it has been when the joint broke away from rest before."""
+    """Return when [s] the position stops for good although its target goes on; None where it does not, and where dry
+    friction may hold it: where its target goes no further away than it has been when the joint broke away from rest
+    before."""
     j = run.joints.index(joint)
     q = run.q[:, j]
     last = np.flatnonzero(q != q[-1])
@@ -532,8 +535,8 @@ def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float 
 
 
 def _holds(run: Run, j: int, end: int) -> float:
-    """The largest error [rad] at which a joint stood still for 50 ms and more, and then moved, in the samples before
-    `end`."""
+    """Return the largest error [rad] at which a joint stood still for 50 ms and more, and then moved, in the samples
+    before `end`."""
     q = run.q[:end, j]
     error = np.abs(run.command_at(run.t[:end])[:, j] - q)
     stood = [(a, b) for a, b in rests(q) if b + 1 < end and run.t[b] - run.t[a] >= SIGNAL.rest]
@@ -585,14 +588,15 @@ def _keep(run: Run, on: np.ndarray) -> None:
 
 
 def rests(q: np.ndarray) -> list[tuple[int, int]]:
-    """(first, last) sample of each stretch of readings that are all the same."""
+    """Return (first, last) sample of each stretch of readings that are all the same."""
     edge = np.flatnonzero(np.diff(np.r_[0, (np.diff(q) == 0).astype(int), 0]))
     return list(zip(edge[::2].tolist(), edge[1::2].tolist(), strict=True))
 
 
 def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S - 1] how far the step after each sample goes beyond what the faster of the steps beside it would give in its
-    time; 0 where one beside it goes the other way just as far (a reading that comes back is a spike, not a jump)."""
+    """Return [S - 1] how far the step after each sample goes beyond what the faster of the steps beside it would give
+    in its time; 0 where one beside it goes the other way just as far (a reading that comes back is a spike, not a
+    jump)."""
     dt, dq = np.maximum(np.diff(t), 1e-6), np.diff(q)
     speed = dq / dt
     before, after = np.r_[0.0, speed[:-1]], np.r_[speed[1:], 0.0]
@@ -605,8 +609,8 @@ def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_stretches(
     runs: Sequence[Run], joint: str, targets: Sequence[Targets] | None = None
 ) -> list[list[tuple[int, int]]]:
-    """Of each run, (first, last) number of the joint's readings in the stretches in which they are old ones; `last` is
-    the last old one. Runs without the joint have none. targets: of each run, where they are found already."""
+    """Return of each run, (first, last) number of the joint's readings in the stretches in which they are old ones;
+    `last` is the last old one. Runs without the joint have none. targets: of each run, where they are found already."""
     out: list[list[tuple[int, int]]] = [[] for _ in runs]
     stood: dict[int, list[tuple[int, int]]] = {}
     for k, run in enumerate(runs):
@@ -638,8 +642,8 @@ def repeated_stretches(
 
 
 def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S] bool: single readings that repeat the one before in a steady motion and are made up for by the next; none
-    where there are few."""
+    """Return [S] bool: single readings that repeat the one before in a steady motion and are made up for by the next;
+    none where there are few."""
     again = repeats(t, q)
     return again if again.sum() >= max(SIGNAL.few, SIGNAL.often * len(t)) else np.zeros(len(t), bool)
 
@@ -648,8 +652,8 @@ def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 # An encoder that is read more seldom than it is logged: the rhythm of its readings, and the samples between them.
 
 def common_rhythm(runs: Sequence[Run], joint: str) -> float:
-    """s between readings of a joint that is read more seldom than it is logged, in most of the runs that can tell; 0
-    else."""
+    """Return s between readings of a joint that is read more seldom than it is logged, in most of the runs that can
+    tell; 0 else."""
     told = [rhythm(*r.readings(r.joints.index(joint))) for r in runs if joint in r.joints]
     told = [x for x in told if not np.isnan(x)]
     slow = [x for x in told if x > 0]
@@ -657,8 +661,8 @@ def common_rhythm(runs: Sequence[Run], joint: str) -> float:
 
 
 def rhythm(t: np.ndarray, q: np.ndarray) -> float:
-    """s from one reading to the next of an encoder that is read at a slower rate than it is logged; 0 where each sample
-    is a reading of its own, NaN where it moves too little to tell.
+    """Return s from one reading to the next of an encoder that is read at a slower rate than it is logged; 0 where each
+    sample is a reading of its own, NaN where it moves too little to tell.
 
     Such a position leaps, by several of its smallest steps within one sample, at the beats of one rhythm. A joint that
     turns slowly past a coarse encoder's steps has a rhythm but no leaps, one that sticks and slips leaps but in no
@@ -681,8 +685,8 @@ def rhythm(t: np.ndarray, q: np.ndarray) -> float:
 
 
 def between_readings(t: np.ndarray, q: np.ndarray, period: float) -> np.ndarray:
-    """[S] bool: samples that repeat the last reading of an encoder that is read every `period` s. New readings are
-    those that differ from the one before and, at the beats without one, the sample next to it."""
+    """Return [S] bool: samples that repeat the last reading of an encoder that is read every `period` s. New readings
+    are those that differ from the one before and, at the beats without one, the sample next to it."""
     change = np.flatnonzero(np.diff(q) != 0) + 1
     old = np.ones(len(t), bool)
     old[change] = False
@@ -700,7 +704,8 @@ def between_readings(t: np.ndarray, q: np.ndarray, period: float) -> np.ndarray:
 
 
 def _beat(t: np.ndarray, period: float, within: float) -> tuple[float, complex]:
-    """(period within a share of the given one with which times t are most in step, mean of their turns round it)."""
+    """Return (period within a share of the given one with which times t are most in step, mean of their turns round
+    it)."""
     # at neighbouring ones the first and the last time are a sixteenth of a turn apart
     n = int(32 * within * (t[-1] - t[0]) / period) + 3
     periods = period * np.linspace(1 - within, 1 + within, min(n, 4001))

@@ -33,7 +33,7 @@ class Unusable(Exception):
 
 
 def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
-    """The recording as plain arrays. Raises Unusable where it cannot be used; what is left out goes to notes."""
+    """Return the recording as plain arrays. Raises Unusable where it cannot be used; what is left out goes to notes."""
     name = recording.path.name
     joints = _known_joints(recording, m, notes)
     column = [recording.joints.index(j) for j in joints]
@@ -73,8 +73,8 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
 
 
 def _known_joints(recording: Recording, m: Mechanism, notes: list[str]) -> tuple[str, ...]:
-    """The recording's joints that the model has, in its order. Raises Unusable where there are none, or no states or
-    commands."""
+    """Return the recording's joints that the model has, in its order. Raises Unusable where there are none, or no
+    states or commands."""
     name = recording.path.name
     joints = tuple(j for j in m.joints if j in recording.joints)
     followers = () if m.hand is None else m.hand.couplings.passive  # measured, but nothing commands them
@@ -151,8 +151,8 @@ def _commands(
 
 
 def _begin(name: str, t: np.ndarray, commands: np.ndarray, notes: list[str]) -> int:
-    """The first state from which on it is known what was asked; a command from before the first state still holds.
-    t [S], commands [C]: times. Raises Unusable where the two do not overlap."""
+    """Return the first state from which on it is known what was asked; a command from before the first state still
+    holds. t [S], commands [C]: times. Raises Unusable where the two do not overlap."""
     if commands[0] > t[-1]:
         raise Unusable(
             f"{name}: the commands begin {commands[0] - t[-1]:.1f} s after the last state: the clocks do not belong "
@@ -175,7 +175,8 @@ def _torque(
     column: list[int],
     notes: list[str],
 ) -> np.ndarray | None:
-    """[S, J] the effort in the unit of the drive's torque; None where none was recorded or it is not what it says."""
+    """Return [S, J] the effort in the unit of the drive's torque; None where none was recorded or it is not what it
+    says."""
     effort = recording.signed_effort()
     if effort is None or recording.effort_is == "none" or _bad(recording, STATES, "effort"):
         return None
@@ -219,7 +220,7 @@ def _bad(recording: Recording, topic: str, word: str) -> bool:
 
 
 def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool = False) -> np.ndarray | None:
-    """Columns of a series at times t, interpolated (held where hold)."""
+    """Return columns of a series at times t, interpolated (held where hold)."""
     if series is None or not len(series):
         return None
     out = np.empty((len(t), len(columns)))
@@ -246,9 +247,9 @@ def free_air(
     room: tuple[float, float] = (0.1, 0.3),
     least: float = 2.0,
 ) -> tuple[list[Run], list[int]]:
-    """The runs without the stretches in which something is touched (by recording: start, end in s; `why`, and what is
-    left, `rest`, in words) and `room` s before and after, and which are held out. Pieces shorter than `least` s are
-    left out.
+    """Return the runs without the stretches in which something is touched (by recording: start, end in s; `why`, and
+    what is left, `rest`, in words) and `room` s before and after, and which are held out. Pieces shorter than `least` s
+    are left out.
 
     A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in
     between becomes several of the same name, on its own clock.
@@ -276,7 +277,7 @@ def free_air(
 
 
 def cut(run: Run, start: float, end: float) -> Run:
-    """The run between two times [s]; commands stay, for what was sent before still acts."""
+    """Return the run between two times [s]; commands stay, for what was sent before still acts."""
     on = (run.t >= start) & (run.t <= end)
     part = lambda x: None if x is None else x[on]  # noqa: E731
     return Run(
@@ -303,7 +304,7 @@ def cut(run: Run, start: float, end: float) -> Run:
 
 
 def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
-    """The runs with the joints that all of them have, in one order."""
+    """Return the runs with the joints that all of them have, in one order."""
     shared = [j for j in runs[0].joints if all(j in r.joints for r in runs)]
     if not shared:
         raise Unusable(
@@ -335,7 +336,7 @@ def channel_findings(
     sensors: dict[str, str],
     openly: Set[tuple[str, str]] = frozenset(),
 ) -> list[Finding]:
-    """Findings of signals that are not what they say. sensors: ids of the effects that
+    """Return findings of signals that are not what they say. sensors: ids of the effects that
     make the same of an effort's sign, each with the experiment that shows it; openly: of `channels.driven_openly`."""
     out: dict[tuple, Finding] = {}
     for r in recordings:
@@ -361,7 +362,7 @@ def channel_findings(
 
 
 def files(given: Any, key: str) -> list[Path]:
-    """A list of recording paths from a setting; UserError where it is empty or a file is missing."""
+    """Return a list of recording paths from a setting; UserError where it is empty or a file is missing."""
     items = given if isinstance(given, (list, tuple)) else [given]
     out = []
     for item in items:
@@ -382,8 +383,9 @@ def files(given: Any, key: str) -> list[Path]:
 
 
 def parted(recordings: Any, held_out: Any) -> tuple[list[Path], list[Path] | None]:
-    """(recordings that are fitted, those held out of the fit, None where nothing is said). held_out: as recordings, or
-    `episodes[40:]` of them; what is held out is taken out of the fit. Raises UserError where nothing is left."""
+    """Return (recordings that are fitted, those held out of the fit, None where nothing is said). held_out: as
+    recordings, or `episodes[40:]` of them; what is held out is taken out of the fit. Raises UserError where nothing is
+    left."""
     every = files(recordings, "recordings")
     if not held_out:
         return every, None
@@ -487,8 +489,8 @@ def used_end_stops(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
 
 
 def with_ranges(spec: mujoco.MjSpec, used: mujoco.MjModel) -> tuple[mujoco.MjSpec, list[str]]:
-    """(a copy of a mechanism with the joints' ranges of `used`, a model of it, what changed in words): a joint that has
-    moved beyond its range, or meets an end before it, does so in training too."""
+    """Return (a copy of a mechanism with the joints' ranges of `used`, a model of it, what changed in words): a joint
+    that has moved beyond its range, or meets an end before it, does so in training too."""
     own, spec, said = spec.compile(), spec.copy(), []
     for i in range(own.njnt):
         name, limited, ends = own.joint(i).name, bool(used.jnt_limited[i]), used.jnt_range[i]
@@ -529,8 +531,8 @@ def unforeseen_end_stops(model: mujoco.MjModel, runs: list[Run]) -> dict[str, li
 def _end(
     model: mujoco.MjModel, data: mujoco.MjData, runs: list[Run], j: int, side: int
 ) -> tuple[float, str, float] | None:
-    """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it
-    meets none."""
+    """Return (position of the end, names of the recordings, what counts as near it) on one side of a joint; None where
+    it meets none."""
     outer = max(float((side * r.q[:, j]).max()) for r in runs)
     near = SIGNAL.near * (max(float(r.q[:, j].max()) for r in runs) - min(float(r.q[:, j].min()) for r in runs))
     errors = [side * (r.command_at(r.t)[:, j] - r.q[:, j]) for r in runs]
@@ -563,7 +565,7 @@ def _end(
 
 
 def _still(run: Run, j: int, near: float) -> np.ndarray:
-    """[S] whether the joint stands, as far as 0.1 s around each sample show."""
+    """Return [S] whether the joint stands, as far as 0.1 s around each sample show."""
     n = max(int(round(0.05 / max(float(np.median(np.diff(run.t))), 1e-6))), 1)
     q = np.pad(run.q[:, j], n, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(q, 2 * n + 1)
@@ -571,7 +573,7 @@ def _still(run: Run, j: int, near: float) -> np.ndarray:
 
 
 def _hard(model: mujoco.MjModel, data: mujoco.MjData, run: Run, j: int, i: int) -> bool:
-    """Whether the believed drive asks at sample i for far more than gravity weighs there."""
+    """Return whether the believed drive asks at sample i for far more than gravity weighs there."""
     row = run.servo.nominal(run.joints)[j]
     from dexsim.actuator.columns import INDEX
 

@@ -12,7 +12,7 @@ REPEATS = 0.5
 
 
 def noise(t: np.ndarray, x: np.ndarray, miss: np.ndarray | None = None) -> tuple[float, float]:
-    """(standard deviation of the measurement noise, quantum) of one signal, from each sample's misfit to a local
+    """Return (standard deviation of the measurement noise, quantum) of one signal, from each sample's misfit to a local
     parabola through its neighbours without it (miss: `misfit`, where it is known). The quantum is 0 where the values
     are not on a grid."""
     steps = np.unique(np.round(np.abs(np.diff(x)), 9))
@@ -39,13 +39,14 @@ def noise(t: np.ndarray, x: np.ndarray, miss: np.ndarray | None = None) -> tuple
 
 
 def noise_of(run: Run, j: int) -> tuple[float, float]:
-    """`noise` of joint j's position in a run. Every joint's case asks for that of all others, each time anew that cases
-    are built: it is kept with the run, for as long as the run has these positions."""
+    """Return `noise` of joint j's position in a run. Every joint's case asks for that of all others, each time anew
+    that cases are built: it is kept with the run, for as long as the run has these positions."""
     return noises(run)[1][j]
 
 
 def noises(run: Run) -> tuple[np.ndarray, list[tuple[float, float]], list[np.ndarray]]:
-    """(positions [S, J]; by joint the `noise` of its readings, and what these miss local cubics by (`misfit`))."""
+    """Return (positions [S, J]; by joint the `noise` of its readings, and what these miss local cubics by
+    (`misfit`))."""
     if run.noises is None or run.noises[0] is not run.q:
         each = [run.readings(j) for j in range(run.q.shape[1])]
         if run.read is None:
@@ -57,8 +58,8 @@ def noises(run: Run) -> tuple[np.ndarray, list[tuple[float, float]], list[np.nda
 
 
 def misfit(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """[S - 2 BESIDE, J] by what each sample of signals x [S, J] at t [S] s misses a local cubic through its neighbours
-    without it, of the noise's own size; nothing where there are too few."""
+    """Return [S - 2 BESIDE, J] by what each sample of signals x [S, J] at t [S] s misses a local cubic through its
+    neighbours without it, of the noise's own size; nothing where there are too few."""
     k = BESIDE
     if len(x) < 2 * k + 3:
         return np.empty((0, x.shape[1]))

@@ -61,7 +61,7 @@ class Stage:
 
 
 def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -> list[Stage]:
-    """One Stage for each joint whose duty (voltage drives) or effort was logged."""
+    """Return one Stage for each joint whose duty (voltage drives) or effort was logged."""
     out = []
     rng = np.random.default_rng(seed)
     for case in cases:
@@ -99,8 +99,8 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
 
 
 def _late(case: Case, runs: list[Run]) -> float:
-    """s by which a drive may act late and be as believed: `BELIEF.late` of its loop's period, or of the readings' where
-    those are further apart."""
+    """Return s by which a drive may act late and be as believed: `BELIEF.late` of its loop's period, or of the
+    readings' where those are further apart."""
     readings = max(float(np.median(np.diff(run.t))) for run in runs)
     return BELIEF.late * max(1.0 / (case.loop_rate or 1000.0), readings)
 
@@ -117,7 +117,7 @@ class _Logged:
 
 
 def _logged(run: Run, j: int) -> _Logged | None:
-    """What joint j's drive logged in a recording; None where it logged nothing that its law gives."""
+    """Return what joint j's drive logged in a recording; None where it logged nothing that its law gives."""
     row = run.servo.nominal(run.joints)[j]
     gains, limit = {n: row[INDEX[n]] for n in ("kp", "kd")}, row[INDEX["torque_limit"]]
     if run.duty is not None and run.servo.drive == "voltage":
@@ -140,6 +140,6 @@ def _logged(run: Run, j: int) -> _Logged | None:
 def _slope(
     n: np.ndarray, sx: np.ndarray, sy: np.ndarray, sxx: np.ndarray, sxy: np.ndarray, axis: int = -1
 ) -> np.ndarray:
-    """Slopes of the lines through resampled blocks, of the blocks' sums: samples, x, y, x x and x y."""
+    """Return slopes of the lines through resampled blocks, of the blocks' sums: samples, x, y, x x and x y."""
     n, sx, sy, sxx, sxy = (s.sum(axis) for s in (n, sx, sy, sxx, sxy))
     return (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)

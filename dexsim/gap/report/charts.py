@@ -35,7 +35,7 @@ def _line(x: np.ndarray, y: np.ndarray, colour: str, width: float = 1.4) -> str:
 def text(
     x: float, y: float, words: str, anchor: str = "start", size: float = 11, colour: str = SOFT, weight: int = 400
 ) -> str:
-    """A line of text at x, y."""
+    """Return a line of text at x, y."""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{colour}" text-anchor="{anchor}" '
         f'font-weight="{weight}">{html.escape(words)}</text>'
@@ -52,8 +52,8 @@ def curves(
     spans: Sequence[tuple[float, float]] = (),
     width: int = 980,
 ) -> str:
-    """The quantity above, simulated minus measured below in thousandths, against time [s]; spans: stretches that are
-    shaded."""
+    """Return the quantity above, simulated minus measured below in thousandths, against time [s]; spans: stretches that
+    are shaded."""
     top, bottom, left, right = 200, 96, 56, 12
     height = top + bottom + 50
     t0, t1 = float(t[0]), float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1
@@ -104,7 +104,7 @@ def curves(
 
 
 def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], unit: str, width: int = 560) -> str:
-    """Horizontal bars: (name, value, low, high, colour); values share one scale."""
+    """Return horizontal bars: (name, value, low, high, colour); values share one scale."""
     left, right, step = 156, 118, 38
     height = step * len(rows) + 6
     top = max([*(max(r[1], r[3] or 0.0) for r in rows), 1e-12])
@@ -133,7 +133,7 @@ def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], uni
 
 
 def interval(value: float, low: float, high: float, width: int = 190) -> str:
-    """A value with its interval on a short axis that begins at 0 where that is near."""
+    """Return a value with its interval on a short axis that begins at 0 where that is near."""
     lo, hi = min(low, value), max(high, value)
     span = max(hi - lo, 1e-12 + 0.02 * abs(value))
     a, b = lo - 0.6 * span, hi + 0.6 * span
@@ -158,7 +158,7 @@ def interval(value: float, low: float, high: float, width: int = 190) -> str:
 
 
 def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]], width: int = 560) -> str:
-    """One strip a recording: (name, its end [s], stretches [s] that are dark)."""
+    """Return one strip a recording: (name, its end [s], stretches [s] that are dark)."""
     end = max(max(e, 1e-9) for _, e, _ in rows)
     left, right, step = 118, 12, 22
     height = step * len(rows) + 18
@@ -179,7 +179,7 @@ def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]], width: 
 
 
 def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, left: int = 400) -> str:
-    """Bars with intervals, 1 marked."""
+    """Return bars with intervals, 1 marked."""
     right, step = 50, 26
     height = step * len(rows) + 22
     top = max([2.0, *(min(r[3], 8.0) for r in rows)])
@@ -211,8 +211,8 @@ UNKNOWN = 12  # taxels drawn in a column where no lattice is known
 
 
 def pad(error: np.ndarray, marked: set[int], lattice: tuple[int, int] | None, size: float = 15.0) -> str:
-    """One pad's taxels [K] N as its lattice of (columns, rows), rows from the joint (below) to the tip, coloured by
-    error; the marked ringed. Without a lattice in rows of twelve, by number."""
+    """Return one pad's taxels [K] N as its lattice of (columns, rows), rows from the joint (below) to the tip, coloured
+    by error; the marked ringed. Without a lattice in rows of twelve, by number."""
     columns, rows = lattice or (-(-len(error) // UNKNOWN), UNKNOWN)
     error = error[: columns * rows]  # a smaller pad's end before the largest's
     most = max(float(error.max()), 1e-9)
@@ -239,7 +239,7 @@ def heat(share: float) -> str:
 
 
 def scale(most: float, unit: str, width: int = 360) -> str:
-    """The colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
+    """Return the colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
     left, right, steps = 60, width - 96, 24
     part = (right - left) / steps
     out = [
@@ -279,8 +279,8 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
 
 
 def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
-    """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side
-    stands."""
+    """Return rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest
+    side stands."""
     centred = cloud - cloud.mean(0)
     _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=False)
     front = axes[2]
@@ -310,7 +310,7 @@ class _Drawing:
     height: int
 
     def at(self, p: np.ndarray) -> np.ndarray:
-        """[n, 2] of the picture."""
+        """Return [n, 2] of the picture."""
         u = (np.atleast_2d(p) @ self.axes.T)[:, :2]
         x, y = (u[:, k] - self.middle[k] for k in (0, 1))
         return np.stack([self.width / 2 + x * self.scale, self.height / 2 - y * self.scale], 1)
@@ -319,7 +319,8 @@ class _Drawing:
 def _drawing(
     model: mujoco.MjModel, sensors: Sensors, joints: list[int], touch_alone: bool, width: int, height: int
 ) -> _Drawing | None:
-    """The model seen from where its motion shows best, filling the picture; None where there is nothing to see."""
+    """Return the model seen from where its motion shows best, filling the picture; None where there is nothing to
+    see."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     groups = [g for g in range(model.ngeom) if int(model.geom_group[g]) <= 2] or list(range(model.ngeom))
@@ -359,9 +360,9 @@ def mechanism(
     width: int = 360,
     height: int = 400,
 ) -> str:
-    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
-    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model
-    carries the pads of `sensors`."""
+    """Return the links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named
+    where found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads of
+    `sensors`."""
     names = [model.joint(i).name for i in range(model.njnt)]
     joints = [i for i, n in enumerate(names) if n in error]
     drawing = _drawing(model, sensors, joints, not error, width, height)
@@ -378,7 +379,7 @@ def mechanism(
 
 
 def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
-    """The links from the farthest to the nearest, those of `hot` bodies in another colour."""
+    """Return the links from the farthest to the nearest, those of `hot` bodies in another colour."""
     from scipy.spatial import ConvexHull, QhullError
 
     out = []
@@ -397,7 +398,7 @@ def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
 
 
 def _links(d: _Drawing, joints: list[int]) -> list[str]:
-    """Lines from joint to joint, so that a mechanism without shapes still shows."""
+    """Return lines from joint to joint, so that a mechanism without shapes still shows."""
     out = []
     for i in joints:
         parent = int(d.model.body_parentid[int(d.model.jnt_bodyid[i])])
@@ -415,7 +416,7 @@ def _links(d: _Drawing, joints: list[int]) -> list[str]:
 
 
 def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
-    """The taxels of the pads, coloured by their error [F, K] N; ringed where `marked`."""
+    """Return the taxels of the pads, coloured by their error [F, K] N; ringed where `marked`."""
     out = []
     most = max(float(taxels.max()), 1e-9)
     for f, p in d.pads:
@@ -433,7 +434,8 @@ def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
 def _discs(
     d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found: set[str], unit: str
 ) -> list[str]:
-    """A disc at each joint (number -> name, error), coloured by its error of `most`, ringed and named where found."""
+    """Return a disc at each joint (number -> name, error), coloured by its error of `most`, ringed and named where
+    found."""
     out, labels = [], []
     for i, (name, small) in joints.items():
         (x, y) = d.at(d.data.xanchor[i])[0]

@@ -71,7 +71,8 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
 
 
 def _page(d: Diagnosis) -> str:
-    """The page. It is drawn from an answer that may have taken an hour: a fault in the drawing must not lose that."""
+    """Return the page. It is drawn from an answer that may have taken an hour: a fault in the drawing must not lose
+    that."""
     try:
         return page(d)
     except Exception:
@@ -96,7 +97,7 @@ BEYOND = (("reason",), ("noise_floor", "recordings"), ("held_out", "how"), ("une
 
 
 def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for
+    """Return (what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for
     details.json)."""
     asked = copy.deepcopy(data)
     more: dict[str, Any] = {}
@@ -169,7 +170,7 @@ class Section(ABC):
 
     @abstractmethod
     def values(self) -> dict[str, Any] | None:
-        """What its template is given; None where it is not shown."""
+        """Return what its template is given; None where it is not shown."""
 
 
 class Hero(Section):
@@ -261,7 +262,7 @@ class Where(Section):
         return out
 
     def _bars(self) -> dict[str, Any] | None:
-        """The error before and after beside the noise floor."""
+        """Return the error before and after beside the noise floor."""
         d, h = self.d, self.held_out
         if h["before"] is None:
             return None
@@ -300,7 +301,7 @@ class Findings(Section):
         return {"sure": sure, "hints": hints, "nearest": nearest} if sure or hints or nearest else None
 
     def _card(self, f: Finding) -> dict[str, Any]:
-        """One finding."""
+        """Return one finding."""
         e, h = entry(f), f.held_out
         where = place(f, self.d.mechanism) if len(f.joints) < 4 else f"{len(f.joints)} joints"
         unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
@@ -321,7 +322,7 @@ class Findings(Section):
         } | self._lost(f)
 
     def _metric(self, f: Finding) -> str:
-        """The metric of a finding's held-out error."""
+        """Return the metric of a finding's held-out error."""
         if not f.joints:
             return "tactile_rmse_N"
         if isinstance(e := entry(f), Effect) and e.effort_only:
@@ -330,7 +331,7 @@ class Findings(Section):
         return h if not h.startswith("tactile") else "position_rmse_rad"
 
     def _strip(self, f: Finding) -> Markup | None:
-        """When it acts, a line for each of the first recordings."""
+        """Return when it acts, a line for each of the first recordings."""
         rows = []
         for name in list(dict.fromkeys(w["recording"] for w in f.when))[:4]:
             spans = [(w["start"], w["end"]) for w in f.when if w["recording"] == name]
@@ -339,7 +340,7 @@ class Findings(Section):
         return Markup(charts.strips(rows)) if rows else None
 
     def _lost(self, f: Finding) -> dict[str, Any]:
-        """The runner-up and why it lost, or the set that cannot be told apart."""
+        """Return the runner-up and why it lost, or the set that cannot be told apart."""
         rivals = [a for a in f.alternatives if a["confidence"] >= 0.005]
         out: dict[str, Any] = dict.fromkeys(
             ("set", "separating", "lone", "open", "rival", "then", "wins"), ""
@@ -362,7 +363,7 @@ class Findings(Section):
         }
 
     def _nearest(self) -> list[dict[str, str]]:
-        """The effects that a search priced highest and did not find."""
+        """Return the effects that a search priced highest and did not find."""
         scanned = sorted(((o.joint, *x) for o in self.d.outcomes for x in o.scanned), key=lambda r: -r[2])[:5]
         return [
             {"joint": j, "effect": _name(e), "gain": f"{100 * gain:.1f}", "chance": f"{p:.2f}"}
@@ -451,7 +452,7 @@ class Details(Section):
         return notes
 
     def _written(self) -> dict[str, Any]:
-        """Of each joint what its candidates leave, which is written and what that leaves as written."""
+        """Return of each joint what its candidates leave, which is written and what that leaves as written."""
         w = self.d.written
         assert w is not None  # as looked at by who asks
         r, columns = w.replayed, [name for name in ORDER if any(name in x for x in w.errors.values())]
@@ -477,19 +478,19 @@ SECTIONS: tuple[type[Section], ...] = (Hero, Where, Findings, Curves, Next, Deta
 
 
 def page(d: Diagnosis) -> str:
-    """The page as HTML text."""
+    """Return the page as HTML text."""
     shown = [text for section in SECTIONS if (text := render(section(d)))]
     return ENVIRONMENT.get_template("page.html").render(word=VERDICTS[d.data["verdict"]][0], sections=shown)
 
 
 def render(section: Section) -> Markup:
-    """A section as HTML; empty where it has nothing to show."""
+    """Return a section as HTML; empty where it has nothing to show."""
     values = section.values()
     return Markup("") if values is None else Markup(ENVIRONMENT.get_template(section.template).render(values).strip())
 
 
 def unit_of(metric: str) -> tuple[str, float]:
-    """(unit in which a metric of `diagnosis.json` is shown, factor)."""
+    """Return (unit in which a metric of `diagnosis.json` is shown, factor)."""
     if metric.startswith("effort"):
         return ("mA" if metric.endswith("_A") else "mN" if metric.endswith("_N") else "mN.m"), 1e3
     if metric.endswith("_N"):
@@ -506,8 +507,8 @@ def _capital(text: str) -> str:
 
 
 def _ratios(d: Diagnosis, most: tuple[tuple[int, str], ...], named: bool = True, *size: int) -> Markup:
-    """The regimes in which the error before is largest, the strongest bin of each; so many of each signal. named: with
-    their joint."""
+    """Return the regimes in which the error before is largest, the strongest bin of each; so many of each signal.
+    named: with their joint."""
     best: dict[tuple[str, str, str], Any] = {}
     for s in d.spots:
         best.setdefault((s.joint, s.of, s.regime), s)
@@ -520,7 +521,7 @@ def _ratios(d: Diagnosis, most: tuple[tuple[int, str], ...], named: bool = True,
 
 
 def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, str]]:
-    """The joints with the largest errors, and the pads."""
+    """Return the joints with the largest errors, and the pads."""
     plain, found, rows = d.data["baseline"].get("joints", {}), d.findings, []
     for j, v in sorted(d.joints.items(), key=lambda x: -x[1]["before"])[:most]:
         names = [_name(f.effect) + " (hint)" * f.hint for f in found if j in f.joints]
@@ -541,7 +542,7 @@ def _row(where: str, names: list[str], v: dict[str, float], plain: str, noise: s
 
 
 def _parameter(key: str, p: dict[str, Any]) -> dict[str, Any]:
-    """A row of a finding's parameters: a number with its interval, a list, or words."""
+    """Return a row of a finding's parameters: a number with its interval, a list, or words."""
     value, out = (
         p["value"],
         {"label": key.replace("_", " "), "unit": "" if p["unit"] == "1" else p["unit"], "chart": None},

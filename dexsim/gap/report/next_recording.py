@@ -94,7 +94,8 @@ def _choice(
     f: Finding,
     rivals: list[str],
 ) -> Choice | None:
-    """The motions on which the finding's hypotheses disagree most; None where they cannot be simulated or planned."""
+    """Return the motions on which the finding's hypotheses disagree most; None where they cannot be simulated or
+    planned."""
     for x in searched:
         search, outcome = x.search, x.outcome
         if x.case.joint not in f.joints or not outcome.best.members:
@@ -169,7 +170,8 @@ class Choice:
 
 
 def rival_of(search: JointSearch, outcome: Outcome, effect: str, rival: str | None) -> Trial | None:
-    """The fitted hypothesis with `rival` in the place of `effect`; None for "without it" where no rival was fitted."""
+    """Return the fitted hypothesis with `rival` in the place of `effect`; None for "without it" where no rival was
+    fitted."""
     rest = {m.id for m in outcome.best.members} - {effect}
     if rival is not None:
         return search.fitted.get(frozenset({rival, *rest}))
@@ -179,7 +181,8 @@ def rival_of(search: JointSearch, outcome: Outcome, effect: str, rival: str | No
 def choose(
     m: Mechanism, search: JointSearch, a: Trial, b: Trial, seed: int = 0, kinds: Sequence[str] = KINDS, most: int = 2
 ) -> Choice:
-    """The motions of one joint that tell hypothesis a from b. Raises UserError where nothing safe can be planned."""
+    """Return the motions of one joint that tell hypothesis a from b. Raises UserError where nothing safe can be
+    planned."""
     case = search.case
     made = excitation.plan(m, [case.joint], list(kinds), seed, repeats=0)
     scores = disagreement(m, case, search, a, b, made)
@@ -191,8 +194,8 @@ def choose(
 
 
 def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Trial, p: Plan) -> dict[str, float]:
-    """rms difference of the positions that two hypotheses predict on each kind of motion of a plan, over the joint's
-    noise, with what the refitted figures of `a` could make up for taken out."""
+    """Return rms difference of the positions that two hypotheses predict on each kind of motion of a plan, over the
+    joint's noise, with what the refitted figures of `a` could make up for taken out."""
     every = max(1, round(1 / RATE / float(p.run.t[1] - p.run.t[0])))
     t = p.run.t[::every]
     column = m.joints.index(case.joint)
@@ -231,7 +234,7 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
 
 
 def _guess(plant: JointPlant, trial: Trial, x: np.ndarray) -> np.ndarray:
-    """[R, C] plant parameters of a hypothesis at x."""
+    """Return [R, C] plant parameters of a hypothesis at x."""
     out = expand(plant, trial.fit.params, x[None])[0]
     for member in trial.members:
         for name, value in member.variant.fixed:

@@ -88,8 +88,8 @@ class Baseline:
 
 
 def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
-    """What is fitted of a joint: around its belief, within its stated range where it has one; friction from none to
-    what drives it."""
+    """Return what is fitted of a joint: around its belief, within its stated range where it has one; friction from none
+    to what drives it."""
     s, out = case.scales, []
 
     def factor(name: str, wide: tuple[float, float]) -> None:
@@ -143,8 +143,8 @@ def fitted(
     seed: int = 0,
     passed: Callable[[], bool] = lambda: False,
 ) -> tuple[list[Param], np.ndarray] | None:
-    """The plain model of a joint, fitted on runs `train` (span: part of each run, s; passed: whether time is up, the
-    best by then is taken): its parameters and their values [P]. None where there is nothing to fit."""
+    """Return the plain model of a joint, fitted on runs `train` (span: part of each run, s; passed: whether time is up,
+    the best by then is taken): its parameters and their values [P]. None where there is nothing to fit."""
     windows = case.plant.windows(WINDOW, list(train), span=span)
     if not len(windows.window):
         return None
@@ -177,8 +177,8 @@ def judged(
     span: dict | None = None,
     whole: Any = None,
 ) -> Baseline | None:
-    """The plain model of a joint (`fitted`) on runs `test` (span: part of each run, s). whole: the plant on which free
-    runs are judged (None: the case's own). None where nothing was fitted or there is nothing to judge."""
+    """Return the plain model of a joint (`fitted`) on runs `test` (span: part of each run, s). whole: the plant on
+    which free runs are judged (None: the case's own). None where nothing was fitted or there is nothing to judge."""
     here = replace(case, plant=whole or case.plant)
     kept = here.plant.windows(None, list(test), span=span)
     if plain is None or not len(kept.window):
@@ -206,7 +206,7 @@ def judged(
 
 
 def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list[np.ndarray]:
-    """[P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
+    """Return [P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
     low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
     start = np.clip([p.start for p in params], low, high)
     # a Latin square
@@ -235,8 +235,8 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
 
 
 def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:
-    """All joints together as `diagnosis.json` has them; empty where there is none. handed_on: joints of which it is
-    written."""
+    """Return all joints together as `diagnosis.json` has them; empty where there is none. handed_on: joints of which it
+    is written."""
     if not given:
         return {}
     rms = lambda parts: float(np.sqrt(np.mean(np.concatenate(parts))))  # noqa: E731
@@ -250,8 +250,8 @@ def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[st
 
 
 def forbidden(case: Case, trial: Any, train: Sequence[int]) -> str:
-    """Why a fitted hypothesis of a joint cannot be: its friction forbids a motion that was recorded. Empty where none
-    is forbidden."""
+    """Return why a fitted hypothesis of a joint cannot be: its friction forbids a motion that was recorded. Empty where
+    none is forbidden."""
     row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
     dry = {n: float(row[INDEX[n]]) for n in DRY}
     # than was believed: that is not this answer's
@@ -274,13 +274,13 @@ def write(plain: Baseline, table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
 
 
 def left_by_what_is_handed_on(data: dict[str, Any]) -> float | None:
-    """Error [rad or m] that is left where it is the plain model of every judged joint that is handed on; None where it
-    is not. data: of `overall`."""
+    """Return error [rad or m] that is left where it is the plain model of every judged joint that is handed on; None
+    where it is not. data: of `overall`."""
     return data["error"] if data and set(data["handed_on"]) == set(data["joints"]) else None
 
 
 def text(data: dict[str, Any], unit: str) -> str:
-    """One line for a person."""
+    """Return one line for a person."""
     if not data:
         return ""
     said = (
@@ -291,7 +291,7 @@ def text(data: dict[str, Any], unit: str) -> str:
 
 
 def stopped(data: dict[str, Any]) -> list[str]:
-    """Sentences about figures of the plain model that ended at the bounds of what was tried."""
+    """Return sentences about figures of the plain model that ended at the bounds of what was tried."""
     return [
         f"{joint}: the plain least squares ends at its bound in {' and '.join(n.replace('_', ' ') for n in x)}: "
         "what is believed of the drive is further off than was tried, or another law acts"
@@ -335,9 +335,9 @@ def room_for_friction(case: Case, runs: Sequence[int], dry: Mapping[str, float] 
 def _beyond_coulomb(
     dry: Mapping[str, float], way: int, q: np.ndarray, drive: np.ndarray, pull: np.ndarray
 ) -> np.ndarray:
-    """[S] dry friction [N.m] of a joint at rest that is about to move to one side, beyond its Coulomb friction: what
-    it takes to break away, and what grows with the torques on its gear. drive: most torque that way; where that is not
-    known the motor's share is left out."""
+    """Return [S] dry friction [N.m] of a joint at rest that is about to move to one side, beyond its Coulomb friction:
+    what it takes to break away, and what grows with the torques on its gear. drive: most torque that way; where that is
+    not known the motor's share is left out."""
     motor = np.where(np.isfinite(drive), way * drive, 0.0)
     level = dry_friction(dict(dry) | {"coulomb_friction": 0.0}, q, np.full_like(q, way * 1e-9), motor, -pull)
     shares = dry["gear_load_friction"], dry["gear_load_friction_backdriven"]
@@ -348,8 +348,8 @@ def _beyond_coulomb(
 def forbids(
     case: Case, runs: Sequence[int], friction: float, asymmetry: float = 0.0, dry: Mapping[str, float] | None = None
 ) -> str:
-    """Why a dry friction [N.m] (its asymmetry as in servo.yaml; dry: what is beside it, see `room_for_friction`) cannot
-    be: a motion was recorded that it forbids. Empty where none is."""
+    """Return why a dry friction [N.m] (its asymmetry as in servo.yaml; dry: what is beside it, see `room_for_friction`)
+    cannot be: a motion was recorded that it forbids. Empty where none is."""
     most = room_for_friction(case, runs)
     for way, room in room_for_friction(case, runs, dry).items():
         level = friction * (1 + 0.5 * way * asymmetry) + case.constants.friction
@@ -363,7 +363,7 @@ def forbids(
 
 
 def _series(case: Case, run: int, name: str) -> np.ndarray:
-    """A prescribed column at the samples of a run."""
+    """Return a prescribed column at the samples of a run."""
     plant = case.plant
     rows = plant.rows(run)
     part = plant.series[plant._grid[run] : plant._grid[run + 1], SERIES_INDEX[name]]

@@ -30,22 +30,22 @@ EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
 
 
 def centre_of(params: list[Param]) -> np.ndarray:
-    """[P] value at which each parameter is not there."""
+    """Return [P] value at which each parameter is not there."""
     return np.array([{"add": 0.0, "factor": 1.0}.get(p.mode, p.start) for p in params], float)
 
 
 def prior_weight(params: list[Param]) -> np.ndarray:
-    """[P] weight of each belief on the sum of squares, per squared unit of its parameter."""
+    """Return [P] weight of each belief on the sum of squares, per squared unit of its parameter."""
     return np.array([BELIEF.prior / p.sd**2 if p.sd > 0 else 0.0 for p in params])
 
 
 def disbelief(params: list[Param], x: np.ndarray) -> float:
-    """How far x [P] is from what is believed, on the scale of a sum of squared residuals."""
+    """Return how far x [P] is from what is believed, on the scale of a sum of squared residuals."""
     return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
 
 
 def huber_square(res: np.ndarray, k: float) -> np.ndarray:
-    """Huber's square of residuals of any shape, from `k` on linear; plain squares where k is 0."""
+    """Return Huber's square of residuals of any shape, from `k` on linear; plain squares where k is 0."""
     size = np.abs(res)
     far, out = size > k, size * size
     if k > 0 and far.any():
@@ -123,14 +123,14 @@ class Fitter:
         return twin
 
     def residuals(self, params: list[Param], x: np.ndarray, inits: np.ndarray | None = None) -> np.ndarray:
-        """[H, m] measured minus simulated, in sigmas."""
+        """Return [H, m] measured minus simulated, in sigmas."""
         plants = expand(self.plant, params, x, self.fixed)
         q, tau = self.plant.simulate(plants, self.w, inits)
         return self.compare(q, tau, plants)
 
     def compare(self, q: np.ndarray, tau: np.ndarray, plants: np.ndarray) -> np.ndarray:
-        """[H, m] measured minus simulated position [H, n] and effort [H, n], in sigmas; plants [H, R, C] for what the
-        effort's sensor makes of it."""
+        """Return [H, m] measured minus simulated position [H, n] and effort [H, n], in sigmas; plants [H, R, C] for
+        what the effort's sensor makes of it."""
         n = q.shape[1]
         out = np.empty((len(q), 2 * n if self.use_torque else n))
         with np.errstate(invalid="ignore", over="ignore"):
@@ -147,14 +147,14 @@ class Fitter:
             return np.maximum(out, -MOST, out=out)
 
     def init_directions(self, params: list[Param], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals at x [m], and their change [2, m] per sigma of the initial position and speed."""
+        """Return residuals at x [m], and their change [2, m] per sigma of the initial position and speed."""
         r = self.r
         inits = np.array([[0.0, 0.0], [r.sigma_q0, 0.0], [0.0, r.sigma_v0]])
         res = self.residuals(params, np.repeat(x[None], 3, 0), inits)
         return res[0], res[1:] - res[0]
 
     def eliminated(self, res: np.ndarray, s: np.ndarray | None) -> np.ndarray:
-        """res [H, m] after the best initial state of each window (with its prior) is taken out."""
+        """Return res [H, m] after the best initial state of each window (with its prior) is taken out."""
         if s is None:
             return res
         a11, a22, a12 = self.by_window(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
@@ -174,7 +174,7 @@ class Fitter:
         return out
 
     def by_window(self, x: np.ndarray) -> np.ndarray:
-        """[H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
+        """Return [H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
         interpreter."""
         out, some = np.empty((len(x), self.count)), max(SUMMED // max(x.shape[1], 1), 1)
         for a in range(0, len(x), some):
@@ -183,8 +183,8 @@ class Fitter:
         return out
 
     def _adds(self, rows: int) -> csr_array:
-        """[rows * W, rows * m] what adds up so many rows of residuals by window, in their order: a sparse matrix of
-        ones, four times as fast as counting into bins, each of which waits for the one before. Made once for the
+        """Return [rows * W, rows * m] what adds up so many rows of residuals by window, in their order: a sparse matrix
+        of ones, four times as fast as counting into bins, each of which waits for the one before. Made once for the
         most."""
         m, W = len(self.window), self.count
         if rows not in self._sparse:
@@ -201,15 +201,15 @@ class Fitter:
         return self._sparse[rows]
 
     def loss(self, res: np.ndarray) -> np.ndarray:
-        """[H] mean of Huber's square."""
+        """Return [H] mean of Huber's square."""
         return huber_square(res, self.r.huber).mean(-1)
 
     def window_loss(self, res: np.ndarray) -> np.ndarray:
-        """[W] sum of Huber's square by window."""
+        """Return [W] sum of Huber's square by window."""
         return np.bincount(self.window, huber_square(res, self.r.huber), self.count)
 
     def evaluate(self, params: list[Param], x: np.ndarray) -> np.ndarray:
-        """[m] residuals at x, initial states taken out."""
+        """Return [m] residuals at x, initial states taken out."""
         if not self.eliminate:
             return self.residuals(params, x[None])[0]
         res, s = self.init_directions(params, x)
@@ -218,8 +218,8 @@ class Fitter:
     def perturbed_restarts(
         self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20
     ) -> Fitted:
-        """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the
-        loss rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
+        """Return the fit again from the best of random guesses about it, where one is better: stick, play and limits
+        make the loss rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
         P = len(params)
         if P == 0:
             return f
@@ -252,9 +252,9 @@ class Fitter:
         return f
 
     def toward_prior(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
-        """The fit again from where one belief, or all of them, are back at what is believed, all else following by its
-        slopes, where that is better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at
-        kinks, steps end before they are there."""
+        """Return the fit again from where one belief, or all of them, are back at what is believed, all else following
+        by its slopes, where that is better: in a valley of what acts alike (a damping in the loop, a viscous friction),
+        and at kinks, steps end before they are there."""
         P = len(params)
         nuisance = np.array([p.nuisance for p in params], bool)
         if not nuisance.any():
@@ -296,7 +296,7 @@ class Fitter:
         return f
 
     def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
-        """[H, P] guesses about x [P]: each effect's parameter scaled, each belief moved, one at a time."""
+        """Return [H, P] guesses about x [P]: each effect's parameter scaled, each belief moved, one at a time."""
         out = []
         for i, p in enumerate(params):
             zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
@@ -312,7 +312,7 @@ class Fitter:
         return np.array(out)
 
     def _tried(self, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
-        """[K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
+        """Return [K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
         res = self.residuals(params, trial)
         centre = np.array([p.start for p in params], float)
         return self.loss(self.eliminated(res, s)) + ((trial - centre) ** 2 @ prior_weight(params)) / res.shape[-1]
@@ -328,7 +328,7 @@ class Fitter:
         lazy: bool = False,
         exact: bool = True,
     ) -> Fitted:
-        """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
+        """Fit by Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
 
         slopes: change [m] of the residuals per span of a parameter, by its key, known from a fit nearby on the same
         windows. lazy: once known, from there or from the first batch, the slopes of beliefs and of these parameters
@@ -420,7 +420,7 @@ class Fitter:
         )
 
     def _known(self, params: list[Param], slopes: dict[str, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
-        """(slopes [m, P] per span as far as they are known, which are [P])."""
+        """Return (slopes [m, P] per span as far as they are known, which are [P])."""
         m = len(self.window)
         jac, known = np.zeros((m, len(params))), np.zeros(len(params), bool)
         for i, p in enumerate(params):
@@ -431,8 +431,8 @@ class Fitter:
     def _slopes(
         self, params: list[Param], x: np.ndarray, delta: np.ndarray, which: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """(residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states [2, m]),
-        by one batch of simulations: here, each of them moved, the initial state moved."""
+        """Return (residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states
+        [2, m]), by one batch of simulations: here, each of them moved, the initial state moved."""
         k = len(which)
         guesses = np.repeat(x[None], k + 3, 0)
         guesses[1 + np.arange(k), which] += delta[which]
@@ -447,8 +447,8 @@ class Fitter:
 
 
 def _differences(params: list[Param], x: np.ndarray, step: float) -> np.ndarray:
-    """[P] steps of the finite differences at x, backward where forward would leave the bounds: `step` of a range, and
-    small beside the value too, for a range may be wide and many effects are kinked where they begin."""
+    """Return [P] steps of the finite differences at x, backward where forward would leave the bounds: `step` of a
+    range, and small beside the value too, for a range may be wide and many effects are kinked where they begin."""
     low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
     span, belief = high - low, np.array([p.nuisance for p in params], bool)
     size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
@@ -457,8 +457,8 @@ def _differences(params: list[Param], x: np.ndarray, step: float) -> np.ndarray:
 
 
 def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray) -> np.ndarray:
-    """[K, P] steps of the normal equations A step = b in the `free` parameters, in spans and at most half of one, each
-    damped by one of lambdas [K]."""
+    """Return [K, P] steps of the normal equations A step = b in the `free` parameters, in spans and at most half of
+    one, each damped by one of lambdas [K]."""
     scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
     steps = np.zeros((len(lambdas), len(b)))
     M = A[np.ix_(free, free)] + lambdas[:, None, None] * np.diag(scale[free])
@@ -471,14 +471,14 @@ def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray)
 
 
 def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """[F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which bounds hold,
-    in a tenth of the time of SciPy's interior steps."""
+    """Return [F] the least of x' A x / 2 - b' x with low <= x <= high, A [F, F] being positive definite: by which
+    bounds hold, in a tenth of the time of SciPy's interior steps."""
     root = np.linalg.cholesky(A).T
     return lsq_linear(root, np.linalg.solve(root.T, b), (low, high), method="bvls").x
 
 
 def _solved(M: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[F] x of M x = b, the shortest of them where there are many."""
+    """Return [F] x of M x = b, the shortest of them where there are many."""
     try:
         return np.linalg.solve(M, b)
     except np.linalg.LinAlgError:
@@ -486,13 +486,13 @@ def _solved(M: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def slopes_of(f: Fitted) -> dict[str, np.ndarray]:
-    """Slopes [m] of a fit's residuals per span of each parameter, by its key, as `Fitter.fit` takes them."""
+    """Return slopes [m] of a fit's residuals per span of each parameter, by its key, as `Fitter.fit` takes them."""
     return {p.key: f.jacobian[:, i] * p.span for i, p in enumerate(f.params)}
 
 
 def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, huber: float = 0.0) -> np.ndarray:
-    """[P, 2] 90 % intervals that let residuals be correlated inside a block: the sandwich over blocks [m] of each
-    residual, with the small-sample factor of the number of blocks."""
+    """Return [P, 2] 90 % intervals that let residuals be correlated inside a block: the sandwich over blocks [m] of
+    each residual, with the small-sample factor of the number of blocks."""
     P = len(fitted.params)
     if P == 0:
         return np.zeros((0, 2))

@@ -71,12 +71,12 @@ class Outcome:
 
 
 def named(member: Member) -> list[Param]:
-    """The member's parameters with keys unique in a hypothesis."""
+    """Return the member's parameters with keys unique in a hypothesis."""
     return [replace(p, key=f"{member.id}.{p.key}") for p in member.variant.params]
 
 
 def complexity_price(trial: Trial) -> float:
-    """Factor on the losses of a hypothesis that can imitate simpler ones."""
+    """Return factor on the losses of a hypothesis that can imitate simpler ones."""
     return float(np.prod([1 + m.variant.complexity_price for m in trial.members]))
 
 
@@ -129,9 +129,9 @@ MEASURED = (
 
 
 def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
-    """How a servo column that is said to be unknown is fitted with every hypothesis, as the effect that writes it would
-    be, and from where. None where no effect does, or where the column says nothing without others (`Effect.whole`): it
-    is taken as absent, and the effect looked for."""
+    """Return how a servo column that is said to be unknown is fitted with every hypothesis, as the effect that writes
+    it would be, and from where. None where no effect does, or where the column says nothing without others
+    (`Effect.whole`): it is taken as absent, and the effect looked for."""
     for effect in (e for e in CATALOGUE if not e.whole):
         for v in effect.variants(s):
             for i, p in enumerate(v.params):
@@ -144,20 +144,21 @@ def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
 
 
 def refitted(case: Case) -> list[Param]:
-    """What is refitted with every hypothesis: believed figures within `BELIEF.tolerance`, stated ranges, unknowns."""
+    """Return what is refitted with every hypothesis: believed figures within `BELIEF.tolerance`, stated ranges,
+    unknowns."""
     out = _figures(case)
     taken = {p.columns[0] for p in out}
     return [*out, *_timing(case, taken), *_of_the_drive(case, taken), *_of_the_body(case), *_of_the_sensors(case)]
 
 
 def _within(key: str, *columns: str) -> Param:
-    """A factor on what is believed, within its tolerance."""
+    """Return a factor on what is believed, within its tolerance."""
     off = BELIEF.tolerance
     return Param(key, columns, "factor", 1 - off, 1 + off, 1.0, nuisance=True, sd=0.5 * off)
 
 
 def _figures(case: Case) -> list[Param]:
-    """The drive's figures that are believed, stated as a range or unknown."""
+    """Return the drive's figures that are believed, stated as a range or unknown."""
     out, s = [], case.scales
     for name in (*USUAL, *(n for n in case.unknown if n not in USUAL)):
         value = s.nominal[name]
@@ -178,7 +179,7 @@ def _figures(case: Case) -> list[Param]:
 
 
 def _timing(case: Case, taken: Set[str]) -> list[Param]:
-    """When a drive acts and reads. taken: columns that are refitted already.
+    """Return when a drive acts and reads. taken: columns that are refitted already.
 
     A command waits for the loop's next period, half of one on average, and a clock is read when it is read; more is an
     effect, which training is given. Of a loop that nothing is known of, it may be twice as much."""
@@ -202,7 +203,7 @@ def _timing(case: Case, taken: Set[str]) -> list[Param]:
 
 
 def _of_the_drive(case: Case, taken: Set[str]) -> list[Param]:
-    """What may be so or otherwise in any drive."""
+    """Return what may be so or otherwise in any drive."""
     s = case.scales
     small = give(s)  # what holds a joint gives a little before it slides
     out = [Param("presliding", ("presliding",), "set", 0.0, small, 0.1 * small, nuisance=True)]
@@ -215,7 +216,7 @@ def _of_the_drive(case: Case, taken: Set[str]) -> list[Param]:
 
 
 def _of_the_body(case: Case) -> list[Param]:
-    """What the model says of inertia, gravity and friction."""
+    """Return what the model says of inertia, gravity and friction."""
     s, c = case.scales, case.constants
     low, high = case.factors.get("inertia", (1 - BELIEF.tolerance, 1 + BELIEF.tolerance))
     middle, sd = 0.5 * (low + high), 0.25 * (high - low)
@@ -232,7 +233,7 @@ def _of_the_body(case: Case) -> list[Param]:
 
 
 def _of_the_sensors(case: Case) -> list[Param]:
-    """What a second encoder and a reading of the effort show."""
+    """Return what a second encoder and a reading of the effort show."""
     s, out = case.scales, []
     if s.apart:  # two encoders have two zeros, set to a count or two
         z = BELIEF.zero * max(case.quantum, case.sigma)
@@ -340,7 +341,7 @@ class JointHypotheses:
         self.tell(self._part**SLOWER)
 
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
-        """Block of each residual [m]: half-second stretches of one window."""
+        """Return block of each residual [m]: half-second stretches of one window."""
         t = self.case.plant.t[w.sample_row]
         start = np.full(len(w.window), np.inf)
         np.minimum.at(start, w.sample_window, t)
@@ -349,7 +350,7 @@ class JointHypotheses:
         return np.concatenate([b, b]) if fitter.use_torque else b
 
     def _params(self, members: tuple[Member, ...]) -> list[Param]:
-        """Effects' parameters, then the nuisances that act on no column of theirs."""
+        """Return effects' parameters, then the nuisances that act on no column of theirs."""
         mine = [p for m in members for p in named(m)]
         taken = {c for p in mine for c in p.columns}
         # what left no trace without them may with them: a motor that rattles behind its joint turns faster than the
@@ -380,8 +381,8 @@ class JointHypotheses:
         return Trial((), self.fitter.toward_prior(self.nuisances, self._restarted(self.fitter, self.nuisances, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
-        """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the
-        next."""
+        """Return [P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to
+        the next."""
         x = np.array([p.start for p in params], float)
         for i, p in enumerate(params):
             found = unknown(p.key, self.case.scales) if p.key in self.case.unknown else None
@@ -398,7 +399,7 @@ class JointHypotheses:
         return x
 
     def _restarted(self, fitter: Fitter, params: list[Param], fit: Fitted) -> Fitted:
-        """The fit, looked for nearby too, where it does not follow the data yet."""
+        """Return the fit, looked for nearby too, where it does not follow the data yet."""
         return fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
 
     def _simulate(self, fitter: Fitter, plants: np.ndarray, s: np.ndarray | None) -> np.ndarray:
@@ -408,7 +409,8 @@ class JointHypotheses:
     def draft(
         self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | SimpleNamespace | None = None
     ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
-        """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
+        """Return (members, where it began, fit on short windows) of a hypothesis, from `starts` of the members'
+        parameters."""
         params = self._params(members)
         if like is not None:  # what left a trace in that alone starts from there too, not from what was believed
             taken = {c for p in params for c in p.columns}
@@ -432,7 +434,8 @@ class JointHypotheses:
     def finish(
         self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
     ) -> Trial:
-        """The draft refitted on long windows. quick: fewer steps, and beliefs are not drawn back to their prior."""
+        """Return the draft refitted on long windows. quick: fewer steps, and beliefs are not drawn back to their
+        prior."""
         added, at = self._newly_identifiable(members, short)
         params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
         x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
@@ -444,9 +447,9 @@ class JointHypotheses:
         return Trial(members, a)
 
     def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
-        """Beliefs that left no trace without any effect and leave one with these, and what is believed of them [n]: a
-        drive that turns out to be slow may reach a limit that nothing was known of. Without them a hypothesis that
-        imitates another by such a belief would be the only one that may."""
+        """Return beliefs that left no trace without any effect and leave one with these, and what is believed of them
+        [n]: a drive that turns out to be slow may reach a limit that nothing was known of. Without them a hypothesis
+        that imitates another by such a belief would be the only one that may."""
         taken = {c for p in short.params for c in p.columns}
         without_trace = [p for p in self.all_nuisances if not taken & set(p.columns)]
         if not without_trace:
@@ -463,7 +466,7 @@ class JointHypotheses:
         return [p for p, on in zip(without_trace, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:
-        """The trial fitted again from perturbed starts, and with its beliefs drawn back to their prior."""
+        """Return the trial fitted again from perturbed starts, and with its beliefs drawn back to their prior."""
         fitter, params = self.fitter.given(trial.members), trial.fit.params
         return Trial(trial.members, fitter.toward_prior(params, self._restarted(fitter, params, trial.fit)))
 
@@ -480,11 +483,11 @@ class JointHypotheses:
         return trial.fit.x[:n]
 
     def _shrunk(self, trial: Trial) -> bool:
-        """Whether an effect was fitted down to the size at which it begins: what it gained is another's."""
+        """Return whether an effect was fitted down to the size at which it begins: what it gained is another's."""
         return any(self._nothing_of(m, trial) for m in trial.members)
 
     def _nothing_of(self, m: Member, trial: Trial) -> bool:
-        """Whether a member of a trial was fitted down to the size at which it begins."""
+        """Return whether a member of a trial was fitted down to the size at which it begins."""
         at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
         first = m.variant.params[0]
         # of a friction with load one direction may have none
@@ -503,7 +506,7 @@ class JointHypotheses:
 
 
 def restlessness(r: np.ndarray, window: np.ndarray) -> float:
-    """What of residuals [n] in windows [n] changes from sample to sample, as a standard deviation: by second
+    """Return what of residuals [n] in windows [n] changes from sample to sample, as a standard deviation: by second
     differences, whose variance is six times that of white noise; the largest, of jumps, are cut. A loop's torque is as
     restless as the encoder that it reads."""
     inner = window[2:] == window[:-2]
@@ -545,7 +548,7 @@ def thin(w: Windows, case: Case, budget: float) -> Windows:
 
 
 def subset(w: Windows, keep: np.ndarray) -> Windows:
-    """The windows where keep [W] bool holds."""
+    """Return the windows where keep [W] bool holds."""
     pick = np.flatnonzero(keep)
     new = np.full(len(w.window), -1)
     new[pick] = np.arange(len(pick))

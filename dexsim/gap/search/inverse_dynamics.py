@@ -63,7 +63,8 @@ class Motion:
         return max(EDGE, int(SWING / (self.cutoff * self.step)))
 
     def smooth(self, x: np.ndarray) -> np.ndarray:
-        """x [n] through the filter that the torque passed: what jumps with the sign of a speed must pass it as well."""
+        """Return x [n] through the filter that the torque passed: what jumps with the sign of a speed must pass it as
+        well."""
         return low_pass(x, self.cutoff, self.step)
 
 
@@ -80,7 +81,7 @@ class Body:
 
 
 def highest(t: np.ndarray) -> float:
-    """The highest cutoff [Hz] that readings at times t [n] s allow."""
+    """Return the highest cutoff [Hz] that readings at times t [n] s allow."""
     return min(CUTOFF * 0.5 / float(np.median(np.diff(t))), TOP)
 
 
@@ -95,14 +96,15 @@ def motion(t: np.ndarray, q: np.ndarray, torque: np.ndarray, cutoff: float) -> M
 
 
 def low_pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
-    """x [n], every `step` s, without what is faster than the cutoff [Hz]: forth and back, so that it is not late."""
+    """Return x [n], every `step` s, without what is faster than the cutoff [Hz]: forth and back, so that it is not
+    late."""
     b, a = butter(4, cutoff * 2 * step)
     return filtfilt(b, a, x)
 
 
 def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: Motion) -> Body:
-    """Of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the model has
-    them."""
+    """Return of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the
+    model has them."""
     data = mujoco.MjData(model)
     ids = [model.joint(name).id for name in joints]
     at, dof = np.array([model.jnt_qposadr[i] for i in ids]), np.array([model.jnt_dofadr[i] for i in ids])
@@ -178,23 +180,23 @@ class Columns:
     seconds: float
 
     def column(self, f: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-        """[m] f(q, v, load) through the filter."""
+        """Return [m] f(q, v, load) through the filter."""
         return np.concatenate([p.motion.smooth(f(p.q, p.v, p.load))[p.keep] for p in self.pieces])
 
     def without(self, names: Collection[str]) -> Columns:
-        """The same with figures that are held at 0."""
+        """Return the same with figures that are held at 0."""
         on = [n not in names for n in self.names]
         return replace(self, X=self.X[:, on], names=tuple(n for n in self.names if n not in names))
 
     def pack(self, x: np.ndarray) -> dict[str, float]:
-        """Coefficients by name, the inertia with the model's."""
+        """Return coefficients by name, the inertia with the model's."""
         out = {n: float(y) for n, y in zip(self.names, x, strict=False)}
         return out | ({"inertia": out["inertia"] + self.inertia} if "inertia" in out else {"inertia": self.inertia})
 
 
 def columns_of(given: Sequence[Stretch], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
-    """Of joint j; given: of each recording; efficiency: of the drive, believed; loaded: whether gravity's factors are
-    among the columns, by default where it matters in these recordings."""
+    """Build it for joint j; given: of each recording; efficiency: of the drive, believed; loaded: whether gravity's
+    factors are among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
     bodies = [(x.motion, x.body) for x in given if x.body is not None]
     inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b in bodies]))) if bodies else 0.0
@@ -232,7 +234,7 @@ def columns_of(given: Sequence[Stretch], j: int, efficiency: float = 1.0, loaded
 
 
 def readable(run: Run, j: int) -> bool:
-    """Whether a run's torque of joint j can be differentiated beside its motion."""
+    """Return whether a run's torque of joint j can be differentiated beside its motion."""
     if (
         run.torque is None
         or run.torque_unit != "N.m"
@@ -245,21 +247,21 @@ def readable(run: Run, j: int) -> bool:
 
 
 def moved(run: Run, model: mujoco.MjModel, cutoff: float) -> Stretch:
-    """A run's motion beside the model's body."""
+    """Return a run's motion beside the model's body."""
     assert run.torque is not None  # as `readable` has looked
     m = motion(run.t, run.q, np.nan_to_num(run.torque), cutoff)
     return Stretch(m, body(model, run.gravity, run.joints, m))
 
 
 def sums(X: np.ndarray, u: np.ndarray, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations [count, K, K], [count, K] of the rows of each part `of` [m]."""
+    """Return normal equations [count, K, K], [count, K] of the rows of each part `of` [m]."""
     rows = [np.flatnonzero(of == b) for b in range(count)]
     return np.stack([X[i].T @ X[i] for i in rows]), np.stack([X[i].T @ u[i] for i in rows])
 
 
 def solved(grams: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Coefficients [.., K] of normal equations [.., K, K], [.., K], columns scaled alike; 0 for a column that is not
-    there."""
+    """Return coefficients [.., K] of normal equations [.., K, K], [.., K], columns scaled alike; 0 for a column that is
+    not there."""
     scale = np.sqrt(np.maximum(np.einsum("...kk->...k", grams), 1e-300))
     scaled = grams / (scale[..., :, None] * scale[..., None, :]) + 1e-13 * np.eye(grams.shape[-1])
     return np.linalg.solve(scaled, (sides / scale)[..., None])[..., 0] / scale
@@ -274,7 +276,7 @@ def misfit(d: Columns) -> float:
 
 
 def unphysical(d: Columns) -> dict[str, str]:
-    """Figures that least squares make negative where nothing can be, one after another, each with the reason."""
+    """Return figures that least squares make negative where nothing can be, one after another, each with the reason."""
     out: dict[str, str] = {}
     while True:
         left = d.without(out)
@@ -392,7 +394,8 @@ def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int 
 
 
 def _not_weighed(d: Columns) -> list[str]:
-    """Factors on gravity that these recordings tell worse than a model does (each half second one reading of it)."""
+    """Return factors on gravity that these recordings tell worse than a model does (each half second one reading of
+    it)."""
     at = {n: d.names.index(n) for n in WEIGHT if n in d.names}
     reach = {n: float(np.std(d.X[:, k])) * np.sqrt(d.blocks.max() + 1.0) for n, k in at.items()}
     return [n for n in at if max(reach.values()) * BELIEF.tolerance < misfit(d.without(list(at)))]
@@ -405,8 +408,8 @@ def _name(
     theirs: dict[str, np.ndarray],
     rng: np.random.Generator,
 ) -> tuple[list[Named], np.ndarray, dict[str, str]]:
-    """Further effects in the order in which they help on quarters left out, the coefficients with the catalogue's, and
-    effects that would have helped but cannot be what they are called, each with the reason."""
+    """Return further effects in the order in which they help on quarters left out, the coefficients with the
+    catalogue's, and effects that would have helped but cannot be what they are called, each with the reason."""
     chosen: list[str] = []
     impossible: dict[str, str] = {}
     out: list[tuple[str, float, str]] = []
@@ -415,7 +418,7 @@ def _name(
     count = int(own.blocks.max()) + 1
 
     def left_out(A: np.ndarray) -> np.ndarray:
-        """[blocks] squared residual, each quarter with coefficients of the others."""
+        """Return [blocks] squared residual, each quarter with coefficients of the others."""
         grams, sides = sums(A, own.u, quarter, QUARTERS)
         x = solved(grams.sum(0) - grams, sides.sum(0) - sides)
         r = own.u - np.einsum("nk,nk->n", A, x[quarter])
@@ -471,8 +474,8 @@ def _name(
 
 
 def _removed(before: np.ndarray, after: np.ndarray, blocks: np.ndarray) -> tuple[float, float]:
-    """90 % interval of the share of the squared residual `before` [m] that is gone in `after`, by a bootstrap over
-    stretches of neighbouring blocks."""
+    """Return 90 % interval of the share of the squared residual `before` [m] that is gone in `after`, by a bootstrap
+    over stretches of neighbouring blocks."""
     was = np.bincount(blocks, before**2)
     less = was - np.bincount(blocks, after**2)
     share = less[intervals.stretches(len(was), STRETCH, 0, DRAWS)].sum(1) / max(float(was.sum()), 1e-300)
@@ -489,13 +492,13 @@ def _kind(name: str) -> str:
 
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Whether a coefficient can be what it is called."""
+    """Return whether a coefficient can be what it is called."""
     kind = _kind(name)
     return kind not in EFFECT or EFFECT[kind].possible_by_torque(c, theta, LEAST)
 
 
 def _impossible(name: str, c: float, theta: dict[str, float]) -> str:
-    """Why a coefficient that is not sensible is a refusal that is told; empty where it is passed over."""
+    """Return why a coefficient that is not sensible is a refusal that is told; empty where it is passed over."""
     kind = _kind(name)
     return EFFECT[kind].impossible_by_torque(c, theta) if kind in EFFECT else ""
 
@@ -503,7 +506,7 @@ def _impossible(name: str, c: float, theta: dict[str, float]) -> str:
 def _intervals(
     X: np.ndarray, u: np.ndarray, blocks: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares and 90 % by a block bootstrap."""
+    """Return least squares and 90 % by a block bootstrap."""
     count = int(blocks.max()) + 1
     grams, sides = sums(X, u, blocks, count)
     weight = intervals.weights(count, rng, DRAWS)
@@ -512,7 +515,7 @@ def _intervals(
 
 
 def _further(own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
-    """One more effect each, as a column of what was filtered, by its law (`_kind`) and what it was given."""
+    """Return one more effect each, as a column of what was filtered, by its law (`_kind`) and what it was given."""
     laws = [e.torque_columns(own) for e in BY_TORQUE]
     laws.insert(1, {SQUARE: lambda d: d.v * np.abs(d.v)})  # beside the other friction that grows with speed
     return {name: column for law in laws for name, column in law.items()}

@@ -66,8 +66,8 @@ def identify_joints(
     span_train: dict[int, tuple[float, float]] | None = None,
     span_test: dict[int, tuple[float, float]] | None = None,
 ) -> list[IdentifiedJoint]:
-    """Each joint whose motor torque was logged in N.m, fast and long enough. span_*: part of each run [s from its
-    start]."""
+    """Return each joint whose motor torque was logged in N.m, fast and long enough. span_*: part of each run [s from
+    its start]."""
     out: list[IdentifiedJoint] = []
     motions: dict[tuple[int, float], Stretch] = {}
     for case in cases:
@@ -101,13 +101,13 @@ def identify_joints(
 
 
 def _by_torque(case: Case, x: inverse_dynamics.Inverse, n: inverse_dynamics.Named) -> ByTorque:
-    """A further effect of a joint's torque as its entry of the catalogue takes it."""
+    """Return a further effect of a joint's torque as its entry of the catalogue takes it."""
     force, length = ("N", "m") if case.scales.slide else ("N.m", "rad")
     return ByTorque(n.value, n.low, n.high, n.speed, x.full, force, length)
 
 
 def torque_texts(given: Sequence[IdentifiedJoint]) -> list[str]:
-    """What `identify_joints` found, in words."""
+    """Return what `identify_joints` found, in words."""
     out = []
     for joint in given:
         case, x = joint.case, joint.inverse
@@ -190,7 +190,7 @@ class Told:
     def over(
         self, write: Callable[[ServoTable, mujoco.MjSpec], list[str]]
     ) -> Callable[[ServoTable, mujoco.MjSpec], list[str]]:
-        """The same as `write`, then these figures."""
+        """Return the same as `write`, then these figures."""
 
         def both(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
             said = write(table, spec)
@@ -218,8 +218,8 @@ def told(
     span_test: Spans | None,
     stages: Sequence[Stage] = (),
 ) -> dict[str, Told]:
-    """The torque's figures of each joint that is handed them on: where its closed loop does not say otherwise, what it
-    was refitted to is the fit's own wandering.
+    """Return the torque's figures of each joint that is handed them on: where its closed loop does not say otherwise,
+    what it was refitted to is the fit's own wandering.
 
     A closed loop says otherwise where a free run over what was held out is followed better with its own figures, by
     more than `BELIEF.tolerance`, or where what was found is about them; not where `stages` say that the drive itself is
@@ -251,9 +251,9 @@ def told(
 
 
 def unknown_controllers(given: Sequence[IdentifiedJoint], stages: Sequence[Stage], notes: list[str]) -> set[str]:
-    """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly
-    in part, or surely pushes the other way: their closed loop speaks of an unknown controller, and no effect of the
-    joint is looked for in it. Said in `notes`.
+    """Return joints of which the torque told, but whose logged torque is not what the believed law of the drive gives,
+    hardly in part, or surely pushes the other way: their closed loop speaks of an unknown controller, and no effect of
+    the joint is looked for in it. Said in `notes`.
 
     A line through the law and the torque fits well where one is the other's mirror image, too; but no gain of the
     believed law is negative, and the torque's own sign is borne out by its friction, which resists."""
@@ -280,8 +280,8 @@ def _alike(
     test: Sequence[int],
     span_test: Spans | None,
 ) -> bool:
-    """Whether what was held out is followed as well with the torque's figures as with those that the closed loop was
-    refitted to."""
+    """Return whether what was held out is followed as well with the torque's figures as with those that the closed loop
+    was refitted to."""
     whole = replace(case, plant=search.whole)
     windows = whole.plant.windows(None, test, span=span_test)
     params, fixed = trial.fit.params, [f for m in trial.members for f in m.variant.fixed]
@@ -297,7 +297,7 @@ def _alike(
 def findings(
     given: Sequence[IdentifiedJoint], unknown: Sequence[str], runs: list[Run], train: list[int]
 ) -> list[Finding]:
-    """The further effects as findings, for joints of which nothing of the friction was believed
+    """Return the further effects as findings, for joints of which nothing of the friction was believed
     (`unknown`)."""
     out = []
     for joint in given:
@@ -381,8 +381,8 @@ class Push:
 
 
 def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:
-    """Of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; [] where
-    no torque was logged."""
+    """Return of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; []
+    where no torque was logged."""
     out: list[Push] = []
     motions: dict[int, Stretch] = {}
     rng = np.random.default_rng(seed)
@@ -412,8 +412,8 @@ QUIETEST = 0.05  # of a joint's samples: those by which it is told what is no ri
 
 
 def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) -> list[int]:
-    """Of `joints` the j-th and those before and behind it in the mechanism: what one accelerates asks a torque of the
-    others."""
+    """Return of `joints` the j-th and those before and behind it in the mechanism: what one accelerates asks a torque
+    of the others."""
 
     def chain(joint: str) -> set[int]:
         dof, out = int(model.jnt_dofadr[model.joint(joint).id]), set()
@@ -429,10 +429,10 @@ def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) ->
 def _by_ringing(
     given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], joints: Sequence[int], cutoff: float
 ) -> bool:
-    """Whether one of `joints` (`_moving_one_another`) rings in most of the samples in which something seems to push one
-    of them, (times [S] s, pushed [S]) by run: it shakes by far more than where it is quietest, and by more than its
-    motion below the cutoff [Hz] asks for. Inverse dynamics know no acceleration of what is faster than the readings,
-    and a loop that rings by itself is pushed by nobody."""
+    """Return whether one of `joints` (`_moving_one_another`) rings in most of the samples in which something seems to
+    push one of them, (times [S] s, pushed [S]) by run: it shakes by far more than where it is quietest, and by more
+    than its motion below the cutoff [Hz] asks for. Inverse dynamics know no acceleration of what is faster than the
+    readings, and a loop that rings by itself is pushed by nobody."""
     on = np.concatenate([pushed for _, pushed in given])
     for j in joints:
         swings = []
@@ -452,7 +452,7 @@ def _by_ringing(
 
 
 def _swing(x: np.ndarray, step: float) -> np.ndarray:
-    """[n] rms of the second differences of x [n] within `AROUND` about each sample."""
+    """Return [n] rms of the second differences of x [n] within `AROUND` about each sample."""
     count = max(int(AROUND / step), 3)
     return np.sqrt(np.convolve(np.diff(x, 2, prepend=x[0], append=x[-1]) ** 2, np.ones(count) / count, "same"))
 
@@ -510,10 +510,10 @@ def _size(
     off: np.ndarray,
     noise: float,
 ) -> tuple[float, tuple[float, float]]:
-    """(the largest push, interval of its size): of the crest of the strongest stretch, where medians over `AROUND` are
-    within `CREST` of the largest. One sample is no size: the largest of many is the noise's. The interval holds nine
-    tenths of those medians and what their mean moves by with the fit's own figures. off [draws, K]: by which the
-    figures of the fit differ when its blocks are drawn anew; noise: of one sample."""
+    """Return (the largest push, interval of its size): of the crest of the strongest stretch, where medians over
+    `AROUND` are within `CREST` of the largest. One sample is no size: the largest of many is the noise's. The interval
+    holds nine tenths of those medians and what their mean moves by with the fit's own figures. off [draws, K]: by which
+    the figures of the fit differ when its blocks are drawn anew; noise: of one sample."""
     best: tuple[float, int, np.ndarray, np.ndarray] | None = None
     anywhere = any(on.any() for on in pushed)
     for k, (t, r, on) in enumerate(zip(times, residual, pushed, strict=True)):
@@ -537,7 +537,7 @@ def _size(
 
 
 def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np.ndarray) -> np.ndarray:
-    """[m] torque that the fit misses; at rest only beyond what dry friction may carry either way."""
+    """Return [m] torque that the fit misses; at rest only beyond what dry friction may carry either way."""
     still = A.copy()
     still[:, coulomb] = 0.0
     held = u - still @ x
@@ -546,22 +546,22 @@ def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np
 
 
 def _slow(residual: np.ndarray, block: np.ndarray) -> bool:
-    """Whether residuals are alike over half a second, as forces are and noise is not."""
+    """Return whether residuals are alike over half a second, as forces are and noise is not."""
     count = np.maximum(np.bincount(block), 1)
     means = np.bincount(block, residual) / count
     return float(np.sum(count * means**2)) > TORQUE.slow * float(np.sum(residual**2))
 
 
 def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Columns:
-    """Other rows in the place of a piece's, for the look whether their figures can be."""
+    """Return other rows in the place of a piece's, for the look whether their figures can be."""
     return replace(of, names=tuple(names), X=A, u=u)
 
 
 def _trimmed(
     A: np.ndarray, u: np.ndarray, block: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(coefficients [K], fitted blocks [count] bool) of the least trimmed squares by blocks (P. Rousseeuw, K. Van
-    Driessen 2006)."""
+    """Return (coefficients [K], fitted blocks [count] bool) of the least trimmed squares by blocks (P. Rousseeuw, K.
+    Van Driessen 2006)."""
     grams, sides = sums(A, u, block, count)
     squares, n = np.bincount(block, u * u, count), np.maximum(np.bincount(block, minlength=count), 1)
     keep, lowest = max(int(HALF * count), 4), np.inf
@@ -607,8 +607,8 @@ def _spans(
 def without_pushes(
     pushes: Sequence[Push], runs: list[Run], held: list[int], notes: list[str]
 ) -> tuple[list[Run], list[int]]:
-    """The runs without the stretches in which something pushes, and which are held out, where enough is left of both to
-    judge by."""
+    """Return the runs without the stretches in which something pushes, and which are held out, where enough is left of
+    both to judge by."""
     from dexsim.gap.read import inputs
 
     clear = [p for p in pushes if p.clear]

@@ -108,8 +108,8 @@ class Ringing:
             self.speed = KICK * float(np.median(level[self.rung])) / float(np.median(step))
 
     def _of(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """([H, gaps, W] rms by which readings q [H, n] differ from the line between their neighbours, [H, W] their
-        mean)."""
+        """Return ([H, gaps, W] rms by which readings q [H, n] differ from the line between their neighbours, [H, W]
+        their mean)."""
         W = len(self.w.window)
         by = lambda x, of: np.bincount(of, x, W) / np.maximum(np.bincount(of, None, W), 1)  # noqa: E731
         levels = []
@@ -135,14 +135,14 @@ class Ringing:
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
     def _part(self, on: np.ndarray) -> Windows:
-        """The windows `on` [W] bool; made once, with what is known of them."""
+        """Return the windows `on` [W] bool; made once, with what is known of them."""
         key = on.tobytes()
         if key not in self._parts:
             self._parts[key] = self.w if on.all() else subset(self.w, on)
         return self._parts[key]
 
     def missed(self, members: tuple[Member, ...], params: list[Param], x: np.ndarray) -> np.ndarray:
-        """[H, W] by how much each guess x [H, P] misses each window."""
+        """Return [H, W] by how much each guess x [H, P] misses each window."""
         levels, means = self._simulated(members, params, x)
         noise = 1.5 * self.quiet**2
         ratio = 0.5 * np.log((self.levels**2 + noise) / (levels**2 + 2 * noise))
@@ -150,11 +150,11 @@ class Ringing:
         return (np.clip(ratio, -MOST_LOG, MOST_LOG) ** 2).sum(1) + SEARCH.resting * np.minimum(away**2, MOST_AWAY**2)
 
     def of(self, trial: Trial) -> np.ndarray:
-        """[W] by how much a fitted hypothesis misses each window."""
+        """Return [W] by how much a fitted hypothesis misses each window."""
         return self.missed(trial.members, trial.fit.params, trial.fit.x[None])[0]
 
     def best(self, member: Member, rng: np.random.Generator) -> tuple[float, list[Param], np.ndarray]:
-        """(what is missed in all, params, sizes [P]) of one effect, looked for over its range and then about the
+        """Return (what is missed in all, params, sizes [P]) of one effect, looked for over its range and then about the
         best."""
         search, case = self.search, self.search.case
         own = len(member.variant.params)
@@ -202,15 +202,15 @@ def _starts(member: Member) -> list[tuple[float, ...]]:
 
 
 def without_loop(case: Case) -> bool:
-    """Whether a joint's loop gives next to nothing of the torque that moves it (a duty or a torque is commanded,
+    """Return whether a joint's loop gives next to nothing of the torque that moves it (a duty or a torque is commanded,
     through a gain that stands for none): only what is fed back makes a joint ring by itself."""
     s = case.scales
     return s.stiffness * s.span < SEARCH.doubt * s.tau
 
 
 def answered(search: JointSearch, found: Outcome) -> Outcome:
-    """What the search of a joint found; where it rings by itself and that is hardly followed, the effect that makes it
-    ring as measured in the place of what was found, if any does by at least `SEARCH.plainly` more."""
+    """Return what the search of a joint found; where it rings by itself and that is hardly followed, the effect that
+    makes it ring as measured in the place of what was found, if any does by at least `SEARCH.plainly` more."""
     followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
     if followed or without_loop(search.case) or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by

@@ -31,7 +31,7 @@ class JointLosses(JointHypotheses):
     none_loss: np.ndarray  # by block, without any effect
 
     def _score(self, trial: Trial) -> float:
-        """Left-out loss with a price on parameters."""
+        """Return left-out loss with a price on parameters."""
         return (
             float(self._left(trial).sum())
             * (1 + SEARCH.apart * sum(len(m.variant.params) for m in trial.members))
@@ -39,8 +39,8 @@ class JointLosses(JointHypotheses):
         )
 
     def _price_factor(self, trial: Trial) -> float:
-        """Factor on the losses of a hypothesis that can imitate simpler ones, or whose size stopped at the end of what
-        is physical: the data would have it where it cannot be."""
+        """Return factor on the losses of a hypothesis that can imitate simpler ones, or whose size stopped at the end
+        of what is physical: the data would have it where it cannot be."""
         at, begin = complexity_price(trial), 0
         for m in trial.members:
             fitted = trial.fit.x[begin : begin + len(m.variant.params)]
@@ -51,14 +51,14 @@ class JointLosses(JointHypotheses):
         return at
 
     def _left(self, trial: Trial) -> np.ndarray:
-        """Losses by block [B] on what was left out, and what the beliefs had to give for them, spread over the
+        """Return losses by block [B] on what was left out, and what the beliefs had to give for them, spread over the
         blocks."""
         out = self.cross(trial)
         return out + disbelief(trial.fit.params, trial.fit.x) / len(out)
 
     def cross(self, trial: Trial) -> np.ndarray:
-        """Losses by block [B] when the block's condition is left out of the fit: from the optimum of all, one bounded
-        Gauss-Newton step on the other conditions, its length chosen there."""
+        """Return losses by block [B] when the block's condition is left out of the fit: from the optimum of all, one
+        bounded Gauss-Newton step on the other conditions, its length chosen there."""
         if trial.left_out is not None:
             return trial.left_out
         f, fitter = trial.fit, self.fitter
@@ -107,8 +107,8 @@ class JointLosses(JointHypotheses):
         return out
 
     def refold(self, trial: Trial) -> Trial:
-        """The trial with its losses on what was left out from fits of their own: where an effect is kinked (a limit, a
-        sag, play), one step from the optimum of all lands anywhere."""
+        """Return the trial with its losses on what was left out from fits of their own: where an effect is kinked (a
+        limit, a sag, play), one step from the optimum of all lands anywhere."""
         f = trial.fit
         out = np.zeros(int(self.blocks.max()) + 1)
         folds, parts, left = np.unique(self.fold_of), [], []
@@ -131,8 +131,8 @@ class JointLosses(JointHypotheses):
         return replace(trial, left_out=out, folds=parts, refitted=True)
 
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
-        """Whether what `new` has beside `old` removes enough of what was left out: of windows or, far from the noise
-        and beside other effects, of whole recordings."""
+        """Return whether what `new` has beside `old` removes enough of what was left out: of windows or, far from the
+        noise and beside other effects, of whole recordings."""
         return self._earns_in_windows(new, old, further) or self._earns_run_free(new, old)
 
     def _earns_in_windows(self, new: Trial, old: Trial, further: bool) -> bool:
@@ -154,7 +154,7 @@ class JointLosses(JointHypotheses):
         return bool(np.quantile(self._boot(a - b), chance) > 0)
 
     def _earns_run_free(self, new: Trial, old: Trial) -> bool:
-        """Whether a further effect lasts on whole recordings of conditions left out.
+        """Return whether a further effect lasts on whole recordings of conditions left out.
 
         Where even with it far more than noise is left, a joint that sticks goes another way than the recorded one in a
         few windows, and their squares decide by which stick came first. Mean errors of free runs hang less on a few
@@ -198,7 +198,7 @@ class JointLosses(JointHypotheses):
         return x[intervals.stretches(len(x), STRETCH, self.rng, BOOTSTRAPS)].sum(1)
 
     def _by_condition(self, lost: np.ndarray, mine: np.ndarray) -> list[float]:
-        """Relative gain of `mine` over `lost` (losses by block [B]) on each condition that was left out."""
+        """Return relative gain of `mine` over `lost` (losses by block [B]) on each condition that was left out."""
         fold = self.fold_of[self.fitter.window]
         out = []
         for number in np.unique(fold):
@@ -226,8 +226,8 @@ class JointScan(JointLosses):
     def _guesses(
         self, current: Trial, base: np.ndarray
     ) -> tuple[list[np.ndarray], list[tuple[Member, np.ndarray]]]:
-        """The plant's rows of every effect that `current` has not, at each of its starts, the others as in base [R, C];
-        and (effect, start) of each."""
+        """Return the plant's rows of every effect that `current` has not, at each of its starts, the others as in base
+        [R, C]; and (effect, start) of each."""
         case, believed = self.case, self.case.plant.base()
         taken = {m.id for m in current.members}
         guesses: list[np.ndarray] = []
@@ -251,7 +251,7 @@ class JointScan(JointLosses):
         return guesses, owners
 
     def scan(self, current: Trial) -> list[Scanned]:
-        """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
+        """Return every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
         case = self.case
         params = current.fit.params
         fitter = self.scan_fitter.given(current.members)
@@ -336,8 +336,8 @@ class JointScan(JointLosses):
         params: list[Param],
         x: np.ndarray,
     ) -> list[tuple[float, Member, np.ndarray]]:
-        """What each guess of the scan would save where beliefs, moved out to follow the data, may go back: [(share of
-        the squared error with what beliefs gave for it, member, start)] by member, the best first.
+        """Return what each guess of the scan would save where beliefs, moved out to follow the data, may go back:
+        [(share of the squared error with what beliefs gave for it, member, start)] by member, the best first.
 
         owners [H]: (member, start); dots, squares [H]: of the residuals' change d by the guess with the residuals and
         itself; cross [H, P]: J' d. Least squares over the guess's size (0 to 2) and every belief inside its bounds, by
@@ -379,8 +379,8 @@ class JointScan(JointLosses):
         return sorted(best.values(), key=lambda o: -o[0])
 
     def _narrow(self, effect: Effect, variant: Variant) -> Variant | None:
-        """A variant of the effect without parameters that are fitted anyway, because nothing in particular is believed
-        of them."""
+        """Return a variant of the effect without parameters that are fitted anyway, because nothing in particular is
+        believed of them."""
         keep = [i for i, p in enumerate(variant.params) if not set(p.columns) & self.wide]
         if len(keep) == len(variant.params):
             return variant
@@ -392,8 +392,8 @@ class JointScan(JointLosses):
     def _shortlist(
         self, scan: list[Scanned], size: int, loss: float, members: Sequence[Member]
     ) -> list[Scanned]:
-        """The best variants of the best effects, every kind of those that ask for it, and what the first is confused
-        with."""
+        """Return the best variants of the best effects, every kind of those that ask for it, and what the first is
+        confused with."""
         seen: dict[str, int] = {}
         out: list[Scanned] = []
         for row in scan:
@@ -415,9 +415,9 @@ class JointScan(JointLosses):
         return out
 
     def _hinted(self, listed: list[Scanned], members: Sequence[Member], least: float) -> list[Scanned]:
-        """The list, and up to four more that, by the scan, save at least `least` of the squared error with what the
-        beliefs give for it: where those moved out to follow the data, what is left shows little, and the right effect
-        lets them go back."""
+        """Return the list, and up to four more that, by the scan, save at least `least` of the squared error with what
+        the beliefs give for it: where those moved out to follow the data, what is left shows little, and the right
+        effect lets them go back."""
         known = {row[2].id for row in listed}
         more = [
             row
@@ -428,18 +428,19 @@ class JointScan(JointLosses):
 
 
 def _times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """[H, K] A [K, m] times each of x [H, m]: each as one product of its own, so that no sum hangs on how many there
-    are."""
+    """Return [H, K] A [K, m] times each of x [H, m]: each as one product of its own, so that no sum hangs on how many
+    there are."""
     return np.matmul(A, x[..., None])[..., 0]
 
 
 def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[H] products of the rows of a and b [H, m]."""
+    """Return [H] products of the rows of a and b [H, m]."""
     return np.matmul(a[:, None, :], b[..., None])[:, 0, 0]
 
 
 def _projected(J: np.ndarray, gram: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """[H, m] y [H, m] without what the columns of J [m, P] may absorb of each, gram [P, P] being J' J and a prior."""
+    """Return [H, m] y [H, m] without what the columns of J [m, P] may absorb of each, gram [P, P] being J' J and a
+    prior."""
     if not J.shape[1]:
         return y.copy()
     taken = _times(J, np.linalg.solve(gram, _times(J.T, y)[..., None])[..., 0])
@@ -447,11 +448,11 @@ def _projected(J: np.ndarray, gram: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
-    """[R, C] plant parameters at one guess."""
+    """Return [R, C] plant parameters at one guess."""
     return expand(case.plant, params, x[None])[0]
 
 
 def legal(g: np.ndarray) -> np.ndarray:
-    """Plant parameters [.., C] in place, those that cannot be negative at 0 at least."""
+    """Return plant parameters [.., C] in place, those that cannot be negative at 0 at least."""
     g[..., NOT_NEGATIVE] = np.maximum(g[..., NOT_NEGATIVE], 0.0)
     return g

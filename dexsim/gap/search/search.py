@@ -117,9 +117,9 @@ class JointSelection(JointScan):
         pool: dict[str, tuple[Member, np.ndarray]],
         price: dict[str, float],
     ) -> Trial:
-        """What one effect more makes of hypotheses with what is the same torque while the joint moves in the place of
-        what was added (`nested`): which of them it is may show beside another effect only. `current` where none
-        lasts better, or little is left."""
+        """Return what one effect more makes of hypotheses with what is the same torque while the joint moves in the
+        place of what was added (`nested`): which of them it is may show beside another effect only. `current` where
+        none lasts better, or little is left."""
         best = current
         for fork in forks:
             loss = self._left(fork).sum() / len(self.blocks)
@@ -134,7 +134,7 @@ class JointSelection(JointScan):
         return best
 
     def _more_general(self, current: Trial) -> Trial:
-        """`current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
+        """Return `current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
         unknown anyway only that it differs by direction is found, which is a spring without stiffness, and on a joint
         that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
         general one leaves."""
@@ -174,8 +174,8 @@ class JointSelection(JointScan):
         pool: dict[str, tuple[Member, np.ndarray]],
         price: dict[str, float],
     ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
-        """The hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted on
-        short windows: those that follow best, the best first. pool, price: by effect, are filled."""
+        """Return the hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted
+        on short windows: those that follow best, the best first. pool, price: by effect, are filled."""
         drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
         followed: dict[str, float] = {}
         begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
@@ -209,7 +209,7 @@ class JointSelection(JointScan):
     def _finished(
         self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
     ) -> list[Trial]:
-        """The drafts fitted on long windows, and judged on what was left out."""
+        """Return the drafts fitted on long windows, and judged on what was left out."""
 
         def finished(k: int) -> Trial | None:
             return self.finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
@@ -234,8 +234,8 @@ class JointSelection(JointScan):
         return trials
 
     def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
-        """The one of the trials that loses least on what was left out; fits of their own decide where what follows best
-        seems to last less, or not to last."""
+        """Return the one of the trials that loses least on what was left out; fits of their own decide where what
+        follows best seems to last less, or not to last."""
         best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
         if close.fit.loss < (1 - SEARCH.tie) * best.fit.loss:
             two = [self.refold(t) for t in (best, close)]
@@ -252,7 +252,7 @@ class JointSelection(JointScan):
     def _settled(
         self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
     ) -> tuple[Trial, dict[str, tuple[list[tuple[str, float]], float, float]]]:
-        """(the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
+        """Return (the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):
             better = self._overtaken(current, final)
@@ -265,7 +265,7 @@ class JointSelection(JointScan):
         return current, final
 
     def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
-        """The hypothesis fitted again from where those with one effect more ended that follow better: what they
+        """Return the hypothesis fitted again from where those with one effect more ended that follow better: what they
         refitted, and of that effect what is inside the bounds of a belief. The fit without it may have stopped in a
         hollow beside; `current` where it had not."""
         best, params = current, current.fit.params
@@ -295,15 +295,15 @@ class JointSelection(JointScan):
         return best
 
     def plain(self) -> tuple[list[Param], np.ndarray] | None:
-        """The plain model of this joint (`baseline.fitted`), fitted once."""
+        """Return the plain model of this joint (`baseline.fitted`), fitted once."""
         if not hasattr(self, "_plain"):
             self._plain = baseline.fitted(self.case, self.train, self.span, self.seed, self.deadline.passed)
         return self._plain
 
     def _from_plain(self, current: Trial) -> Trial:
-        """The effects by which a plain least squares differs from what is believed, all at once and from its figures,
-        where they follow better: of several that are missing together each alone may look like another. Those that do
-        not earn their place are let go. `current` where they do not."""
+        """Return the effects by which a plain least squares differs from what is believed, all at once and from its
+        figures, where they follow better: of several that are missing together each alone may look like another. Those
+        that do not earn their place are let go. `current` where they do not."""
         enough = self._left(current).sum() / len(self.blocks) < SEARCH.enough**2
         if enough or self.deadline.over() or (plain := self.plain()) is None:
             return current
@@ -358,7 +358,7 @@ class JointSelection(JointScan):
     def _swap(
         self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]], level: list[Trial]
     ) -> tuple[Trial, list[Trial]]:
-        """Each earlier member replaced by others of the pool, while the rest stays."""
+        """Return each earlier member replaced by others of the pool, while the rest stays."""
         best = current
         for i, member in enumerate(current.members[:-1]):
             rest = [m for k, m in enumerate(current.members) if k != i]
@@ -377,8 +377,8 @@ class JointSelection(JointScan):
         return best, level
 
     def _in_its_place(self, trials: Sequence[Trial], current: Trial) -> Trial:
-        """What was added in the place of what was fitted down to nothing beside it, which had only looked like it;
-        `current` where no trial that follows far better has such a member."""
+        """Return what was added in the place of what was fitted down to nothing beside it, which had only looked like
+        it; `current` where no trial that follows far better has such a member."""
         for trial in sorted(trials, key=lambda t: t.fit.loss):
             if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or self.deadline.over():
                 break
@@ -394,7 +394,7 @@ class JointSelection(JointScan):
         return current
 
     def _drop(self, current: Trial) -> Trial:
-        """Members that no longer earn their place are let go."""
+        """Return members that no longer earn their place are let go."""
         changed = True
         while changed and len(current.members) > 1:
             changed = False
@@ -411,7 +411,7 @@ class JointSelection(JointScan):
         return current
 
     def _refine(self, current: Trial) -> Trial:
-        """Members with more parameters (an elasticity that hardens), where those earn their place."""
+        """Return members with more parameters (an elasticity that hardens), where those earn their place."""
         for i, member in enumerate(current.members):
             for whole in member.effect.variants(self.case.scales):
                 variant = self._narrow(member.effect, whole) if whole.refines else None
@@ -436,7 +436,7 @@ class JointSelection(JointScan):
         return current
 
     def _approximate(self, current: Trial) -> Trial:
-        """The members that are confused with an effect replaced by a law of it that training has less exactly
+        """Return the members that are confused with an effect replaced by a law of it that training has less exactly
         (`Variant.approximate`), where they leave more than noise and that law leaves but `SEARCH.approximate` of what
         is more.
 
@@ -477,8 +477,8 @@ class JointSelection(JointScan):
         return best if best is current else self._drop(best)  # what made up for the imitations may not be needed
 
     def _by_laws(self, current: Trial) -> Trial:
-        """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the
-        others kept beside it, so that intervals hold what the law is not known to be."""
+        """Return each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits
+        by the others kept beside it, so that intervals hold what the law is not known to be."""
         for i, member in enumerate(current.members):
             tries = [current]
             for variant in self._laws_of(member):
@@ -489,7 +489,7 @@ class JointSelection(JointScan):
         return current
 
     def _laws_of(self, member: Member) -> list[Variant]:
-        """The other laws of a hypothesis' effect, the first among them where a later one has taken its place."""
+        """Return the other laws of a hypothesis' effect, the first among them where a later one has taken its place."""
         first = self.first_laws.get((member.id, member.variant.label), member.variant)
         laws = [first, *first.by_law()]
         self.first_laws |= {(member.id, v.label): first for v in laws}
@@ -498,8 +498,8 @@ class JointSelection(JointScan):
     def _overtaken(
         self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]
     ) -> Trial | None:
-        """The hypothesis in which a rival stands in the place of the member that it beats in most bootstraps; None
-        where each holds its own."""
+        """Return the hypothesis in which a rival stands in the place of the member that it beats in most bootstraps;
+        None where each holds its own."""
         ahead = []
         for k, m in enumerate(current.members):
             others, share, _ = final[m.id]
@@ -588,7 +588,8 @@ def _loss(fitter: Fitter, trial: Trial) -> float:
 
 
 def _value(p: Param, plain: Param, x: float, case: Case) -> float:
-    """The value of an effect's parameter `p` that writes to its column what the plain model's `plain` does at `x`."""
+    """Return the value of an effect's parameter `p` that writes to its column what the plain model's `plain` does at
+    `x`."""
     nominal = case.scales.nominal[p.columns[0]]
     absolute = x * nominal if plain.mode == "factor" else x
     value = absolute / nominal if p.mode == "factor" else absolute - nominal if p.mode == "add" else absolute
@@ -596,7 +597,7 @@ def _value(p: Param, plain: Param, x: float, case: Case) -> float:
 
 
 def _differs(plain: Param, x: float, case: Case) -> bool:
-    """Whether the plain model's figure is another than what is believed, as far as that is believed."""
+    """Return whether the plain model's figure is another than what is believed, as far as that is believed."""
     nominal = case.scales.nominal[plain.columns[0]]
     unit = nominal if plain.mode == "factor" else 1.0
     return abs(x * unit - nominal) > max(BELIEF.tolerance * abs(nominal), SEARCH.doubt * plain.span * unit)
@@ -611,7 +612,7 @@ class JointSearch(JointSelection):
     the scan (`JointScan`), the selection (`JointSelection`), and what was found on whole recordings."""
 
     def law_spread(self, trial: Trial) -> np.ndarray:
-        """[P, 2] lowest and highest value of each parameter over the laws that do about as well: within twice
+        """Return [P, 2] lowest and highest value of each parameter over the laws that do about as well: within twice
         `SEARCH.apart` of the loss on what was left out."""
         x = trial.fit.x
         out = np.stack([x, x], 1)
@@ -637,8 +638,8 @@ class JointSearch(JointSelection):
         self.polish(found.best), self.polish(found.none)  # kept for the judgement
 
     def _simpler(self, trial: Trial) -> Trial:
-        """The trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without: slopes
-        stall at such kinks, and what was held out may go beyond what told them."""
+        """Return the trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without:
+        slopes stall at such kinks, and what was held out may go beyond what told them."""
         params = trial.fit.params
         away = [
             p.key
@@ -659,8 +660,8 @@ class JointSearch(JointSelection):
         return best
 
     def polish(self, trial: Trial) -> Trial:
-        """The trial refitted on whole training recordings run free from their first sample, where that follows them
-        better than the windows' fit: state carried over windows is right there. Done once a trial."""
+        """Return the trial refitted on whole training recordings run free from their first sample, where that follows
+        them better than the windows' fit: state carried over windows is right there. Done once a trial."""
         if id(trial) not in self._polished:
             self._polished[id(trial)] = trial, self._polish(trial)
         return self._polished[id(trial)][1]
@@ -689,7 +690,7 @@ class JointSearch(JointSelection):
         return trial
 
     def by_run(self, trial: Trial) -> np.ndarray:
-        """[R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
+        """Return [R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
         a = huber_square(self.fitter.given(trial.members).evaluate(trial.fit.params, trial.fit.x), self.r.huber)
         run, count = self.long.run[self.fitter.window], self.case.plant.runs
         return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
@@ -702,9 +703,9 @@ class JointSearch(JointSelection):
         return _loss(Fitter(self.case.plant, windows, self.r), trial)
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
-        """Intervals that also hold what the residuals do not show, added in squares: the disagreement of the fits
-        without one condition each (a jackknife); the believed figures being off by more than their fit says (half of
-        `BELIEF.tolerance` each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant
+        """Return intervals that also hold what the residuals do not show, added in squares: the disagreement of the
+        fits without one condition each (a jackknife); the believed figures being off by more than their fit says (half
+        of `BELIEF.tolerance` each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant
         being no truer."""
         f = trial.fit
         x, P = f.x, len(f.x)

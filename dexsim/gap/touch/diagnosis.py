@@ -236,7 +236,7 @@ def doubted(finding: Finding) -> bool:
 
 
 def handed(findings: list[Finding], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
-    """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
+    """Return the settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
     out = Handed()
     pads: dict[str, PadSettings] = {}
     drifts: dict[str, Any] = {}
@@ -282,7 +282,8 @@ def handed(findings: list[Finding], facts: dict[str, PadFacts], names: Sequence[
 
 
 def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
-    """One range for all fingertips: every fit, and what was believed of a fingertip that was judged and follows it."""
+    """Return one range for all fingertips: every fit, and what was believed of a fingertip that was judged and follows
+    it."""
     others = [x.believed(name) for pad, x in facts.items() if pad not in by_pad]
     believed = [x for x in others if x is not None]
     value, low, high = (np.array(x) for x in zip(*by_pad.values(), strict=True))

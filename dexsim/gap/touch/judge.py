@@ -58,7 +58,7 @@ class PadAnswer:
             self.constant = replace(self.constant, held_out=left)
 
     def findings(self) -> list[Finding]:
-        """What was found."""
+        """Return what was found."""
         found = [f for e in self.best.ids if (f := self._finding(e)) is not None]
         if self.constant is not None:  # one finding per effect and pad: constant taxels are gains of 0
             k = next((k for k, f in enumerate(found) if TOUCH_EFFECTS[f.effect].by_taxel), None)
@@ -69,7 +69,7 @@ class PadAnswer:
         return found
 
     def _finding(self, e: str) -> Finding | None:
-        """One effect; None where it did not help on what was held out."""
+        """Return one effect; None where it did not help on what was held out."""
         search, best, effect = self.search, self.best, TOUCH_EFFECTS[e]
         stage = _stage(search, e)
         less = search.without(best, e) if len(best.ids) > 1 else self.none
@@ -100,7 +100,7 @@ class PadAnswer:
         )
 
     def facts(self) -> PadFacts:
-        """What training is told of the pad beside its findings."""
+        """Return what training is told of the pad beside its findings."""
         search, best, run = self.search, self.best, self.search.runs[0]
         common = (best.values["gain"], *self.bounds["gain"]) if "gain" in best.keys else None
         warmest = max(float(r.warm.max()) for r in search.runs)
@@ -109,7 +109,7 @@ class PadAnswer:
         )
 
     def nuisance(self) -> dict[str, float]:
-        """The refitted beliefs by the keys of `diagnosis.json`."""
+        """Return the refitted beliefs by the keys of `diagnosis.json`."""
         keys = [k for k in ("scale", "zero", "along", "across", "spread", "clock") if k in self.best.keys]
         return {f"touch_{k}@{self.name}": round(self.best.values[k], 7) for k in keys}
 
@@ -118,14 +118,14 @@ class PadAnswer:
         return self.kept or {r.recording for r in self.search.runs}
 
     def structured(self) -> bool:
-        """Whether something is left that no effect explains."""
+        """Return whether something is left that no effect explains."""
         search = self.search
         loss = float(search.cross(self.best).sum()) / max(int(search.train.sum()), 1)
         return loss > JUDGE.within**2 and self.left > JUDGE.within * self.floor
 
     def _rest(self) -> Fit | None:
-        """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where
-        they do not."""
+        """Return gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None
+        where they do not."""
         search, t = self.search, self.best
         if t.gains is None:
             return None
@@ -140,8 +140,8 @@ class PadAnswer:
         return (value, low, high) if abs(value - 1) > TOUCH.law and high - low < abs(value - 1) else None
 
     def _chord(self) -> Fit | None:
-        """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are
-        known; None without one."""
+        """Return the linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers
+        are known; None without one."""
         t = self.best
         rubber = [key for e in t.ids for key in TOUCH_EFFECTS[e].rubber]
         if not rubber:
@@ -157,7 +157,7 @@ class PadAnswer:
         return found[0][0], min(f[1] for f in found), max(f[2] for f in found)
 
     def _parameters(self, e: str) -> tuple[list[str], dict[str, Any]]:
-        """(taxels concerned, parameters with intervals by the catalogue's keys)."""
+        """Return (taxels concerned, parameters with intervals by the catalogue's keys)."""
         effect, t, search = TOUCH_EFFECTS[e], self.best, self.search
         if effect.by_taxel and t.gains is not None:
             return self._gains_of_taxels()
@@ -178,7 +178,7 @@ class PadAnswer:
         return taxels, out | {k: word(v) for k, v in effect.words_beside.items()}
 
     def _gains_of_taxels(self) -> tuple[list[str], dict[str, Any]]:
-        """The same of a gain for every taxel: those that are off, and those that are exchanged."""
+        """Return the same of a gain for every taxel: those that are off, and those that are exchanged."""
         t, pad = self.best, self.pad
         g = t.gains
         assert g is not None  # of such an effect
@@ -203,12 +203,12 @@ class PadAnswer:
 
 
 def rms(squares: np.ndarray) -> float:
-    """Root of the mean of squares; 0 for none."""
+    """Return root of the mean of squares; 0 for none."""
     return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
 
 
 def held_out(pad: PadFit, trial: TouchTrial, stage: int = 0) -> tuple[float, np.ndarray, np.ndarray]:
-    """(rms [N], squared errors, blocks) on residuals held out, of one stage, over taxels that feel something."""
+    """Return (rms [N], squared errors, blocks) on residuals held out, of one stage, over taxels that feel something."""
     at = ~pad.train & (pad.stage_of() == stage)
     sigma = np.concatenate([s.sigma[s.mask] for s in pad.samples])
     e = (trial.res * sigma)[at] ** 2
@@ -216,20 +216,20 @@ def held_out(pad: PadFit, trial: TouchTrial, stage: int = 0) -> tuple[float, np.
 
 
 def _quantiles(x: np.ndarray, weight: np.ndarray, at: tuple[float, ...]) -> list[float]:
-    """Quantiles of x [n], each counting by its weight: the least value below or at which that share of the weights
-    lies."""
+    """Return quantiles of x [n], each counting by its weight: the least value below or at which that share of the
+    weights lies."""
     order = np.argsort(x)
     share = np.cumsum(weight[order]) / weight.sum()
     return [float(x[order][min(int(np.searchsorted(share, q)), len(x) - 1)]) for q in at]
 
 
 def _stage(search: PadFit, effect: str) -> int:
-    """Which signal judges an effect: 0 the taxels, 1 the load cell (where there is one), 2 shear."""
+    """Return which signal judges an effect: 0 the taxels, 1 the load cell (where there is one), 2 shear."""
     return {"cell": 1 if search.load else 0, "shear": 2}.get(TOUCH_EFFECTS[effect].stage, 0)
 
 
 def _floor(search: PadFit, stages: list[int]) -> float:
-    """N: the noise of one reading; of a sum of taxels or a load cell, with what is not trusted of the plant."""
+    """Return n: the noise of one reading; of a sum of taxels or a load cell, with what is not trusted of the plant."""
     if stages == [0]:
         return search.noise
     stage = search.stage_of()
@@ -238,7 +238,7 @@ def _floor(search: PadFit, stages: list[int]) -> float:
 
 
 def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
-    """Squared errors of the dead and stuck taxels on what was held out: as believed, and as constants."""
+    """Return squared errors of the dead and stuck taxels on what was held out: as believed, and as constants."""
     a, b = [], []
     for s in search.samples:
         if s.stage != "taxels" or s.train.all():
@@ -255,8 +255,8 @@ def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
-    """Stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares one, and
-    force over depth under and over which a tenth of the force is felt; None where nothing is pressed."""
+    """Return stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares
+    one, and force over depth under and over which a tenth of the force is felt; None where nothing is pressed."""
     on = (force > 0.2) & (depth > 1e-4)  # below, force over depth is noise over noise
     if on.sum() < 5:
         return None
@@ -272,7 +272,7 @@ def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
 
 
 def by_taxel(pad: PadFit, t: TouchTrial) -> np.ndarray:
-    """[K] N, rms error of each taxel over all recordings."""
+    """Return [K] N, rms error of each taxel over all recordings."""
     return np.sqrt(np.mean(np.concatenate([(r.z - readings(r, t.values)) ** 2 for r in pad.runs]), 0))
 
 
@@ -287,7 +287,7 @@ def when(e: str, pad: PadFit, t: TouchTrial) -> list[dict]:
 
 
 def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
-    """What the error that is left on a pad goes with, in words."""
+    """Return what the error that is left on a pad goes with, in words."""
     error, load, depth, speed = [], [], [], []
     for r in pad.runs:
         e = np.abs(r.z - readings(r, t.values, t.gains, t.order)).max(1)
@@ -309,7 +309,8 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
 
 
 def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: bool) -> PadCurve:
-    """The last recording of a pad for the page: all of it, or its last quarter, which was held out of the fit."""
+    """Return the last recording of a pad for the page: all of it, or its last quarter, which was held out of the
+    fit."""
     run = pad.runs[-1]
     before, after = readings(run, none.values), readings(run, best.values, best.gains, best.order)
     for k, value in pad.silent.items():
@@ -325,8 +326,8 @@ def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: boo
 
 
 def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[Finding]:
-    """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the
-    pad feel many counts. Their gain is 0."""
+    """Return findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on
+    the pad feel many counts. Their gain is 0."""
     if sensors.layout is None:
         return []
     worst: dict[int, set[int]] = {}
@@ -352,8 +353,8 @@ def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[Findi
 
 
 def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
-    """Taxels [K] with no change although `TOUCH.neighbours` beside them changed by `TOUCH.spread` of the pad's largest:
-    more than what a touch beside them may pass on."""
+    """Return taxels [K] with no change although `TOUCH.neighbours` beside them changed by `TOUCH.spread` of the pad's
+    largest: more than what a touch beside them may pass on."""
     top = float(span.max())
     if top <= 0 or len(span) < len(beside):
         return set()
@@ -362,7 +363,7 @@ def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
 
 
 def readings_of(recordings: list[Recording], taxels: Sequence[str]) -> dict[int, float]:
-    """What constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
+    """Return what constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
     out = {}
     for pad, k in (map(int, t.split(":")) for t in taxels):
         values = [
@@ -376,14 +377,14 @@ def readings_of(recordings: list[Recording], taxels: Sequence[str]) -> dict[int,
 
 
 def constant_finding(names: list[str], regime: str, confidence: float) -> Finding:
-    """Gains of 0 of taxels ("pad:k")."""
+    """Return gains of 0 of taxels ("pad:k")."""
     sizes = {"gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"}, "taxels": word(", ".join(names))}
     return Finding(TactileGain.id, confidence, regime, taxels=names, topics=[TACTILE], parameters=sizes)
 
 
 def pressed(silent: dict[int, float], pad: int) -> Finding | None:
-    """The finding of a pad's taxels that read the same although the plant has them pressed. silent: their reading [N]
-    by number."""
+    """Return the finding of a pad's taxels that read the same although the plant has them pressed. silent: their
+    reading [N] by number."""
     if not silent:
         return None
     kinds = {"dead": [k for k, v in silent.items() if v == 0], "stuck": [k for k, v in silent.items() if v != 0]}
@@ -393,7 +394,7 @@ def pressed(silent: dict[int, float], pad: int) -> Finding | None:
 
 
 def with_constant(gain: Finding, dead: Finding) -> Finding:
-    """The finding of a pad's gains with its broken taxels."""
+    """Return the finding of a pad's gains with its broken taxels."""
     p, count, more = gain.parameters["gain"], len(gain.taxels), len(dead.taxels)
     wide = lambda x: list(np.atleast_1d(x)) if len(np.atleast_1d(x)) == count else [float(x)] * count  # noqa: E731
     ends = {k: [float(x) for x in wide(p[k])] + [z] * more for k, z in (("value", 0.0), ("low", 0.0), ("high", 0.05))}

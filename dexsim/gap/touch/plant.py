@@ -64,7 +64,7 @@ PARAMS: dict[str, TouchParam] = {
 
 
 def neutral() -> dict[str, float]:
-    """What is believed: every effect absent."""
+    """Return what is believed: every effect absent."""
     return {k: p.neutral for k, p in PARAMS.items()}
 
 
@@ -73,7 +73,8 @@ REMEMBERED = 16  # contacts a recording: most numbers of a fit do not change it
 
 
 def contact(run: PadRun, v: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """(normal force [G] N by the contact law, share of each taxel [G, K]); shares are 0 where nothing touches."""
+    """Return (normal force [G] N by the contact law, share of each taxel [G, K]); shares are 0 where nothing
+    touches."""
     key = tuple(v[k] for k in CONTACT_KEYS) + (run.load is None,)
     if key not in run.memory:
         if len(run.memory) >= REMEMBERED:
@@ -109,7 +110,7 @@ def _contact(run: PadRun, v: dict[str, float], near: np.ndarray) -> tuple[np.nda
 
 
 def relaxed(x: np.ndarray, dt: float, fraction: float, time_constant: float) -> np.ndarray:
-    """Standard linear solid along the first axis: x + fraction (x - state), the state following x
+    """Return standard linear solid along the first axis: x + fraction (x - state), the state following x
     (`tactile.measure`)."""
     if fraction == 0.0:
         return x
@@ -121,8 +122,8 @@ def relaxed(x: np.ndarray, dt: float, fraction: float, time_constant: float) -> 
 def readings(
     run: PadRun, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None
 ) -> np.ndarray:
-    """[S, K] N that the taxels read at the recording's touch times. gains [K]: of each taxel; order [K]: which taxel's
-    place each reading comes from."""
+    """Return [S, K] N that the taxels read at the recording's touch times. gains [K]: of each taxel; order [K]: which
+    taxel's place each reading comes from."""
     force, share = contact(run, v)
     x = share * (force if run.load is None else run.load)[:, None]
     dt = run.grid[1] - run.grid[0]
@@ -142,9 +143,9 @@ def readings(
 
 
 def shear(run: PadRun, v: dict[str, float]) -> np.ndarray:
-    """[S, 2] N of the skin's tangential force along the recorded sliding: a bristle at every taxel that slips where it
-    exceeds friction times the normal force that the taxel read. Taxels with little to read slip first, so a pad does
-    not slip at once."""
+    """Return [S, 2] N of the skin's tangential force along the recorded sliding: a bristle at every taxel that slips
+    where it exceeds friction times the normal force that the taxel read. Taxels with little to read slip first, so a
+    pad does not slip at once."""
     live = run.pressed.any(0)
     force = np.where(run.pressed, run.z, 0.0)[:, live]
     k = (SHEAR_STIFFNESS * v["skin"] * run.area[live])[:, None]
@@ -164,5 +165,5 @@ def shear(run: PadRun, v: dict[str, float]) -> np.ndarray:
 
 
 def cell(run: PadRun, v: dict[str, float]) -> np.ndarray:
-    """[G] N that the load cell should read."""
+    """Return [G] N that the load cell should read."""
     return contact(run, v)[0]

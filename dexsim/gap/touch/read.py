@@ -123,14 +123,14 @@ class _Thing:
 
 
 def newtons(r: Recording) -> tuple[np.ndarray, bool]:
-    """Readings [S, F, K, 3] in N and our axes, and whether the scale was stated."""
+    """Return readings [S, F, K, 3] in N and our axes, and whether the scale was stated."""
     lsb = r.tactile_lsb
     assert r.tactile is not None  # asked for where touch was recorded
     return r.tactile.value * ((ASSUMED_LSB if lsb is None else lsb) * r.tactile_axis_sign), lsb is not None
 
 
 def collect(recordings: list[Recording], m: Mechanism, sensors: Sensors) -> TouchData:
-    """Every pad that is pressed in the recordings, with the geometry of its contact where it is known."""
+    """Return every pad that is pressed in the recordings, with the geometry of its contact where it is known."""
     out = TouchData()
     model = m.spec.compile()
     layout = sensors.layout
@@ -193,7 +193,7 @@ def collect(recordings: list[Recording], m: Mechanism, sensors: Sensors) -> Touc
 
 
 def _things(r: Recording, model: mujoco.MjModel, sensors: Sensors) -> list[_Thing]:
-    """What may press a pad, in this recording."""
+    """Return what may press a pad, in this recording."""
     if r.object_pose is not None and len(r.object_pose) > 5 and r.config:
         try:
             o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
@@ -306,22 +306,22 @@ def _pad_run(
 
 
 def _tangents(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions along a surface, across each other; axis [3]: its normal."""
+    """Return two directions along a surface, across each other; axis [3]: its normal."""
     e1 = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
     e1 /= np.linalg.norm(e1)
     return e1, np.cross(axis, e1)
 
 
 def _path(R: np.ndarray, p: np.ndarray, middle: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> np.ndarray:
-    """[G, 2] m along e1 and e2: the path of the object over the pad, by where the pad's pressed point lies in the
-    object's frame, seen from the pad. R [G, 3, 3], p [G, 3]: from the pad's frame to the object's; middle [3]."""
+    """Return [G, 2] m along e1 and e2: the path of the object over the pad, by where the pad's pressed point lies in
+    the object's frame, seen from the pad. R [G, 3, 3], p [G, 3]: from the pad's frame to the object's; middle [3]."""
     q = np.einsum("gij,j->gi", R, middle) + p
     step = np.einsum("gji,gj->gi", R[:-1], np.diff(q, axis=0))  # pad over object, in the pad's axes
     return -np.concatenate([np.zeros((1, 2)), np.cumsum(step @ np.stack([e1, e2], 1), 0)])
 
 
 def _believed_contact(r: Recording, thing: _Thing) -> tuple[float, float]:
-    """(stiffness N/m, friction) that is believed of what is touched."""
+    """Return (stiffness N/m, friction) that is believed of what is touched."""
     if thing.body is not None:
         return STIFFNESS, FRICTION
     assert r.config is not None  # `_things` has it from there
@@ -330,8 +330,8 @@ def _believed_contact(r: Recording, thing: _Thing) -> tuple[float, float]:
 
 
 def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
-    """m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5 mrad
-    times its arm."""
+    """Return m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5
+    mrad times its arm."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body, out = model.body(pad).id, 1.5e-4
@@ -389,7 +389,7 @@ def _poses(
 def _posture(
     r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray
 ) -> tuple[list[int], np.ndarray]:
-    """(addresses in qpos, values [G, n]) of the joints that were read."""
+    """Return (addresses in qpos, values [G, n]) of the joints that were read."""
     p = r.states.position
     address, values = [], []
     for joint in (j for j in m.joints if j in r.joints):
@@ -408,8 +408,8 @@ def _posture(
 def _hull_depth(
     r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray, thing: _Thing, pad: str
 ) -> np.ndarray | None:
-    """[G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses (their
-    margin rounds them); None where the pad has none that are convex."""
+    """Return [G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses
+    (their margin rounds them); None where the pad has none that are convex."""
     body = model.body(pad).id
     tips = [
         g
@@ -438,7 +438,7 @@ def _hull_depth(
 def _nearest(
     things: list[_Thing], rot: np.ndarray, pos: np.ndarray, point: np.ndarray
 ) -> tuple[_Thing, np.ndarray, np.ndarray] | None:
-    """The thing that comes nearest to the pad, and its poses; None where none comes near."""
+    """Return the thing that comes nearest to the pad, and its poses; None where none comes near."""
     least, nearest = NEAR, -1
     for k, thing in enumerate(things):
         gap = float(_distance(thing, point[::7], rot[k][::5], pos[k][::5]).min())
@@ -450,7 +450,7 @@ def _nearest(
 
 
 def _distance(thing: _Thing, point: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Signed distances [G, n] of points [n, 3] (pad's frame), a few thousand samples at a time."""
+    """Return signed distances [G, n] of points [n, 3] (pad's frame), a few thousand samples at a time."""
     out = np.empty((len(R), len(point)))
     chunk = max(1, int(4e5 // max(len(point), 1)))
     for a in range(0, len(R), chunk):

@@ -103,14 +103,14 @@ class PadFit:
         )
 
     def _noise(self) -> float:
-        """N, of one reading: from the counts, or the scatter about a local parabola where there are none."""
+        """Return n, of one reading: from the counts, or the scatter about a local parabola where there are none."""
         lsb = max(r.lsb for r in self.runs)
         k = int(np.argmax(sum(r.z.sum(0) for r in self.runs)))
         scatter = float(np.median([noise(r.t, r.z[:, k])[0] for r in self.runs]))
         return max(lsb / np.sqrt(12), min(scatter, 5 * lsb) if lsb else scatter, 1e-4)
 
     def _silent(self) -> dict[int, float]:
-        """Taxels whose reading never changes although they are pressed: taxel -> the reading [N] (0: dead, else
+        """Return taxels whose reading never changes although they are pressed: taxel -> the reading [N] (0: dead, else
         stuck)."""
         z = np.concatenate([r.z for r in self.runs])
         p = np.concatenate([readings(r, self.base) for r in self.runs])
@@ -165,7 +165,7 @@ class PadFit:
     def residual(
         self, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None
     ) -> np.ndarray:
-        """Measured minus predicted, in sigmas, of everything that counts."""
+        """Return measured minus predicted, in sigmas, of everything that counts."""
         out = []
         for s in self.samples:
             r = s.run
@@ -217,8 +217,8 @@ class PadFit:
         evaluations: int = 60,
         still: tuple[str, ...] = (),
     ) -> TouchTrial:
-        """Least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default: training),
-        from `start`."""
+        """Return least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default:
+        training), from `start`."""
         keys = tuple(k for k in self._keys(ids, gains is not None) if k not in still)
         where = self.train if where is None else where
         low, high = np.array([self._bounds(k) for k in keys]).T
@@ -256,7 +256,7 @@ class PadFit:
         return TouchTrial(ids, v, gains, order, keys, found.jac[:n] / scale, self.residual(v, gains, order))
 
     def gain_map(self, trial: TouchTrial, where: np.ndarray) -> np.ndarray:
-        """Gains [K] of single taxels, closed form with a prior, on what the trial predicts without them."""
+        """Return gains [K] of single taxels, closed form with a prior, on what the trial predicts without them."""
         K = self.runs[0].z.shape[1]
         up, down = np.zeros(K), np.zeros(K)
         a = 0
@@ -275,14 +275,14 @@ class PadFit:
         return (independent * up + 1 / TOUCH.gain_prior**2) / (independent * down + 1 / TOUCH.gain_prior**2)
 
     def loss(self, res: np.ndarray) -> np.ndarray:
-        """[B] squared (Huber) residuals by block, stages weighed so that each counts alike per residual."""
+        """Return [B] squared (Huber) residuals by block, stages weighed so that each counts alike per residual."""
         a = np.abs(res)
         h = np.where(a <= 3, a * a, 6 * a - 9)
         _, b = np.unique(self.block[self.train], return_inverse=True)
         return np.bincount(b, h[self.train])
 
     def cross(self, trial: TouchTrial) -> np.ndarray:
-        """[B] losses of the training blocks when their fold is left out of the fit."""
+        """Return [B] losses of the training blocks when their fold is left out of the fit."""
         if trial.left_out is not None:
             return trial.left_out
         res = np.zeros(len(self.train))
@@ -305,8 +305,9 @@ class PadFit:
         return float(np.where(a <= 3, a * a, 6 * a - 9).sum())
 
     def _rounding(self, trial: TouchTrial) -> np.ndarray:
-        """[P] rms by which the numbers come back wrong from their own readings in whole counts, at three slightly
-        different levels: a held force rounds to the same side for as long as it is held, which no scatter shows."""
+        """Return [P] rms by which the numbers come back wrong from their own readings in whole counts, at three
+        slightly different levels: a held force rounds to the same side for as long as it is held, which no scatter
+        shows."""
         if not trial.keys or not any(r.lsb for r in self.runs):
             return np.zeros(len(trial.keys))
         kept = [r.z for r in self.runs]
@@ -329,8 +330,8 @@ class PadFit:
         return np.sqrt(np.mean(np.square(off), 0))
 
     def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
-        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what
-        whole counts do to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
+        """Return 90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds,
+        what whole counts do to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
         squares."""
         keys = trial.keys
         fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
@@ -363,7 +364,7 @@ class PadFit:
         return {k: v for k, v in out.items() if k in keys}
 
     def gain_width(self, t: TouchTrial) -> np.ndarray:
-        """Half of the 90 % interval of each taxel's gain [K]: the disagreement of the folds, and 2 %."""
+        """Return half of the 90 % interval of each taxel's gain [K]: the disagreement of the folds, and 2 %."""
         maps = [self.gain_map(t, self.train & (self.fold != f)) for f in self.folds]
         if len(maps) < 2:
             return np.full(self.runs[0].z.shape[1], 0.1)
@@ -373,7 +374,7 @@ class PadFit:
 
 
 def _rate(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """|dx/dt| along the first axis, the largest of a sample and its neighbours."""
+    """Return |dx/dt| along the first axis, the largest of a sample and its neighbours."""
     rate = np.abs(np.gradient(x, t, axis=0))
     out = rate.copy()
     out[1:] = np.maximum(out[1:], rate[:-1])
@@ -424,7 +425,7 @@ class PadSearch(PadFit):
                 break
 
             def priced(t: TouchTrial, had: bool = current.gains is not None) -> float:
-                """A gain for every taxel must do clearly better than one number."""
+                """Return a gain for every taxel must do clearly better than one number."""
                 return self.cross(t).sum() * (1.0 if t.gains is None or had else JUDGE.within**2)
 
             least = min(map(priced, good))
@@ -450,8 +451,8 @@ class PadSearch(PadFit):
         return effect.possible(self)
 
     def scan(self, current: TouchTrial, most: int = 4) -> list[TouchEffect]:
-        """The effects that would remove most of what `current` leaves, by a linear score at their starts with the
-        refitted numbers projected out; gains of single taxels are always tried."""
+        """Return the effects that would remove most of what `current` leaves, by a linear score at their starts with
+        the refitted numbers projected out; gains of single taxels are always tried."""
         if current.jac is None:
             current = self.fit(current.ids, current.values, None, current.gains, current.order, 12)
         r0 = np.clip(current.res[self.train], -10, 10)
@@ -479,7 +480,7 @@ class PadSearch(PadFit):
         return [e for g, e in found[:most] if g > SEARCH.apart]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
-        """The hypothesis with one effect more; None where it cannot be there."""
+        """Return the hypothesis with one effect more; None where it cannot be there."""
         e = effect.id
         if not self._possible(current, effect):
             return None
@@ -522,7 +523,7 @@ class PadSearch(PadFit):
         return best
 
     def _common(self, effect: TouchEffect, current: TouchTrial, evaluations: int) -> TouchTrial:
-        """The hypothesis with one gain for all of the pad, of an effect that may be another on each taxel."""
+        """Return the hypothesis with one gain for all of the pad, of an effect that may be another on each taxel."""
         ratio = float(
             np.median(
                 [
@@ -602,7 +603,8 @@ class PadSearch(PadFit):
     def _rivals(
         self, current: TouchTrial, e: str, trials: dict[frozenset[str], TouchTrial]
     ) -> tuple[list[tuple[str, float]], float]:
-        """What else in the place of one effect would do (its share of bootstraps), and the effect's own share."""
+        """Return what else in the place of one effect would do (its share of bootstraps), and the effect's own
+        share."""
         base = self.without(current, e)
         others = []
         tried = self.scan(base, 3)
