@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,18 @@ import test_gap
 import torch
 import yaml
 
-from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.columns import COLUMNS, INDEX
 from dexsim.actuator.reference import Step, setpoint
+from dexsim.actuator.setpoint import setpoints
+from dexsim.actuator.table import ServoTable
 from dexsim.cli import start
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.judge.full_model import free_runs, worlds_of
+from dexsim.gap.plant.case import build
+from dexsim.gap.read import Run
 from dexsim.paths import CONFIGS
-from dexsim.recording import read, write
-from dexsim.recording.mechanism import drive, mechanism, recorded, replay
+from dexsim.recording import write
+from dexsim.recording.mechanism import STEP, drive, mechanism, recorded, replay
 from dexsim.recording.realistic import Hardware, realistic
 from dexsim.recording.schema import COMMANDS, Series
 from dexsim.tasks import make_env
@@ -67,6 +73,53 @@ def test_a_target_that_turns_back_is_followed_within_the_limits():
 
 
 BOTH = {"profile_speed": 2.2, "profile_acceleration": 14.0}
+
+
+def test_a_setpoint_is_known_at_any_time_and_goes_on_from_there():
+    """The law alone over the commands is the reference's, step by step, and the reference goes on from what it says."""
+    dt, way, limits = 0.002, 0.4 * np.sign(np.sin(5 * np.arange(0, 3, 0.002))) + 0.5, (2.0, 12.0)
+    whole, p = path(way, dt, *limits), {c.name: c.neutral for c in COLUMNS}
+    p |= {"profile_speed": limits[0], "profile_acceleration": limits[1]}
+    rows = np.array([list(p.values()), [c.neutral for c in COLUMNS]])
+    times = np.array([0.9, 0.0, 2.2])
+    x, free = setpoints(rows, np.zeros((2, 2)), dt * np.arange(len(way)), way[:, None], 0.0, times, dt)
+    assert np.isnan(free).all() and np.isnan(x[1]).all()  # no profile, or nothing was sent before
+    for (at, speed), time in zip(x[[0, 2]], times[[0, 2]], strict=True):
+        k = round(time / dt)
+        assert at == pytest.approx(whole[k - 1], abs=2e-3) and abs(at - way[k]) > 0.02
+        step = Step(dt, True, {"setpoint": at, "setpoint_speed": speed, "setpoint_new": -1.0})
+        on = []
+        for target in way[k:]:
+            on.append(float(setpoint(p, np.array(target), np.array(9.0), step)))
+            step.fresh = False
+        assert np.abs(np.array(on) - whole[k:]).max() < 2e-3
+
+
+@pytest.mark.parametrize("profile", [{"profile_speed": 1.2}, BOTH])
+def test_what_begins_in_the_middle_of_a_motion_goes_on_as_it_did(profile):
+    """A replay, a world of a batch and a search's window from any time on move as what began with the recording: their
+    setpoint is where the commands until then have brought it, by each guess's own profile."""
+    believed = ServoTable.from_dict({"joints": {"*": test_gap.SERVO | {"delay": 0.02} | profile}})
+    m, t = test_gap.mechanism_of(believed), np.arange(0, 4, 0.01)
+    way = np.repeat([0.2, 1.3, -0.6, 0.9, -0.9, 0.8, 0.1, 0.9], 50)
+    sent = Series(t, way[:, None], COMMANDS, t.copy())
+    whole = drive(m, sent, ["joint"], 4.0, way[:1], timestep=5e-4)
+    made = recorded(whole, m, sent, ["joint"])
+    for begin in (0.8, 1.8, 3.3):  # joint and setpoint are on their way
+        again = replay(made, m, start=begin)
+        q = np.interp(again.t, whole.t, whole.position[:, 0])
+        assert np.abs(again.position[:, 0] - q).max() < 1e-3, begin
+    run = Run("a", ("joint",), t, way[:, None], whole.t[::10], whole.position[::10], believed, np.array([0, 0, -9.81]))
+    run.smooth()
+    case = build(test_gap.model(), [run])[0]
+    part = case.plant.windows(None, span={0: (1.8, 2.7)})
+    worlds = worlds_of(m, [run], {"a": made}, [case], believed, part)
+    q = free_runs(m.spec, ["joint"], worlds)[0][:1600, 0]
+    assert np.abs(q - np.interp(1.8 + STEP * np.arange(1600), whole.t, whole.position[:, 0])).max() < 1e-3
+    windows, guess = case.plant.windows(0.4), np.repeat(case.plant.base()[None], 2, 0)
+    guess[1, :, INDEX["profile_speed"]] = 0.5
+    right, slow = case.plant.simulate(guess, windows)[0] - case.plant.q[windows.sample_row]
+    assert np.sqrt(np.mean(right**2)) < 2e-3 and np.sqrt(np.mean(slow**2)) > 0.1
 
 
 @pytest.mark.slow
@@ -142,8 +195,7 @@ def test_a_fitted_profile_is_what_the_drive_in_training_has(tmp_path):
 @pytest.mark.slow
 def test_a_profile_in_recordings_of_a_hand_reaches_its_training(tmp_path):
     """Recordings of a hand whose firmware moves one joint's setpoint at 1.4 rad/s: `diagnose` names that, and training
-    with the servo.yaml that it writes drives the joint at that speed. Where it is believed, a replay misses no more
-    than the noise."""
+    with the servo.yaml that it writes drives the joint at that speed. Where it is believed, nothing is missing."""
     true, t, paths = mechanism(None, str(servo_with({"profile_speed": 1.4}, tmp_path / "true.yaml"))), TIMES, []
     steps = np.repeat([0.2, 1.3, 0.5, 1.5, 0.1, 0.9], 100)
     for k, way in enumerate((steps, 0.8 + 0.6 * np.sin(4 * t), np.roll(steps, 250) * 0.9, 0.7 + 0.5 * np.sin(6 * t))):
@@ -153,12 +205,11 @@ def test_a_profile_in_recordings_of_a_hand_reaches_its_training(tmp_path):
         made.meta["servo"] = ""  # what is hidden is not told
         paths.append(tmp_path / f"m{k}.mcap")
         write(paths[-1], made)
-    first = read(paths[0], joints=true.joints)
-    state, again = first.states.position, replay(first, true)
-    q = np.interp(state.t, again.t, again.position[:, true.joints.index(JOINT)])
-    assert np.sqrt(np.mean((state.value[:, first.joints.index(JOINT)] - q) ** 2)) < 6e-4
-    d = diagnose(Settings(paths, tmp_path / "out", joints={JOINT}, next_recording=False), say=lambda _: None)
+    asked = Settings(paths, tmp_path / "out", joints={JOINT}, next_recording=False)
+    d = diagnose(asked, say=lambda _: None)
     save(d, tmp_path / "out")
+    believed = diagnose(dataclasses.replace(asked, servo=str(tmp_path / "true.yaml")), say=lambda _: None)
+    assert believed.data["verdict"] == "none", believed.sentence
     first = d.data["findings"][0]
     assert first["effect"] == "setpoint_profile" and first["where"]["joints"] == [JOINT], d.sentence
     assert first["parameters"]["speed"]["value"] == pytest.approx(1.4, rel=0.05)

@@ -688,7 +688,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
         that target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
 
         The setpoint (columns `profile_speed`, `profile_acceleration`): the loop acts on its error, not on the target's.
-        It begins where the joint is, at its speed.
+        It begins where the joint is, at its speed; where memory says -1 for `setpoint_new`, where that says.
 
         The deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2
         it counts from the edge on."""
@@ -700,7 +700,8 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
         if wp.static("profile" in features):
             if of[PROFILE_SPEED] < type(e)(1.0e8) or of[PROFILE_ACCELERATION] < type(e)(1.0e8):
                 now = wp.vector(target - e, type(e)(0.0))
-                if not fresh:
+                first = fresh and memory[SETPOINT_NEW] >= type(e)(0.0)
+                if not first:
                     now = wp.vector(memory[SETPOINT], memory[SETPOINT_SPEED])
                     if memory[SETPOINT_NEW] > type(e)(0.5):
                         now = wp.vector(target - e, (target - e - memory[SETPOINT]) / dt)
@@ -708,7 +709,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
                     now = profiled(now[0], now[1], target, most, gains, dt)  # type: ignore[index]
                 memory[SETPOINT] = now[0]  # type: ignore[index]
                 memory[SETPOINT_SPEED] = now[1]  # type: ignore[index]
-                memory[SETPOINT_NEW] = wp.where(fresh, type(e)(1.0), type(e)(0.0))
+                memory[SETPOINT_NEW] = wp.where(first, type(e)(1.0), type(e)(0.0))
                 lost += target - now[0]  # type: ignore[index]
                 left = e - lost
         if wp.static("rare" in features):

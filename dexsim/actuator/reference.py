@@ -123,7 +123,8 @@ def supply_left(
 
 def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) -> Numbers:
     """Return setpoint [...] rad that a firmware moves towards its target [...] rad at a limited speed and acceleration:
-    from the joint's position q [...] rad, at its speed, of the first two steps; q, or the target, without either limit.
+    from the joint's position q [...] rad, at its speed, of the first two steps, or from what is remembered where
+    `setpoint_new` is -1; q, or the target, without either limit.
 
     p: columns by name. A limited setpoint stops in time: v <= a dt (sqrt(1/4 + 2 d / (a dt^2)) - 1/2) at the distance
     d, from d = a dt^2 k (k + 1) / 2 and v = a dt k."""
@@ -131,7 +132,8 @@ def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) 
     limited = (most < 1e8) | (steep < 1e8)
     if not np.any(limited):
         return target
-    fresh, new = np.asarray(step.fresh), np.asarray(step.memory["setpoint_new"]) > 0.5
+    known = np.asarray(step.memory["setpoint_new"])
+    fresh, new = np.asarray(step.fresh) & (known >= 0), known > 0.5
     dt = max(step.dt, 1e-12)
     at = np.where(new, q, step.memory["setpoint"])
     speed = np.where(new, (q - np.asarray(step.memory["setpoint"])) / dt, step.memory["setpoint_speed"])

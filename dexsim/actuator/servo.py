@@ -244,6 +244,15 @@ class Servo:
         args = (self.queue, self._mask, self._target, self._state, self._torque)
         self._launch("reset", self._reset, self._shape, args)
 
+    def begin_setpoint(self, known: torch.Tensor) -> None:
+        """Begin the setpoint of each drive, reset just now, at a position [rad] and speed [rad/s] known [N, J, 2]; NaN:
+        where the joint is."""
+        if "profile" in self.features:
+            at = self._as_tensor(known)
+            ok = torch.isfinite(at).all(-1)
+            for name, x in (("setpoint", at[..., 0]), ("setpoint_speed", at[..., 1]), ("setpoint_new", -1.0 * ok)):
+                self.state[:, :, self.slots[name]] = torch.where(ok, x, 0.0)
+
     # -- the step ------------------------------------------------------------
 
     def before_each(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from dexsim import model_file, yaml_text
-from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.columns import COLUMNS, INDEX
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
@@ -81,8 +81,6 @@ class Mechanism:
 
     def column(self, name: str) -> np.ndarray:
         """Return a servo column's nominal value [J]."""
-        from dexsim.actuator.columns import INDEX
-
         return self.table.nominal(self.joints)[:, INDEX[name]]
 
     @property
@@ -282,6 +280,7 @@ def drive(
     target: np.ndarray | None = None,
     columns_of: Mapping[str, Series] | None = None,
     led: Led | None = None,
+    setpoint: np.ndarray | None = None,
 ) -> Run:
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
@@ -289,7 +288,8 @@ def drive(
     start of the mechanism's joints (NaN or None: the model's own); velocity [J]: their speed then (None: at rest);
     target [J]: in force then (NaN or None: the start). enabled: like commands, 0 frees a joint. pairs: contact pairs to
     measure. follow: (name of a free joint, poses [T, 7]): a body that is led along a recorded path. columns_of: servo
-    columns that change, by name [T, J]. led: joints that follow a path. Deterministic. Engine: C MuJoCo.
+    columns that change, by name [T, J]. led: joints that follow a path. setpoint: of `setpoints_at`. Deterministic.
+    Engine: C MuJoCo.
     """
     import torch
 
@@ -329,6 +329,8 @@ def drive(
     now = np.where(np.isfinite(initial), initial, start) if initial is not None else start.copy()
     now = np.where(np.isfinite(target), target, now) if target is not None else now
     servo.reset(None, torch.as_tensor(now)[None])
+    if setpoint is not None:
+        servo.begin_setpoint(torch.as_tensor(setpoint)[None])
     place = np.array([m.joints.index(c) for c in columns])
     J = len(m.joints)
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
@@ -470,6 +472,7 @@ def replay(
         enabled = Series(np.asarray(enabled.t[now:], float) - start, enabled.value[now:])
     pose = recording.object_pose
     path = None if follow is None or pose is None else (follow, replace(pose, t=np.asarray(pose.t) - start))
+    begins = setpoints_at(recording, m, m.table.nominal(m.joints), commands, recording.joints, start, timestep)
     run = drive(
         m,
         given,
@@ -484,8 +487,40 @@ def replay(
         target=target,
         columns_of=_recorded_columns(recording, m, place, start),
         led=Led({j: paths[j] for j in held}) if held else None,
+        setpoint=begins,
     )
     return replace(run, t=run.t + start)
+
+
+def setpoints_at(
+    recording: Recording,
+    m: Mechanism,
+    rows: np.ndarray,
+    commands: Series,
+    columns: Sequence[str],
+    start: float,
+    dt: float,
+) -> np.ndarray | None:
+    """Return setpoint and its speed [J, 2] of a mechanism's joints with servo columns `rows` [J, C] at `start` s in a
+    recording, after its commands [K, len(columns)] since its begin; None where no profile limits any, NaN as of
+    `setpoint.setpoints`."""
+    if np.isinf(rows[:, [INDEX[name] for name in ("profile_speed", "profile_acceleration")]]).all():
+        return None
+    from dexsim.actuator.setpoint import setpoints
+
+    place, t = [m.joints.index(j) for j in columns], np.asarray(commands.t, float)
+    if m.table.control_rate:
+        t = np.ceil(t * m.table.control_rate - 1e-3) / m.table.control_rate
+    first = float(recording.states.position.t[0])
+    first = first if first > SOON else 0.0
+    q, v, _ = begun(recording, m, first)
+    sent = np.concatenate([q[None, place], commands.value])
+    last = np.maximum.accumulate(np.where(np.isfinite(sent), np.arange(len(sent))[:, None], 0))
+    sent = np.take_along_axis(sent, last, 0)
+    out = np.full((len(m.joints), 2), np.nan)
+    begin = np.stack([q, v], 1)[place]
+    out[place] = setpoints(rows[place], begin, np.r_[min(first, t[0]), t], sent, first, np.array([start]), dt)[:, 0]
+    return out
 
 
 def begun(

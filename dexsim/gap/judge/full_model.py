@@ -40,8 +40,9 @@ from dexsim.recording.mechanism import (
     held_joints,
     of_recording,
     replay,
+    setpoints_at,
 )
-from dexsim.recording.schema import Recording
+from dexsim.recording.schema import Recording, Series
 from dexsim.sim import make_engine
 
 if TYPE_CHECKING:
@@ -84,8 +85,8 @@ class World:
     rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first
     position and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K,
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
-    from where a joint that drags another is counted (None: q); led: joints that follow their recording, in every world
-    of a batch the same."""
+    from where a joint that drags another is counted (None: q); setpoint: None or of `setpoints_at`; led: joints that
+    follow their recording, in every world of a batch the same."""
 
     rows: np.ndarray
     table: ServoTable
@@ -99,6 +100,7 @@ class World:
     enabled: tuple[np.ndarray, np.ndarray] | None = None
     warmth: tuple[np.ndarray, np.ndarray] | None = None
     home: np.ndarray | None = None
+    setpoint: np.ndarray | None = None
     led: Led | None = None
 
 
@@ -292,6 +294,7 @@ def worlds_of(
                 enabled,
                 warmth,
                 home,
+                setpoints_at(recordings[run.name], mine, rows, Series(run.cmd_t, run.cmd), run.joints, start, STEP),
                 led if held else None,
             )
         )
@@ -369,6 +372,8 @@ def _batch(
     engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
     now = np.stack([w.target for w in worlds])
     servo.reset(None, up(now))
+    free = np.full((len(joints), 2), np.nan)
+    servo.begin_setpoint(up(np.stack([free if w.setpoint is None else w.setpoint for w in worlds])))
     # a drive that has been on before: its integral holds the load, as in the plant
     if rows[:, :, SERVO_INDEX["integral_gain"]].any():
         held = _gravity(engine.mjm, qpos, dofs) / np.maximum(rows[:, :, SERVO_INDEX["efficiency"]], 0.01)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from dexsim.actuator.setpoint import FREE, PROFILE, setpoints
 from dexsim.gap import compute
 from dexsim.gap.plant import kernel as pk
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
@@ -22,6 +23,7 @@ from dexsim.gap.plant.mechanics import JointConstants
 # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch of a fit has fewer blocks
 # than there are; one of a scan has more, and takes a quarter longer in blocks of 32
 BLOCK = 64
+PROFILED = [INDEX[name] for name in PROFILE]
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 # guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
@@ -379,15 +381,16 @@ class JointPlant:
         groups: dict[bytes, list[int]] = {}
         for r in np.unique(windows.run):
             groups.setdefault(params[:, r].tobytes(), []).append(int(r))
+        begins = [self._setpoints(params[:, group[0]], windows, group) for group in groups.values()]
         consts = self._consts.copy()
         consts[pk.C_OPEN] = open_stage
         if self._on_cpu(H * len(windows.window)):
-            for group in groups.values():
+            for group, begin in zip(groups.values(), begins, strict=True):
                 pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 alone = len(groups) == 1  # nothing to put together
                 oq, ot = (q, torque) if alone else (np.empty((H, len(windows.sample_row[keep]))) for _ in range(2))
                 shared = (_up(oq, copy=False), _up(ot, copy=False))
-                guesses = (_up(params[:, group[0]]), _up(_of(inits, pick)), _up(consts))
+                guesses = (_up(params[:, group[0]]), _up(_of(inits, pick)), _up(begin), _up(consts))
                 self._split(H, steps, recorded(*guesses, *rest, *shared))
                 if not alone:
                     q[:, keep], torque[:, keep] = oq, ot
@@ -398,15 +401,14 @@ class JointPlant:
                 host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
                 inputs = [self._inputs(windows, tuple(group), self.device) for group in groups.values()]
                 rows = [params[:, group[0]] for group in groups.values()]
-                constants, *sent = mine.up([consts, *rows, *(_of(inits, pick) for pick, *_ in inputs)])
+                constants, *sent = mine.up([consts, *rows, *(_of(inits, pick) for pick, *_ in inputs), *begins])
                 at, parts = 0, []
-                for guess, moves, (_, keep, steps, rest) in zip(
-                    sent[: len(rows)], sent[len(rows) :], inputs, strict=True
-                ):
+                of_guesses = (sent[k * len(rows) : (k + 1) * len(rows)] for k in range(3))
+                for guess, moves, begin, (_, keep, steps, rest) in zip(*of_guesses, inputs, strict=True):
                     count = len(windows.sample_row[keep])
                     size = H * count
                     mine_q, mine_t = (mine.part(out, at + k * size, (H, count)) for k in (0, 1))
-                    given = recorded(guess, moves, constants, *rest, mine_q, mine_t)
+                    given = recorded(guess, moves, begin, constants, *rest, mine_q, mine_t)
                     wp.launch(
                         pk.plant_kernel(),
                         dim=(len(steps), H),
@@ -424,6 +426,21 @@ class JointPlant:
             q[:, keep] = numbers[at : at + size].reshape(H, -1)
             torque[:, keep] = numbers[at + size : at + 2 * size].reshape(H, -1)
         return q, torque
+
+    def _setpoints(self, rows: np.ndarray, windows: Windows, group: Sequence[int]) -> np.ndarray:
+        """Return setpoint and its speed [H, W', 2] where the windows [W'] of these runs begin, by each guess's profile, of
+        rows [H, C]; [H, 0, 2] where no guess limits any."""
+        if (rows[:, PROFILED] >= FREE).all():
+            return np.zeros((len(rows), 0, 2))
+        run, begin = (x[np.isin(windows.run, group)] for x in (windows.run, windows.window_t))
+        out = np.empty((len(rows), len(run), 2))
+        for r in np.unique(run):
+            here = run == r
+            first = self.series[self._grid[r], [SERIES_INDEX["q"], SERIES_INDEX["v"]]]
+            offset, scale = rows[:, [INDEX["readout_offset"]]] * (1.0, 0.0), rows[:, [INDEX["readout_scale"]]]
+            out[:, here] = setpoints(rows, (first - offset) / scale, self._cmd_t[r], self._cmd[r][:, None],
+                                     self._start[r], begin[here], self.dt)  # fmt: skip
+        return out
 
     def _on_cpu(self, threads: int) -> bool:
         return self.device == "cpu" or threads <= FEW * compute.cores()

@@ -20,6 +20,9 @@ from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
     LEAST_ROTOR,
+    SETPOINT,
+    SETPOINT_NEW,
+    SETPOINT_SPEED,
     arrived,
     command_delay,
     difference,
@@ -122,6 +125,7 @@ class Recorded:
 
     params: wp.array2d(dtype=f64)  # [H, C]
     inits: wp.array3d(dtype=f64)  # [H, 1 or W, 2] added to the initial position and velocity
+    setpoints: wp.array3d(dtype=f64)  # [H, 0 or W, 2] setpoint and its speed at the begin, NaN: where the joint is
     consts: wp.array(dtype=f64)
     series: wp.array2d(dtype=f64)  # [G, E]
     cmd_t: wp.array(dtype=f64)
@@ -137,6 +141,7 @@ class Recorded:
 FIELDS = (
     "params",
     "inits",
+    "setpoints",
     "consts",
     "series",
     "cmd_t",
@@ -845,6 +850,10 @@ def begun(c: Recorded, h: int, w: int, g: int, warm: int, p: Guess):
         x = moved(c, h, w, x)
     x.qm = x.q
     x.vm = x.v
+    if w < c.setpoints.shape[1] and not wp.isnan(c.setpoints[h, w, 0]):
+        x.memory[SETPOINT] = c.setpoints[h, w, 0]
+        x.memory[SETPOINT_SPEED] = c.setpoints[h, w, 1]
+        x.memory[SETPOINT_NEW] = f64(-1.0)
     return x
 
 
