@@ -516,10 +516,9 @@ def setpoints_at(
     q, v, _ = begun(recording, m, first)
     sent = np.concatenate([q[None, place], commands.value])
     last = np.maximum.accumulate(np.where(np.isfinite(sent), np.arange(len(sent))[:, None], 0))
-    sent = np.take_along_axis(sent, last, 0)
+    sent = np.take_along_axis(sent, last, 0)[1:]
     out = np.full((len(m.joints), 2), np.nan)
-    begin = np.stack([q, v], 1)[place]
-    out[place] = setpoints(rows[place], begin, np.r_[min(first, t[0]), t], sent, first, np.array([start]), dt)[:, 0]
+    out[place] = setpoints(rows[place], np.stack([q, v], 1)[place], t, sent, first, np.array([start]), dt)[:, 0]
     return out
 
 

@@ -428,8 +428,8 @@ class JointPlant:
         return q, torque
 
     def _setpoints(self, rows: np.ndarray, windows: Windows, group: Sequence[int]) -> np.ndarray:
-        """Return setpoint and its speed [H, W', 2] where the windows [W'] of these runs begin, by each guess's profile, of
-        rows [H, C]; [H, 0, 2] where no guess limits any."""
+        """Return setpoint and its speed [H, W', 2] where the windows [W'] of these runs begin, by each guess's profile
+        in rows [H, C]; [H, 0, 2] where no guess limits any."""
         if (rows[:, PROFILED] >= FREE).all():
             return np.zeros((len(rows), 0, 2))
         run, begin = (x[np.isin(windows.run, group)] for x in (windows.run, windows.window_t))
