@@ -290,7 +290,7 @@ def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
     empty = Series.empty("x", 1)
     made = Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))
     found = judge.constant_taxels([made], Sensors(load_hand()))
-    assert [f["where"]["taxels"] for f in found] == [["1:67"]]
+    assert [list(f.taxels) for f in found] == [["1:67"]]
 
 
 def test_rms_interval_covers():

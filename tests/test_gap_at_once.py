@@ -168,7 +168,7 @@ def test_a_joint_that_is_not_searched_again_is_judged_ahead(seconds, stopped, se
     if stopped:
         limit.stop()
     drives.w, drives.ahead = SimpleNamespace(limit=limit, runs=[]), {}
-    drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None, apart={})
+    drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None, apart={}, proven=True)
     case = SimpleNamespace(moved=True)
     search = SimpleNamespace(case=case, plain=lambda: ([], np.zeros(0)), whole=None)
     loss = 0.5 * SEARCH.unsettled if settled else 2 * SEARCH.unsettled

@@ -263,19 +263,25 @@ def test_joints_on_one_side_only_are_said(rig, tmp_path):
 
 def test_what_is_taken_for_repeated_readings():
     t = np.arange(0, 10, 0.01)
-    smooth = np.round(0.3 * np.sin(2 * t) / 1.5e-3) * 1.5e-3
+
+    def held(q, target):
+        before = target[np.maximum(np.arange(len(t)) - round(channels.REACTS / 0.01), 0)]
+        return channels._held(t, q, np.stack([target, before]))
+
+    wanted = 0.3 * np.sin(2 * t)
+    smooth = np.round(wanted / 1.5e-3) * 1.5e-3
     frozen = smooth.copy()
     for a in (157, 314, 471):  # in the middle of a motion
         frozen[a : a + 20] = frozen[a]
-    assert channels._held(t, frozen).sum() == 3 * 19
-    assert not channels._held(t, smooth).any()
+    assert held(frozen, wanted).sum() == 3 * 19
+    assert not held(smooth, wanted).any()
     creeping = np.round(0.02 * np.sin(t) / 1.5e-3) * 1.5e-3
-    assert not channels._held(t, creeping).any()  # slow motion in whole counts
+    assert not held(creeping, 0.02 * np.sin(t)).any()  # slow motion in whole counts
     goal = np.repeat(np.random.default_rng(0).uniform(-1, 1, 10), 100)
     servo = np.zeros_like(t)
     for i in range(1, len(t)):
         servo[i] = servo[i - 1] + 0.35 * (goal[i] - servo[i - 1])
-    assert not channels._held(t, np.round(servo / 1.5e-3) * 1.5e-3).any()  # a joint that rests and then starts at once
+    assert not held(np.round(servo / 1.5e-3) * 1.5e-3, goal).any()  # a joint that rests and then starts at once
 
 
 def test_links_that_touch_each_other_are_cut_out():

@@ -29,7 +29,7 @@ class Judged(JointAnswer):
             SimpleNamespace(fit=SimpleNamespace(params=[], x=[])),
         )
         self.case = SimpleNamespace(joint="j", sigma=1.0)
-        self.kept = SimpleNamespace(runs=[], train=[], test=[])
+        self.kept = SimpleNamespace(runs=[], train=[], test=[], proven=True)
         self.outcome = SimpleNamespace(rivals={})
         self.search = self.whole = self.windows = self.bounds = self.widest = None
         self.measured, self.t = np.zeros(ROWS), 0.01 * np.arange(ROWS)

@@ -38,7 +38,7 @@ def test_a_joint_that_stops_in_one_recording_is_judged_by_the_others():
     runs = [run_of(f"{k}.mcap", k) for k in range(3)]
     runs[1].q[200:, 1] = runs[1].q[200, 1]
     found, out, _ = channels.inspect(runs, model, {})
-    assert list(out) == [("1.mcap", "b")] and found[0]["regime"].startswith("stuck")
+    assert list(out) == [("1.mcap", "b")] and found[0].regime.startswith("stuck")
     notes: list[str] = []
     runs = channels.drop(runs, out, notes, model)
     assert (
@@ -170,7 +170,7 @@ FREE = mujoco.MjModel.from_xml_string(
 
 def signs(runs):
     found, out, _ = channels.inspect(runs, FREE, {})
-    return [f["confidence"] for f in found if f["regime"].startswith("sign")], sorted(n for n, _ in out)
+    return [f.confidence for f in found if f.regime.startswith("sign")], sorted(n for n, _ in out)
 
 
 def test_a_lag_beyond_a_quarter_period_is_no_other_sign():
@@ -191,7 +191,7 @@ def test_a_narrow_band_alone_is_doubted_and_stays():
 def test_one_recording_of_another_sign_is_named_beside_what_contradicts_it():
     runs = [swept("a", 0.03, 1, 0, 8), swept("b", 0.03, -1, 0, 8)]
     found, out, _ = channels.inspect(runs, FREE, {})
-    assert [n for n, _ in out] == ["b"] and "not so in a" in found[0]["regime"]
+    assert [n for n, _ in out] == ["b"] and "not so in a" in found[0].regime
 
 
 def stepped(late, others=0):
@@ -208,4 +208,4 @@ def stepped(late, others=0):
 @pytest.mark.parametrize(("late", "named"), [(0.0, False), (0.02, False), (0.08, True)])
 def test_edges_that_are_logged_late_are_another_clock(late, named):
     found, _, _ = channels.inspect([stepped(late)], FREE, {})
-    assert [f["regime"].startswith("clock_skew") for f in found] == ([True] if named else [])
+    assert [f.regime.startswith("clock_skew") for f in found] == ([True] if named else [])

@@ -112,8 +112,8 @@ def test_what_lies_far_outside_the_models_range_is_left_out(change, topics):
               r.states.position.value.copy(), SERVO, r.gravity, notes=[], counted=r.joints)  # fmt: skip
     change(run)
     found, out, _ = channels.inspect([run], mujoco.MjModel.from_xml_string(MODEL), {})
-    far = [f for f in found if "the model allows" in f["regime"]]
-    assert [f["where"]["topics"] for f in far] == ([topics] if topics else [])
+    far = [f for f in found if "the model allows" in f.regime]
+    assert [list(f.topics) for f in far] == ([topics] if topics else [])
     assert (("x.mcap", "a") in out) == bool(topics)
 
 

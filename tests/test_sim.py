@@ -667,7 +667,8 @@ mujoco.mj_step(model, data)
 @pytest.mark.parametrize("which", ["mujoco", "dexsim"])
 def test_mujoco_leaves_no_log_in_the_users_folder(tmp_path, which):
     """Alone it does: a world that diverges writes MUJOCO_LOG.TXT where the user is."""
-    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    here = Path(__file__).parent
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent), str(here)])}
     done = subprocess.run([sys.executable, "-c", LOGS, which], cwd=tmp_path, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "huge value in QPOS" in done.stderr
