@@ -30,6 +30,7 @@ def teacher(tmp_path_factory):
     return out / "policy.pt"
 
 
+@pytest.mark.slow
 def test_a_student_with_touch_alone_learns_from_a_privileged_teacher(teacher, tmp_path, capsys):
     out = tmp_path / "student"
     learn = ["train", "task=rotate", "agent=distill", *SMALL, "task.perception=proprioception",
@@ -93,6 +94,7 @@ def test_a_cube_is_the_same_from_each_side():
         assert not torch.allclose(now["actor"], before["actor"], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_symmetric_samples_are_learned_from(tmp_path, capsys):
     learn = [*SMALL, "agent.actor.hidden_dims=[16]", "agent.critic.hidden_dims=[16]", "agent=ppo_symmetric"]
     assert main(["train", "task=rotate", *learn, f"out={tmp_path / 'a'}"]) == 0
@@ -103,6 +105,7 @@ def test_symmetric_samples_are_learned_from(tmp_path, capsys):
     assert "task grasp declares no symmetry" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_left_hands_policy_is_the_right_ones_mirrored(tmp_path):
     """The mirrored world goes the mirrored way: rows are those of the right hand but for their signs, and the policy,
     its first layer's signs changed, acts the same."""

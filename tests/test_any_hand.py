@@ -197,6 +197,7 @@ def test_held_poses_are_looked_for_where_there_are_none(tmp_path, monkeypatch):
     assert len(asked) == 1 and asked[0][1] == pytest.approx((0.036, 0.048)) and (folder / "held_cubes.npz").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task, pads", [("rotate", True), ("grasp", False)])
 def test_the_whole_chain(hands, moment, tmp_path, task, pads, capsys):
     """Trained, played, exported, checked, and run in real time's loop on the simulated hand."""
@@ -235,6 +236,7 @@ def test_a_hand_that_a_policy_was_not_trained_for_is_refused(hands, tmp_path):
         play([f"checkpoint={out}/policy.pt", "hand=xhand", "episodes=1", "device=cpu", "video=false"])
 
 
+@pytest.mark.slow
 def test_a_play_of_another_hand_is_replayed_with_its_object(hands, moment, tmp_path):
     """Recorded in the task, replayed by the commands alone: the object is led, and each fingertip's force is there."""
     out, folder = tmp_path / "run", hands[True]

@@ -231,6 +231,7 @@ def test_the_audit_prints_stages_figures_and_what_to_record(tmp_path, capsys):
     assert "for the others record" in said and "torque limit of all joints: steps so large" in said
 
 
+@pytest.mark.slow
 def test_from_a_bare_log_to_a_diagnosis(tmp_path, monkeypatch, capsys):
     """Where neither a model nor a servo is there, the audit writes both to begin with, and its last line is a diagnosis
     that has all that it needs."""

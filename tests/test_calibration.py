@@ -123,6 +123,7 @@ def test_simulated_force_over_torque_is_one_over_the_lever_arm(pressed, joint, w
     assert f.linear and f.slope == pytest.approx(1 / arm, rel=within) and f.r2 > 0.985
 
 
+@pytest.mark.slow
 def test_realistic_presses_give_the_current_per_torque_back(pressed, tmp_path):
     """The pseudo-real half: integer milliamperes of the opposite sign, 8-bit taxels, jitter."""
     real, sim = tmp_path / "real", tmp_path / "sim"
@@ -330,6 +331,7 @@ def of_pad(r, f):
     return r.tactile.value[mine, f, :, 2], load[mine]
 
 
+@pytest.mark.slow
 def test_healthy_simulated_pads_have_no_findings(pads):
     """Beyond a contact's edge a healthy taxel feels nothing, and is not called dead for it."""
     for f in range(5):
@@ -436,6 +438,7 @@ def test_what_is_assumed_is_said():
 # --------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
     for joint, r in pressed.items():
         for name, x in (("real", realistic(r)), ("sim", r)):
@@ -491,6 +494,7 @@ def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
     assert c.current_per_torque[6] == pytest.approx(2.7, rel=0.03)
 
 
+@pytest.mark.slow
 def test_another_hand_is_calibrated_from_its_own_presses(tmp_path, capsys):
     """Three fingers, a thumb last, another lattice: force over torque is one over the lever arm, taxels are told."""
     folder = made_hand(tmp_path / "made")

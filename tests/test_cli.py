@@ -94,6 +94,7 @@ def test_a_run_from_start_to_play_command(configs, place, capfd):
     assert (where / "curves.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_final_episodes_with_video_or_a_reason(configs, place, capfd):
     assert shell.call("train", configs, *QUICK, "run=a", "final_episodes=4") == 0
     out = capfd.readouterr().out

@@ -340,6 +340,7 @@ def grasping():
     )
 
 
+@pytest.mark.slow
 def test_both_settings_make_the_same_contacts_of_a_hand(grasping):
     """All that a contact holds: parameters bitwise, places to what MuJoCo-Warp's own search is exact to."""
     hand, mujoco_warp = grasping

@@ -154,6 +154,7 @@ def test_bad_files_get_one_line(tmp_path, text, why):
     assert "\n" not in str(error.value) and "a.csv" in str(error.value)
 
 
+@pytest.mark.slow
 def test_pickles_and_bombs_in_an_npz_are_refused(tmp_path, monkeypatch):
     class Boom:
         def __reduce__(self):

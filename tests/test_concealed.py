@@ -119,6 +119,7 @@ def test_delay_is_felt_after_its_time():
     assert np.diff(at) == pytest.approx(np.diff(delay), abs=6e-4)
 
 
+@pytest.mark.slow
 def test_other_joints_matter_where_they_should():
     """Coupling moves a joint by its share of another's motion; a sagging supply takes torque only while the other one
     works."""
@@ -219,6 +220,7 @@ def some(tmp_path_factory):
     return root, made, plan
 
 
+@pytest.mark.slow
 def test_names_and_metadata_tell_nothing(some):
     """A classifier on everything but the motion has nothing to split on: the same keys and values, the same names."""
     root, made, _ = some
@@ -264,6 +266,7 @@ def test_metadata_classifier_is_at_chance(quick, tmp_path):
     assert hits <= 21, hits  # chance is 15; more than 21 of 30 has probability 0.8 %
 
 
+@pytest.mark.slow
 def test_what_is_believed_does_not_depend_on_the_effect(quick, tmp_path):
     """The same case number with another effect: rig, servo, metadata and commands are the same to the byte."""
     texts = set()
@@ -343,6 +346,7 @@ def test_another_hand_is_believed_as_its_own_model_has_it(tmp_path):
     assert [(e["shape"], e["tier"], len(e["kinds"])) for e in large] == [("hand", "easy", 1)] * 5
 
 
+@pytest.mark.slow
 def test_size_is_what_was_asked(tmp_path, monkeypatch):
     """An easy case is ten floors large by the generator's own measure, a hard one one and a half."""
     monkeypatch.setattr(generate, "SECONDS", 2.0)

@@ -136,6 +136,7 @@ def test_messages_are_late_one_more_one_less():
     ) == pytest.approx(0.024)
 
 
+@pytest.mark.slow
 def test_second_order_lags_have_the_mean_delay_of_the_first():
     goal = np.where(np.arange(600) >= 100, 0.3, 0.0)
     o = run(2, 600, goal, lag=0.04, lag_order=np.array([1.0, 2.0]), **HEAVY)["torque"][:, 0, 100:] / 0.3
@@ -217,6 +218,7 @@ def test_a_lever_couples_by_its_sine():
     assert last(o["torque"][:, 0]) == pytest.approx([-0.2 * 0.3, -0.2 * 0.3 * np.cos(1.0)], rel=0.02)
 
 
+@pytest.mark.slow
 def test_encoder_payload_and_deadband():
     q = run(2, 1500, 0.4, eccentric=0.05, eccentric_at=0.3, second_harmonic=np.array([0.0, 0.35]), **FREE)["position"][
         :, 0, -1
@@ -376,6 +378,7 @@ def case(kind: str, number: int, which: str, where, shape: str = "one") -> tuple
     )
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_rig_and_motion_whichever_law_is_drawn(quick, tmp_path):
     number = next(n for n in range(50) if laws.draw(["stribeck"], [{}], "two", 3, n)[0] is not None)
     first, seen_first, position_first = case("stribeck", number, "one", tmp_path / "one")

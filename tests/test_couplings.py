@@ -114,6 +114,7 @@ def _alone(spec):
 MIMIC = "".join(f'<joint joint1="second{k}" joint2="first{k}" polycoef="0 0.8 0 0 0"/>' for k in range(3))
 
 
+@pytest.mark.slow
 def test_joints_that_mimic_have_no_drive_and_follow_the_one_that_has(tmp_path):
     hand, said = _imported(tmp_path, jaws(after=f"<equality>{MIMIC}</equality>"))
     assert hand.joints == ("first0", "first1", "first2") and hand.couplings.passive == ("second0", "second1", "second2")
@@ -142,6 +143,7 @@ def _pulled():
     return text.replace("<actuator></actuator>", f"<actuator>{PULL}</actuator>")
 
 
+@pytest.mark.slow
 def test_a_tendon_is_pulled_by_a_drive_of_its_own_until_the_finger_meets_something(tmp_path):
     hand, _ = _imported(tmp_path, _pulled())
     assert hand.joints == ("pull0", "pull1", "pull2")
@@ -165,6 +167,7 @@ def test_a_tendon_is_pulled_by_a_drive_of_its_own_until_the_finger_meets_somethi
     assert (met[near] > -0.15).all() and (met[far] < -0.8).all()  # the outer joint goes on
 
 
+@pytest.mark.slow
 def test_a_tendon_has_play_friction_and_elasticity_of_its_own(tmp_path):
     hand, _ = _imported(tmp_path, _pulled())
     file = tmp_path / "hand" / "servo.yaml"
@@ -199,6 +202,7 @@ def test_a_second_finger_may_follow_the_first(tmp_path):
     assert np.linalg.norm(closed[0] - closed[1]) < np.linalg.norm(opened[0] - opened[1])
 
 
+@pytest.mark.slow
 def test_a_driven_joint_that_follows_another_is_refused(tmp_path):
     hand, _ = _imported(tmp_path, jaws(after=f"<equality>{MIMIC}</equality>"))
     path = hand.folder / "hand.yaml"
@@ -273,6 +277,7 @@ def test_a_joint_without_a_name_is_one_that_nobody_drives():
     assert Couplings(m, ["a"]).passive == ("",) and not Couplings(m, ["a"]).tied
 
 
+@pytest.mark.slow
 def test_a_press_of_a_coupled_finger_obeys_virtual_work(tmp_path):
     """The fingertip's force times its way is the drive's torque times its own, what follows moving along."""
     from dexsim.calibration.simulate import press_recording

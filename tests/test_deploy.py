@@ -316,6 +316,7 @@ def test_interrupts_and_bugs_relax(made, error):
     assert hand.relaxed_at and hand.relaxed_at[0] >= hand.sent[-1][0]
 
 
+@pytest.mark.slow
 def test_a_hanging_driver_is_relaxed_by_the_watchdogs_thread(made):
     held = []
 

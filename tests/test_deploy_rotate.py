@@ -184,6 +184,7 @@ def test_speed_is_the_firmwares_or_the_difference_of_readings(made):
     assert np.allclose(m._velocity(state(0.02, 0.32)), 1.0, atol=1e-5), "the same reading again tells nothing new"
 
 
+@pytest.mark.slow
 def test_the_whole_loop_on_the_simulated_hand(made, tmp_path):
     """The cube is held out, the fingers close on it, it is let go and stays; everything is recorded."""
     from dexsim.deploy.recorder import Recorder

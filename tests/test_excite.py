@@ -64,6 +64,7 @@ def wide():
     return excitation.plan(rig(), kinds=("ladder", "steps"), repeats=0)
 
 
+@pytest.mark.slow
 def test_a_plan_keeps_its_limits(plan):
     m = plan.mechanism
     low, high = m.limits.T
@@ -90,6 +91,7 @@ def test_every_kind_comes_and_one_repeats(plan):
     )
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_order(short):
     again = excitation.plan(rig(), seed=2, kinds=("steps", "chirp"), repeats=0)
     np.testing.assert_array_equal(short.value, again.value)
@@ -139,6 +141,7 @@ def test_no_motor_draws_more_than_the_current_that_is_allowed(wide):
         excitation.plan(rig(), limits=Limits(current=0.0))
 
 
+@pytest.mark.slow
 def test_bodies_that_would_meet_are_kept_apart():
     # the model's own filter would let them pass through each other: the check must not
     m = two_links(0.3)
@@ -163,6 +166,7 @@ def test_joints_of_one_finger_take_turns():
     ]
 
 
+@pytest.mark.slow
 def test_the_hand_is_moved_without_self_contact(tmp_path, capsys):
     argv = [
         f"out={tmp_path}",
@@ -225,6 +229,7 @@ def test_bad_settings(argv, text, tmp_path, monkeypatch):
         excite.main(argv)
 
 
+@pytest.mark.slow
 def test_a_left_hand_is_moved_and_its_recording_replayed(tmp_path, capsys):
     """hand_mirror: the left xHand's commands, simulated by the left one, and compared with it again."""
     from dexsim.cli import recorded
@@ -245,6 +250,7 @@ def test_a_joint_without_limits_is_refused():
         excitation.plan(Mechanism(pendulum_spec(), ("joint",), ServoTable.from_dict(SERVO), "rig"))
 
 
+@pytest.mark.slow
 def test_a_servo_that_cannot_move_safely_is_refused():
     m = rig()
     m.table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1e-4, "no_load_speed": 10.0}}})

@@ -72,6 +72,7 @@ def test_check_passes_and_names_largest_differences(made, capsys):
     assert capsys.readouterr().out.count("ok") == 4
 
 
+@pytest.mark.slow
 def test_check_notices_a_wrong_output_observation_or_target(copy):
     for key, where in (("action", (3, 2)), ("signal_fingertip", (2, 1, 0)), ("target", (4, 5))):
         rows = dict(np.load(copy / "golden.npz"))

@@ -52,6 +52,7 @@ class Sticky(LaggingHand):
             self.target[4] = 1.34 - self.target[4]
 
 
+@pytest.mark.slow
 def test_all_steps_of_a_good_hand(tmp_path):
     status, found, fake, said = walk(tmp_path)
     assert status == 0 and not found["stopped"] and "the hand is let go: " in said
@@ -70,6 +71,7 @@ def test_all_steps_of_a_good_hand(tmp_path):
     assert len(read(tmp_path / "check.mcap", audit=False).states.position) > 2000
 
 
+@pytest.mark.slow
 def test_what_is_planted_is_found(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
@@ -79,6 +81,7 @@ def test_what_is_planted_is_found(tmp_path):
     assert median(late) - median(soon) == pytest.approx(50, abs=12) and median(soon) < 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hand", "steps", "faults", "says"),
     [
@@ -96,11 +99,13 @@ def test_each_step_says_what_is_wrong(tmp_path, hand, steps, faults, says):
     assert says in said
 
 
+@pytest.mark.slow
 def test_the_lowest_current_is_the_one_that_moves_it(tmp_path):
     _, found, *_ = walk(tmp_path, partial(Sticky, need=155.0), ["signs", "lowest"])
     assert found["steps"]["lowest"]["figures"]["mA"] == {"thumb_bend_joint": 160.0, "index_joint1": 160.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [pytest.param(-1, marks=pytest.mark.slow), 37])
 def test_the_calibration_finds_a_dead_taxel_and_the_force_of_a_current(tmp_path, monkeypatch, dead):
     monkeypatch.setattr(first_hour, "PRESSES", 30)

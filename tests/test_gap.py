@@ -403,6 +403,7 @@ def check_planted(effect, changes, key, value, seconds=3.0):
 
 
 # a deadband's fits, begun again from several places, take 45 s; the others 6
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "changes", "key", "value"),
     [pytest.param(*p, id=f"{p[0]} {p[2]}", marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
@@ -620,6 +621,7 @@ def test_unusable_recordings_are_a_verdict(rig, tmp_path, what):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "allowed",
     [
@@ -635,6 +637,7 @@ def test_some_missing_samples_are_said_not_fatal(rig, tmp_path, allowed):
     assert run(asked).data["verdict"] != "unusable"
 
 
+@pytest.mark.slow
 def test_model_range_in_the_wrong_unit_is_said(rig, tmp_path):
     folder, paths, model_path, servo = rig
     wrong = tmp_path / "wrong.xml"

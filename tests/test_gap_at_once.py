@@ -119,6 +119,7 @@ def numbers(found: Outcome) -> list:
     ]
 
 
+@pytest.mark.slow
 def test_hypotheses_side_by_side_are_those_one_after_the_other(monkeypatch):
     """Two effects that write constants to the plant among them: each hypothesis has a plant of its own."""
     changes, allowed = {"backlash": 0.03}, {"backlash", "compliance", "deadband", "coulomb_friction", "lag"}
@@ -142,6 +143,7 @@ def test_hypotheses_side_by_side_are_those_one_after_the_other(monkeypatch):
     assert max(begun) > 1
 
 
+@pytest.mark.slow
 def test_of_hypotheses_that_are_out_of_time_the_first_is_fitted(monkeypatch):
     s = searched({"torque_limit": 0.12})
     none = s.start()

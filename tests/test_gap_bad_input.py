@@ -141,6 +141,7 @@ def test_a_bad_position_or_command_makes_the_joint_unusable(rig, tmp_path, kind,
     assert d.data["verdict"] == "unusable" and kind in d.sentence and d.data["held_out"]["before"] is None
 
 
+@pytest.mark.slow
 def test_healthy_recordings_have_no_bad_channel(rig, tmp_path):
     d = judged(rig, tmp_path, lambda r: None, keep=(0, 1, 2, 3))
     assert d.data["verdict"] == "none" and not d.data["findings"]
@@ -198,6 +199,7 @@ def test_held_out_copies_are_refused(rig, tmp_path):
         diagnose(Settings(paths[:2], tmp_path, [copy], str(model), str(servo)), say=lambda _: None)
 
 
+@pytest.mark.slow
 def test_two_recordings_of_a_dead_encoder_are_no_copies(rig, tmp_path):
     """Both hold one reading for all their length: that is a fault of the signal, which is named, not one recording
     given twice."""

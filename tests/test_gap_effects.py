@@ -178,6 +178,7 @@ GIVING = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planted", "effect", "key", "value", "jumps"), [
     (LEADING, "controller_term", "gain", 0.04, False),
     (HEAVY, "inertia", "armature", 0.015, False),
@@ -193,6 +194,7 @@ def test_a_law_that_is_not_believed_is_named_and_sized(monkeypatch, planted, eff
     )
 
 
+@pytest.mark.slow
 def test_what_is_not_stated_of_braking_is_no_effect(monkeypatch):
     """Nothing is believed of how an unknown drive brakes: it is refitted, and no name is given to it."""
     monkeypatch.setattr(test_gap, "motion", steps)
@@ -217,6 +219,7 @@ def test_an_interval_holds_the_size_by_another_law():
     assert best.members[0].variant.label == "exponential in speed"
 
 
+@pytest.mark.slow
 def test_a_law_is_tried_before_what_it_gets_wrong_is_named():
     """By the other law a breakaway friction leaves so much that a second friction would be found beside it."""
     off = {"stribeck_peak": 0.12, "stribeck_speed": 0.15, "stribeck_exponent": 1.0}

@@ -32,6 +32,7 @@ def test_a_millisecond_is_short_enough_for_a_lag_and_for_braking_at_the_limit(ch
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 1.5e-4  # of 0.5 rad
 
 
+@pytest.mark.slow
 def test_no_effect_is_begun_again_from_where_an_effect_ended():
     runs = [
         plant_run(name, kind, 5.0, {"delay": 6e-4, "*kp": 0.97}, seed)

@@ -151,6 +151,7 @@ PLAY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
 def test_training_has_the_play_and_the_rest_of_it(engine, tmp_path):
     """A servo.yaml with all of it trains: drawn inside the intervals at each episode, on that joint alone; the joint
@@ -189,6 +190,7 @@ def test_training_has_the_play_and_the_rest_of_it(engine, tmp_path):
     assert torch.isfinite(env.q).all() and not env.nan.any()
 
 
+@pytest.mark.slow
 def test_a_hand_with_play_in_every_joint_holds_what_it_catches(tmp_path):
     """Light links behind a gap, in contact at the tasks' step of 7 ms: objects are not thrown, nothing diverges."""
     table = xhand_table()
@@ -266,6 +268,7 @@ def _write(path, text):
     return path
 
 
+@pytest.mark.slow
 def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
     """A drag that the catalogue has not (torque against speed times |speed|): regressed, judged, written, loaded by
     training."""

@@ -104,6 +104,7 @@ def swinging() -> tuple[JointSearch, Outcome]:
     return search, search.without_search()
 
 
+@pytest.mark.slow
 def test_a_loop_that_swings_between_its_limits_is_told_by_the_law_of_its_lag(swinging):
     search, nothing = swinging
     assert ringing.Ringing(search, nothing.none).loud.sum() > 2

@@ -168,6 +168,7 @@ def test_a_joint_further_off_takes_the_place_of_the_last():
         assert apart < 0.1 * size, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.4, 0.0])
 def test_a_linkage_with_a_joint_further_off_is_found(ratio):
     from types import SimpleNamespace

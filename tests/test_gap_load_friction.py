@@ -88,6 +88,7 @@ def test_training_is_given_a_share_of_the_torque_from_outside(searched):
     assert "coulomb_friction" not in given and "gear_load_friction" not in SERVO_INDEX
 
 
+@pytest.mark.slow
 def test_the_engine_that_trains_comes_near():
     """It has no part of the joint's own inertia in that friction."""
     c = replayed("load_friction", "of the torque on the joint", gear(1.3, gear_load_unit=0.05), [1.3, 1.3])

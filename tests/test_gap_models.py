@@ -178,6 +178,7 @@ def test_hardening_is_the_cubic_spring_it_says():
         assert x * (1 + hard * x * x) == pytest.approx(tau, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_load_off_its_links_centre_is_weighed_and_placed():
     p, label = found({"payload": 0.08, "com_across": 0.05}, "payload")
     assert label == "mass and its centre"
@@ -191,6 +192,7 @@ def test_a_load_off_its_links_centre_is_weighed_and_placed():
     assert com["low"][0] < com["value"][0] < com["high"][0] and com["value"][1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_load_at_its_links_centre_has_no_place_fitted():
     p, label = found({"payload": 0.08}, "payload")
     assert label == "mass" and "com" not in p and p["mass"]["low"] <= 0.08 <= p["mass"]["high"]
@@ -238,6 +240,7 @@ def jittered(kind: int, sd: float) -> Run:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [0.0, 0.003])
 def test_jitter_of_a_delay_is_found_and_sized(sd):
     runs = [jittered(k, sd) for k in (0, 1, 3)]
@@ -257,6 +260,7 @@ def test_jitter_of_a_delay_is_found_and_sized(sd):
         assert set(found.entry()) == {"value", "low", "high", "unit"}
 
 
+@pytest.mark.slow
 def test_what_only_looks_like_jitter_is_not_reported():
     """Free play that nobody fitted leaves residuals that the times of commands could take up, too."""
     runs = [plant_run(f"run{k}", k, 4.0, {"backlash": 0.1}, seed=k) for k in (0, 1, 3)]

@@ -55,6 +55,7 @@ def hypotheses():
     )
 
 
+@pytest.mark.slow
 def test_the_same_hypothesis_disagrees_nowhere_and_others_do(hypotheses):
     m, search, none, trials = hypotheses
     same = next_recording.choose(
@@ -96,6 +97,7 @@ def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
     assert gain < 0.3 * real
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("allowed", "seconds"),
     [

@@ -106,6 +106,7 @@ def renders(page, browser, width, figures):
         assert not seen["long"], seen["long"]
 
 
+@pytest.mark.slow
 def test_page_is_not_blank(pages, browser, tmp_path):
     from PIL import Image
 

@@ -104,6 +104,7 @@ def test_a_lead_is_that_of_the_plain_correlation(lead):
     assert (channels._lead(run, 0) > SIGNAL.early) == (lead > 0)
 
 
+@pytest.mark.slow
 def test_enabled_acts_in_the_recording_that_has_it_and_a_second_is_enough(tmp_path):
     """Three clips of 1 s at 50 Hz, one of them with `enabled`: judged, and its switch kept."""
     paths, model, servo, _ = demo.make(tmp_path, "", seconds=4.0)

@@ -38,6 +38,7 @@ def soft() -> JointSearch:
     )
 
 
+@pytest.mark.slow
 def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
     nothing = soft.without_search()
     rung = ringing.Ringing(soft, nothing.none)
@@ -63,6 +64,7 @@ def test_nothing_makes_a_joint_ring_that_has_no_loop(soft):
     assert not ringing.without_loop(soft.case)
 
 
+@pytest.mark.slow
 def test_play_rings_on_where_it_was_struck():
     """A joint with play that sticks is at rest in one state and rattles in another, at the same command: windows that
     begin rattling are begun so."""
@@ -98,6 +100,7 @@ def answer_of(soft: JointSearch, found) -> JointAnswer:
     return JointAnswer(soft.case, soft, found, Kept([None] * 3, [0, 1], [2], None, None))
 
 
+@pytest.mark.slow
 def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft, monkeypatch):
     """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
     does is a hint, and is not handed on."""

@@ -28,6 +28,7 @@ def searched(changes: dict[str, float]) -> JointSearch:
     return JointSearch(build(model(), runs)[0], [0, 1, 2], None, [0, 1, 2])
 
 
+@pytest.mark.slow
 def test_refold_fits_each_condition_left_out_better_than_one_step_does():
     s = searched({"torque_limit": 0.12})
     none = s.start()
@@ -43,6 +44,7 @@ def test_refold_fits_each_condition_left_out_better_than_one_step_does():
     assert own.left_out.sum() <= 1.25 * step.left_out.sum()  # what is free to fit noise does, a little
 
 
+@pytest.mark.slow
 def test_conditions_left_out_are_run_free_with_fits_of_their_own():
     s = searched({"torque_limit": 0.12})
     assert s.fold_by == "conditions"

@@ -50,6 +50,7 @@ def test_a_drive_that_sets_a_voltage_gives_less_of_everything():
     assert np.sqrt(np.mean((q[1] - q[0]) ** 2)) > 5 * case.sigma
 
 
+@pytest.mark.slow
 def test_a_supply_that_sags_under_the_drives_own_load_is_found():
     runs, case = sagging_case(SAGS)
     search = JointSearch(case, [0, 1, 2], None, conditions(runs))

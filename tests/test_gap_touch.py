@@ -62,6 +62,7 @@ def test_catalogue_of_touch_is_that_of_the_specification():
         assert all(len(s) == len(e.fits) for s in e.starts) and {k for k, _ in e.report} <= set(e.fits)
 
 
+@pytest.mark.slow
 def test_the_plant_reads_what_the_rig_reads(plain):
     """The rig's contact is MuJoCo's and its taxels are the kernels': readings agree to the counts, with and without the
     load cell."""
@@ -143,6 +144,7 @@ def check(folder, effect, planted, values, allowed=None):
     assert f.held_out["after"] < (0.9 if effect == "tactile_crosstalk" else 0.6) * f.held_out["before"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effect", "planted", "values"), QUICK, ids=[q[0] for q in QUICK])
 def test_planted_touch_effect_is_named_and_sized(tmp_path, effect, planted, values):
     check(tmp_path, effect, planted, values, {effect, "tactile_delay", "contact_stiffness"})
@@ -154,6 +156,7 @@ def test_more_planted_touch_effects(tmp_path, effect, planted, values):
     check(tmp_path, effect, planted, values)
 
 
+@pytest.mark.slow
 def test_nothing_planted_nothing_found(plain):
     paths, model, servo = plain
     m = mechanism(model, servo)
@@ -167,6 +170,7 @@ def test_two_effects_at_once(tmp_path):
     assert {f.effect for f in out.findings} == {"tactile_delay", "tactile_hysteresis"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "allowed",
     [
@@ -205,6 +209,7 @@ def test_without_a_load_cell_gain_and_stiffness_are_a_set(tmp_path):
 # ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_rig_is_diagnosed_from_end_to_end(tmp_path):
     paths, model, servo = press_rig.record(tmp_path / "rig", 3, 5.0, seed=5, sensor={"delay": 0.06})
     few = {"tactile_delay", "tactile_hysteresis", "contact_stiffness"}
@@ -249,6 +254,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
     assert [f.taxels for f in out.findings] == [["1:66"]]
 
 
+@pytest.mark.slow
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
     paths, model, servo = press_rig.record(tmp_path, 3, 4.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
     m = mechanism(model, servo)
@@ -280,6 +286,7 @@ def test_a_little_crosstalk_may_be_the_law_of_the_contact():
     assert said(0.08) == JUDGE.doubted and said(0.2) == 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.8, 1.25])
 def test_a_force_that_spreads_otherwise_than_the_law_is_no_crosstalk(plain, spread, monkeypatch):
     """Readings of a contact whose pressure reaches further (or less far): the reach is refitted, and nothing is

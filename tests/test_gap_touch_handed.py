@@ -110,6 +110,7 @@ def test_what_is_doubted_holds_what_was_believed(late, tmp_path):
     assert within(drawn, p) and float(drawn.min()) < 0.01
 
 
+@pytest.mark.slow
 def test_a_checkpoint_carries_it_and_play_takes_it(late, tmp_path):
     """The content is in the run's config, so that a resume and a replay need no file; play.py lays it over any
     checkpoint."""

@@ -129,6 +129,7 @@ def _under_the_lock(x):
         return x + 1
 
 
+@pytest.mark.slow
 def test_a_lock_that_a_thread_held_at_the_fork_is_no_pipe():
     """A fork copies a held lock, and nobody there lets go of it."""
     free = threading.Event()

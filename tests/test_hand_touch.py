@@ -51,13 +51,14 @@ def test_the_plant_reads_what_a_hands_taxels_read(claw, tmp_path, mirror):
         assert np.sqrt(np.mean(error[:, felt] ** 2)) < 0.05
 
 
+@pytest.mark.slow
 def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     k = Sensors(claw).middle(2)
     m, recordings = pressed(tmp_path, claw, "middle", 5.0, gains={k: 0.4})
     result = diagnosis.diagnose(recordings, m, set(), allowed={"tactile_gain"})
     (f,) = result.findings
-    assert f["effect"] == "tactile_gain" and f["where"]["taxels"] == [f"2:{k}"], f["where"]
-    assert f["parameters"]["gain"]["value"] == pytest.approx(0.4, abs=0.08) and result.names[2] == "middle"
+    assert f.effect == "tactile_gain" and list(f.taxels) == [f"2:{k}"], f
+    assert f.parameters["gain"]["value"] == pytest.approx(0.4, abs=0.08) and result.names[2] == "middle"
     assert result.error.shape == (4, 48)
     path = tmp_path / "tactile.yaml"
     assert diagnosis.save_tactile(diagnosis.handed(result.findings, result.facts, result.names), path)

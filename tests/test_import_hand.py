@@ -154,6 +154,7 @@ def _briefly(real, *args):
     return (out[0], torch.ones_like(out[1])) if isinstance(out, tuple) else torch.ones_like(out)
 
 
+@pytest.mark.slow
 def test_fingertips_alone_take_hold_of_opposite_faces(claw, tmp_path, monkeypatch):
     """Whatever the hand: an opposing finger on one face, two others on the other, forces that sum to zero."""
     hand, rng = load_hand(claw), np.random.default_rng(0)
@@ -426,6 +427,7 @@ def test_a_folder_that_is_not_ours_is_not_touched(tmp_path):
         import_hand(path, tmp_path / "hand", picture=False)
 
 
+@pytest.mark.slow
 def test_coupled_joints_are_driven_alone_only_when_asked(one_start, tmp_path):
     path = hands.write(tmp_path / "robot")
     start, joint, rest = path.read_text().partition('<joint name="index_2"')
@@ -506,6 +508,7 @@ def test_where_objects_are_held_is_found(claw, tmp_path, monkeypatch):
     assert found.held > 20 and found.middle < 10, found
 
 
+@pytest.mark.slow
 def test_where_objects_are_let_fall_is_a_guess_and_a_persons_place_stays(one_start, tmp_path, monkeypatch):
     found = drop_region.Region(np.array([0.05, 0.004, 0.013]), 60, 64, 0.01, 50, 0.006)
     path = hands.write(tmp_path / "robot")

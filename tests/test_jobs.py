@@ -102,6 +102,7 @@ def test_a_machine_without_slurm_and_a_scheduler_that_is_not_there(monkeypatch, 
         jobs.run(work, jobs.Engine("dask=tcp://127.0.0.1:9"))
 
 
+@pytest.mark.slow
 def test_dask_begins_again_what_a_killed_worker_had(tmp_path):
     """Two workers, one is killed in the middle of a job: its process, an orphan, is ended; the job goes on elsewhere
     from what it had saved, and what it left stands aside."""

@@ -173,6 +173,7 @@ def test_serves_on_loopback_only(view):
     assert hosts == {"0100007F"}
 
 
+@pytest.mark.slow
 def test_pause_step_world_policy_command_and_restart(view, env):
     w = view.wishes
     w.pause, w.steps = True, 7
@@ -556,6 +557,7 @@ def hostile(ids: dict[str, str]):
             yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": -1000})
 
 
+@pytest.mark.slow
 def test_a_thousand_hostile_messages_end_nothing(view, env):
     from websockets.exceptions import ConnectionClosed
 
@@ -718,6 +720,7 @@ def hasty(monkeypatch):
     monkeypatch.setattr(live_gate, "HANDSHAKE_S", live_gate.HANDSHAKE_S / 2)
 
 
+@pytest.mark.slow
 def test_sockets_that_say_nothing_make_room_for_a_page(hasty, view):
     """Two hundred that never finish their handshake: the oldest go, a page is served meanwhile, and all are gone in
     time."""

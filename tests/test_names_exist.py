@@ -33,6 +33,7 @@ def _missing(path: Path) -> list[str]:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", [*OURS, "tests"])
 def test_what_is_imported_exists(folder):
     found = [line for path in sorted((ROOT / folder).rglob("*.py")) for line in _missing(path)]

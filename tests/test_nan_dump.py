@@ -57,6 +57,7 @@ def test_a_dump_holds_the_state_before_the_step(env, tmp_path, capsys):
     assert int(nan_dump.load(tmp_path / "nan_1.npz")["world"]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
 def test_a_replay_fails_again_and_a_sound_world_repeats_its_step(tmp_path, capsys, engine):
     env = grasp_env(worlds=N, engine=engine)

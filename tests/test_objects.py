@@ -311,6 +311,7 @@ def test_convex_mesh_in_millimetres(tmp_path):
     np.testing.assert_allclose(shape.grid.sample(np.array([[0.032, 0, 0], [0, 0, 0.013]])), (2e-3, -2e-3), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_fine_convex_mesh_is_simplified_and_says_so(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     shape = load_mesh(write(ball, tmp_path / "ball.ply"))

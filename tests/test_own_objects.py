@@ -70,6 +70,7 @@ def test_cuts_between_parts_are_no_surface():
     assert parts.distance(small, np.zeros((1, 3)) + 1e-4)[0] < -0.019
 
 
+@pytest.mark.slow
 def test_a_hollow_mesh_is_split_and_its_notch_stays_open(tmp_path, monkeypatch):
     path = tmp_path / "u.stl"
     u_mesh().export(path)
@@ -118,6 +119,7 @@ def test_a_mug_of_bodies_that_share_faces_is_split_body_by_body(tmp_path, monkey
         decompose.decompose(mug.vertices, np.asarray(mug.faces), 2, "mug.stl")
 
 
+@pytest.mark.slow
 def test_what_was_worked_out_is_kept_and_a_broken_cache_is_made_anew(tmp_path, monkeypatch):
     path = tmp_path / "u.stl"
     u_mesh().export(path)
@@ -246,6 +248,7 @@ def test_a_scene_has_a_slot_for_every_part_and_true_sizes():
     assert plain.slots == SLOTS  # nothing changes where nothing of a user's own is named
 
 
+@pytest.mark.slow
 def test_import_object_writes_what_a_task_takes(tmp_path, capsys, monkeypatch):
     u_mesh().export(tmp_path / "u.stl")
     monkeypatch.setattr(decompose, "decompose", lambda *a: u_shape())

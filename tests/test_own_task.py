@@ -92,6 +92,7 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("mine_here", None)
 
 
+@pytest.mark.slow
 def test_a_class_of_the_current_folder_trains_and_plays(folder, capsys):
     where = dexsim.train("mine_here:Raise", worlds=4, iterations=1, device="cpu",
                          settings=["final_episodes=4", "agent.num_steps_per_env=4"])  # fmt: skip
@@ -101,6 +102,7 @@ def test_a_class_of_the_current_folder_trains_and_plays(folder, capsys):
     assert {"mean_return", "return_interval", "last_height", "ends"} <= set(found)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_imports_nothing_that_was_not_named(folder, monkeypatch):
     where = dexsim.train("mine_here:Raise", worlds=2, iterations=1, device="cpu",
                          settings=["final_episodes=0", "agent.num_steps_per_env=4"])  # fmt: skip
@@ -459,6 +461,7 @@ DRAWER = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="box"
 <geom type="box" size=".04 .04 .01"/></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 def test_further_objects_and_imported_machines():
     class Room(Flat):
         scene = Scene(object=None, things=(Thing("ball", "sphere", 0.5, 0.05, (0.055, 0.0, 0.12)),),

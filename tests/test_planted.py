@@ -8,6 +8,7 @@ import pytest
 from benchmarks import planted
 
 
+@pytest.mark.slow
 def test_what_refitted_figures_take_over_is_no_size_and_sizes_grow_to_what_is_wanted():
     rng = np.random.default_rng([5, 2, 0])
     b = planted.rig(rng, "damped")

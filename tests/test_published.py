@@ -160,6 +160,7 @@ def test_what_the_hub_refuses_is_one_line(hub, name, words):
     assert "\n" not in str(error.value) and name in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_hub_that_is_out_of_reach_and_a_file_that_is_no_policy(hub):
     Hub.CONTENT = b"\x80\x04no"
     with pytest.raises(UserError, match="refused, it is a raw pickle"):

@@ -219,6 +219,7 @@ def test_a_damaged_data_set_is_one_line(tmp_path, content):
     assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "make", "version"), [SETS[0], SETS[5], SETS[6]])
 def test_a_data_set_goes_to_mcap_and_back(tmp_path, name, make, version):
     """Any data set to MCAP, that to LeRobot: each as it was."""

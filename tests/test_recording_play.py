@@ -287,6 +287,7 @@ def test_a_models_own_actuators_tendons_and_couplings_of_driven_joints_are_left_
     assert compare(r, own, arm(tmp_path)).position_rmse().max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_joint_without_a_servo_or_not_fitted_to_follows_its_recording(tmp_path):
     """And pulls at the others as it did: they move as if it were driven, whose drive nobody knows."""
     r = swung(arm(tmp_path))
@@ -462,6 +463,7 @@ def test_recording_ends_with_the_episode(played):
     assert len(feed(_Track(0, 0.1, 9.0), steps).times) == 9, "else the longest"
 
 
+@pytest.mark.slow
 def test_the_object_of_a_real_recording_is_placed(played, tmp_path, monkeypatch):
     """A recording that knows only the object's path: a mark that touches nothing, or the object as it is stated to
     be."""

@@ -156,6 +156,7 @@ def much_later(all_):
     return [(c, t + (1 << 62), d) for c, t, d in all_]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", [list, gap, repeated, unsorted, set_back, cut_short, one_bit, much_later])
 def test_a_recording_is_the_same_to_the_last_bit(edit, tmp_path, monkeypatch):
     whole = recordings.signal(4.0, recordings.HAND[:4], tactile=True)

@@ -240,6 +240,7 @@ LINK = """<body pos="0 {k} 0"><joint name="{n}" axis="0 1 0" armature="1e-3" ran
 <geom type="sphere" size="0.02" pos="0 0 -0.1" mass="0.1" contype="0" conaffinity="0"/></body>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joints", [("a", "b"), ("a", "b", "c")])
 def test_a_joint_has_a_time_axis_of_its_own(tmp_path, joints):
     """A message for each joint says of it what a message for all does: its noise, its rate, and no faults."""

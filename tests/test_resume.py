@@ -50,6 +50,7 @@ def resumed(path, task: str, engine: str, *settings: str) -> Runner:
 WARP = pytest.param("grasp", "warp", FEELS, marks=pytest.mark.slow, id="grasp-warp")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "engine", "settings"),
                          [("grasp", "mujoco", FEELS), ("rotate", "mujoco", FEELS),
                           ("rotate_fingertips", "mujoco", FEELS), WARP])  # fmt: skip
@@ -71,6 +72,7 @@ def test_resume_is_the_unbroken_run(tmp_path, task, engine, settings):
     ]
 
 
+@pytest.mark.slow
 def test_so_is_one_that_was_broken_off_in_a_rollout(tmp_path):
     """Ctrl-C comes anywhere: what is saved is the end of the last iteration, its running normalization too."""
     whole = runner("grasp", "mujoco", *ENDS)
@@ -101,6 +103,7 @@ def test_every_part_that_changes_is_kept():
         assert changed <= computed, changed - computed
 
 
+@pytest.mark.slow
 def test_worlds_that_cannot_be_this_runs(tmp_path):
     made = runner("grasp", "mujoco")
     path = checkpoint.save(tmp_path / "last.pt", made.payload())

@@ -225,6 +225,7 @@ def test_an_evaluation_keeps_its_trials():
     assert 0 <= m["touched_by_others"] <= 1
 
 
+@pytest.mark.slow
 def test_a_trials_facts_are_of_its_own_episode():
     """Whatever ends begins anew at once, with another palm, mass and friction: a trial keeps those it was played in."""
     env = make("task.evaluation.cap_s=1.5", worlds=12)

@@ -71,6 +71,7 @@ def test_a_file_of_held_poses_says_what_it_holds(tmp_path):
         GraspSet.load(tmp_path / "bad.npz")
 
 
+@pytest.mark.slow
 def test_a_mesh_of_a_cube_is_held_and_turned_as_the_cube_is(tmp_path, meshes):
     """The same poses, the same draws: a mesh's contacts, its mass and its goals are those of the built-in cube."""
     known = cubes(4)
@@ -94,6 +95,7 @@ def test_a_mesh_of_a_cube_is_held_and_turned_as_the_cube_is(tmp_path, meshes):
     assert torch.allclose(goal, goal2, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_flat_object_is_not_dropped_as_it_lies_and_falls_with_any_axis_up(tmp_path, meshes):
     one = cubes(3)
     poses = tmp_path / "poses.npz"

@@ -128,6 +128,7 @@ def _touching(e, w: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return m, d
 
 
+@pytest.mark.slow
 def test_collision_surface_is_where_touch_has_it(scene):
     """A small probe ball against the engine's slots (mj_geomDistance of the world's own model), in ten directions and
     at a turned pose: the same distance as touch's signed distance, within the grid's error."""

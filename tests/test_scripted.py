@@ -13,6 +13,7 @@ from dexsim.tasks import grasp_eval
 WORLDS = 24
 
 
+@pytest.mark.slow
 def test_the_scripted_policy_holds(monkeypatch, tmp_path):
     """Measured: 60 % of 32 episodes held, nothing without a policy. A wrong sign, a soft servo or contacts that shake
     the object off end well under a third."""

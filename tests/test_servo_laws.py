@@ -402,6 +402,7 @@ LOADED = {"load_friction_external": 0.4, "load_stribeck": 0.2, "load_stribeck_ex
           "load_quadratic_external": 20.0}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_gears_load_from_both_sides_is_one_law_in_servo_and_plant():
     """A link under gravity that is lifted and let down: the two come together with the step; each column matters."""
     columns = {"kp": 0.3, "kd": 0.006, "load_friction": 0.2, "load_friction_backdriven": 0.2, "stribeck_speed": 0.6}

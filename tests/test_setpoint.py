@@ -179,6 +179,7 @@ def servo_with(profile, path):
     return path
 
 
+@pytest.mark.slow
 def test_a_fitted_profile_is_what_the_drive_in_training_has(tmp_path):
     """A servo.yaml with `profile_speed` as a diagnosis writes it, with its interval, given to training: no joint goes
     faster than its profile, each world by one within the interval; without it the joint follows."""

@@ -65,6 +65,7 @@ def test_the_first_pads_are_the_xhands_own(hand):
     assert [p.name for p in contact_pairs(hand, "right_hand_link")][: len(pairs)] == [p.name for p in pairs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cfg", [{}, {"law": "linear"}])
 @pytest.mark.parametrize("lanes", [False, True])
 def test_pads_of_a_link_sum_to_what_the_physics_presses_it_with(hand, cfg, lanes, monkeypatch):
@@ -82,6 +83,7 @@ def test_pads_of_a_link_sum_to_what_the_physics_presses_it_with(hand, cfg, lanes
     torch.testing.assert_close(touch.force, both, rtol=1e-5, atol=1e-5)  # as the sensor measures it
 
 
+@pytest.mark.slow
 def test_taxels_share_a_link_by_their_distance_whichever_pad_they_are_in(hand):
     """Of the palm's four pads as if they were one, and of the hand itself by the nearest link."""
     layout = hand_layout(hand)
@@ -139,6 +141,7 @@ def test_readings_do_not_change_when_all_is_turned(hand):
     np.testing.assert_allclose(out[0][1], out[1][1], atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("requested", ["hull:100/3", "hull:6mm", "a_2:25:all", "hull:40,links:30:all"])
 def test_taxels_lie_evenly_on_the_links_surface(requested, tmp_path):
     made_hand(tmp_path)
@@ -247,6 +250,7 @@ def test_entries_that_do_not_fit_the_hand_are_one_line(tmp_path):
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_command_makes_another_hand_and_leaves_nothing_where_it_fails(tmp_path, capsys):
     made_hand(tmp_path / "made")
     out = tmp_path / "with_skin"
@@ -277,6 +281,7 @@ def test_an_import_lays_skin_and_a_later_one_keeps_it(tmp_path):
     assert not (tmp_path / "bare").exists()
 
 
+@pytest.mark.slow
 def test_a_grasp_is_felt_whole(hand):
     """In simulation: what palm and links carry is felt with what fingertips do, and the hand itself where it meets
     itself; each link's pads add up to the solver's force."""

@@ -99,6 +99,7 @@ for k in range(100):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leak_mib", [0.0, 0.5])
 def test_a_leak_of_a_piece_of_work_is_found_in_what_the_process_keeps(leak_mib, tmp_path):
     """0.5 MiB of each of 100 pieces: 38 MiB of what is judged. Without a leak, what comes and goes is none."""
@@ -124,6 +125,7 @@ def alive(group: int) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_it_leaves_no_process_behind_where_it_is_ended(number, tmp_path):
     """One of two parts ends when it is asked, the other ignores it and has a child that does; what came is judged."""

@@ -89,6 +89,7 @@ def catching(fibers):
     return env
 
 
+@pytest.mark.slow
 def test_forces_of_a_catch_are_those_of_mujoco_warp(catching):
     """Six worlds over five control steps, from the warm start of physics and from starts that are far off."""
     e, rng = catching.engine, np.random.default_rng(0)
@@ -152,6 +153,7 @@ def kinds(fibers):
     return mjm, m, d
 
 
+@pytest.mark.slow
 def test_every_kind_of_row(kinds):
     """An equality, a limit, dry friction, contacts of 1, 3, 4 and 6 directions; 27 dofs (not a multiple of what a lane
     reads at once)."""

@@ -28,6 +28,7 @@ def script(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
     argv = ["--multirun", "task=grasp", "servo=xhand,ideal", "seed=1,3", "iterations=7", f"sweep={tmp_path / 's'}"]
     assert sweep.run(argv, CONFIGS, [sys.executable, str(script)]) == 0

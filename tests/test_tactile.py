@@ -84,6 +84,7 @@ def expected_distance(pose, f: int) -> np.ndarray:
     return ref.distance(shape.kind, size, q, getattr(shape, "grid", None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["linear", "hertz", "mooney_rivlin"])
 def test_spring_sum_equals_the_numpy_reference(law):
     poses = contact_poses(24, 0)
@@ -135,6 +136,7 @@ def test_solver_sum_is_the_solvers_force_spread_as_in_the_reference_and_never_lo
             np.testing.assert_allclose(tactile.raw[w, f].numpy(), want, atol=2e-3 * float(given[w, f]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["spring", "solver"])
 def test_a_warp_a_pad_equals_the_serial_kernel(mode, monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
@@ -158,6 +160,7 @@ def test_a_warp_a_pad_equals_the_serial_kernel(mode, monkeypatch):
     assert out[0][2][0, 1] > 0.0 and out[0][2][0, 2] > 0.0
 
 
+@pytest.mark.slow
 def test_a_warp_a_pad_takes_ragged_pads_several_objects_and_other_fingers(monkeypatch):
     """Pads of 70, 1 and 33 taxels (whole and broken rounds of 32 lanes), two objects, other tips in the readings."""
     from dexsim.tactile import Tactile
@@ -223,6 +226,7 @@ def _exchanges(
     first[i] = lowest_bit(said)
 
 
+@pytest.mark.slow
 def test_lanes_exchange_within_their_warp(monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     n = 128  # two blocks of two warps
@@ -320,6 +324,7 @@ def probe(shape_set: ShapeSet, i: int, size, points: np.ndarray) -> tuple[np.nda
     return d.numpy(), n.numpy()
 
 
+@pytest.mark.slow
 def test_distances_and_normals_on_the_device_are_the_references():
     rng = np.random.default_rng(8)
     points = rng.uniform(-0.06, 0.06, (3000, 3))
@@ -569,6 +574,7 @@ def test_the_surface_may_be_given_by_samples():
     assert np.array_equal(one > 0, exact > 0) or np.mean((one > 0) != (exact > 0)) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [True, False])
 def test_kernels_compile_for_cuda_without_a_gpu(solver, tmp_path):
     """And exchange by shuffles of the whole warp, without a barrier, without local memory."""

@@ -224,6 +224,7 @@ def test_a_delay_between_two_readings_lies_between_them():
         touch.check()
 
 
+@pytest.mark.slow
 def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the
     counts."""
@@ -269,6 +270,7 @@ def test_without_pads_nothing_is_there():
     assert with_pads.by_pad is not None and with_pads._m.report is out[0][0]._m.report
 
 
+@pytest.mark.slow
 def test_recorded_sequences_replay_and_lanes_agree(monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     cfg = {
@@ -310,6 +312,7 @@ PADS = (
 )
 
 
+@pytest.mark.slow
 def test_a_control_step_with_pads_does_not_wait(monkeypatch):
     env = grasp_env(PADS, worlds=4, engine="warp")
     for _ in range(3):

@@ -209,6 +209,7 @@ def test_reset_forgets_one_world_only():
     assert tactile.force[0].item() == pytest.approx(1.5 * tactile.force[1].item(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_measured_force_may_include_other_fingers():
     from dexsim.tactile import Tactile, TaxelLayout
     from dexsim.tactile.posed import PosedEngine

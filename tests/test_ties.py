@@ -243,6 +243,7 @@ def test_a_mass_of_zero_is_none_and_figures_that_are_no_numbers_are_named(tmp_pa
         source.read(robot(tmp_path / "nan", text('ixx="[^"]*"', 'ixx="nan"')))
 
 
+@pytest.mark.slow
 def test_what_an_mjcf_says_of_impossible_inertias_is_done(tmp_path):
     path = tmp_path / "jaws.xml"
     text = jaws(head='<compiler angle="radian" {}/>').replace("2e-5 2e-5 5e-6", "2e-6 3e-6 1e-5", 1)

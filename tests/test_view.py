@@ -35,6 +35,7 @@ def read(path):
     return meta, [np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader]
 
 
+@pytest.mark.slow
 def test_video_has_every_frame_and_shows_the_ball_move(tmp_path):
     seen = []
     try:
@@ -59,6 +60,7 @@ def test_video_has_every_frame_and_shows_the_ball_move(tmp_path):
     assert held < 3  # the shorter clip keeps its last frame
 
 
+@pytest.mark.slow
 def test_many_control_steps_a_second_are_thinned(tmp_path):
     try:
         video.render([clip(20)], tmp_path / "a.mp4", dt=0.005, size=(64, 64))
@@ -104,6 +106,7 @@ def test_a_crashing_driver_does_not_take_us_down(tmp_path, monkeypatch):
         video.render([clip(2)], tmp_path / "a.mp4", dt=0.05)
 
 
+@pytest.mark.slow
 def test_unwritable_video_is_an_error(tmp_path):
     try:
         video.render([clip(2)], tmp_path / "ok.mp4", dt=0.05, size=(64, 64))
@@ -152,6 +155,7 @@ def test_gravity_turns_to_straight_down():
         assert turn @ gravity / np.linalg.norm(gravity) == pytest.approx([0, 0, -1], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_push_shows_and_taxels_light(tmp_path):
     """An arrow is drawn while a force acts; a pad's picture changes where its taxels feel something."""
     points = np.array([[[0.0, 0.0, 0.01], [0.0, 0.01, 0.01], [0.01, 0.0, 0.01]]])
@@ -212,6 +216,7 @@ def test_drawing_functions_give_one_file_each(tmp_path):
     assert [p.name for p in paths] == ["force_command.png", "plain.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_drawn_figure_gives_its_memory_back_at_once(tmp_path):
     """Without Python's search for circles: ten hold 50 MB otherwise, and hundreds in a long run."""

@@ -380,6 +380,7 @@ def drive(d, seconds, until=lambda: False):
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_the_package_lives_in_a_process_of_its_own_and_a_silent_loop_is_let_go_of(tmp_path):
     log = tmp_path / "log"
     d = driver(Clock(), Pressing, hang=0.3, log=str(log))
@@ -402,6 +403,7 @@ def test_the_package_lives_in_a_process_of_its_own_and_a_silent_loop_is_let_go_o
     assert commands(log)[-1][2] == 0
 
 
+@pytest.mark.slow
 def test_an_abort_of_the_package_is_said_at_once(tmp_path):
     d = driver(Clock(), abort_s=1.0, hang=2.0)
     d.open()
@@ -432,6 +434,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
 def test_a_loop_that_is_killed_or_stopped_leaves_a_hand_that_is_let_go(tmp_path, how):
     log, script = tmp_path / "log", tmp_path / "drive.py"
@@ -557,6 +560,7 @@ def left(b, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_command_runs_two_policies_on_two_hands_of_a_bus(b, left, tmp_path, monkeypatch, capsys):
     """In real time, each in a thread."""
     fake = lambda config, calibration, text, *_: partial(FakeXHand, faults=Faults.parse(text))  # noqa: E731

@@ -35,6 +35,7 @@ def quiet():
         yield
 
 
+@pytest.mark.slow
 def test_the_corpus_itself_is_sound(files, tmp_path):
     for kind, paths in files.items():
         for path in paths:
