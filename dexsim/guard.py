@@ -52,24 +52,17 @@ PACKAGE = Path(__file__).parent
 _inside = False
 
 
-def call(function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0) -> T:
-    """Return `function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size:
-    bytes of the file, with which the limits grow; patience: multiplies the processor time, where more than reading is
-    done. Raises UserError."""
-    return _run(function, args, what, size, True, patience)
-
-
-def rehearse(function: Callable[..., Any], *args: Any, what: str, size: int = 0) -> None:
-    """As `call`, the answer left there. Raises UserError where `function(*args)` cannot be worked out within limits."""
-    _run(function, args, what, size, False, 1.0)
-
-
 def ours(path: Path) -> bool:
     """Return whether a file comes with dexsim."""
     return Path(os.path.abspath(path)).is_relative_to(PACKAGE)
 
 
-def _run(function: Callable[..., Any], args: tuple, what: str, size: int, wanted: bool, patience: float) -> Any:
+def call(
+    function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0, wanted: bool = True
+) -> T:
+    """Return `function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size:
+    bytes of the file, with which the limits grow; patience: multiplies the processor time, where more than reading is
+    done; wanted: false leaves the answer there (None). Raises UserError."""
     if _inside:  # within a reader's limits already
         return function(*args)
     times = typed.number(TRUSTED, os.environ.get(TRUSTED, "1"), 1.0, 1e6)

@@ -72,14 +72,14 @@ def load(path: str | Path) -> Bundle:
     _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
     data = _network(policy, manifest["policy"]["sha256"])
-    guard.rehearse(_tried, data, policy, manifest["policy"], what=f"{policy}", size=len(data))
+    guard.call(_tried, data, policy, manifest["policy"], what=f"{policy}", size=len(data), wanted=False)
     return Bundle(path, manifest, session(data, policy), hand)
 
 
 def network(file: Path, digest: str) -> Any:
     """Return onnxruntime's session of another of a bundle's networks. Raises UserError as `load` does."""
     data = _network(file, digest)
-    guard.rehearse(session, data, file, what=f"{file}", size=len(data))
+    guard.call(session, data, file, what=f"{file}", size=len(data), wanted=False)
     return session(data, file)
 
 

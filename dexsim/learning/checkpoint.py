@@ -108,7 +108,7 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
         raise UserError(f"{path}: no such checkpoint{_nearby(path)}; dexsim comes with {names}")
     if path.is_dir():
         raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
-    guard.rehearse(_whole, path, what=f"{path}", size=files.check(path, "checkpoint", 16 << 30))
+    guard.call(_whole, path, what=f"{path}", size=files.check(path, "checkpoint", 16 << 30), wanted=False)
     return _load(path, device)
 
 

@@ -126,7 +126,7 @@ def write(path: Path, rng: np.random.Generator) -> None:
 def _mend(root: ET.Element) -> bool:
     """Change the attribute that MuJoCo's parser does not take; returns whether there was one."""
     try:
-        guard.rehearse(mujoco.MjSpec.from_string, ET.tostring(root, encoding="unicode"), what="case")
+        guard.call(mujoco.MjSpec.from_string, ET.tostring(root, encoding="unicode"), what="case", wanted=False)
     except UserError as error:
         said = re.search(r"'([^']*)'.*Element '(\w+)'", str(error))
         found = [(n, k) for n in root.iter(said[2]) for k, v in n.items() if said[1] in (k, v)] if said else []
