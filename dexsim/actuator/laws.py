@@ -710,7 +710,10 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
                 memory[SETPOINT] = now[0]  # type: ignore[index]
                 memory[SETPOINT_SPEED] = now[1]  # type: ignore[index]
                 memory[SETPOINT_NEW] = wp.where(first, type(e)(1.0), type(e)(0.0))
-                lost += target - now[0]  # type: ignore[index]
+                mean = now[0]  # type: ignore[index]
+                if of[PROFILE_ACCELERATION] >= type(e)(1.0e8):  # over the step, as of a target
+                    mean -= type(e)(0.5) * now[1] * wp.abs(now[1]) * dt / of[PROFILE_SPEED]  # type: ignore[index]
+                lost += target - mean
                 left = e - lost
         if wp.static("rare" in features):
             kind = of[DEADBAND_KIND]

@@ -146,7 +146,8 @@ def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) 
     at, speed = np.where(fresh, q, at + speed * dt), np.where(fresh, 0.0, speed)
     for name, value in (("setpoint", at), ("setpoint_speed", speed), ("setpoint_new", np.where(fresh, 1.0, 0.0))):
         step.memory[name] = np.where(limited, value, step.memory[name])
-    return np.where(limited, at, target)
+    mean = np.where(steep < 1e8, at, at - 0.5 * speed * np.abs(speed) * dt / most)  # over the step, as of a target
+    return np.where(limited, mean, target)
 
 
 def lost_error(
