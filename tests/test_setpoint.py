@@ -200,6 +200,7 @@ def test_a_profile_in_recordings_of_a_hand_reaches_its_training(tmp_path):
     true, t, paths = mechanism(None, str(servo_with({"profile_speed": 1.4}, tmp_path / "true.yaml"))), TIMES, []
     steps = np.repeat([0.2, 1.3, 0.5, 1.5, 0.1, 0.9], 100)
     for k, way in enumerate((steps, 0.8 + 0.6 * np.sin(4 * t), np.roll(steps, 250) * 0.9, 0.7 + 0.5 * np.sin(6 * t))):
+        way = np.where(t < 0.2, 0.0, way)  # at rest where it is recorded first
         sent = Series(t, way[:, None], COMMANDS, t.copy())
         made = realistic(recorded(drive(true, sent, [JOINT], 6.0, timestep=0.001), true, sent, [JOINT]), seed=k,
                          hardware=Hardware())  # fmt: skip

@@ -70,22 +70,17 @@ def setpoints(
     dt: float,
 ) -> np.ndarray:
     """Return the setpoint [rad] and its speed [rad/s] at `times` [W] s, [N, W, 2]: by the law of `laws.profiled` in
-    steps of dt s, from position and speed `begun` [N, 2] at `start` s, or at rest from the first command on where that
-    came before.
+    steps of dt s, from position and speed `begun` [N, 2] at `start` s.
 
     rows [N, C]: servo columns; stamps [K] s, targets [K, 1 or N] rad: commands. NaN where no profile limits it, another
     joint drags the target, or no time has passed: there the joint tells."""
     out = np.full((len(rows), len(times), 2), np.nan)
-    if not len(stamps):
-        return out
-    if stamps[0] < start:
-        begun, start = begun * (1.0, 0.0), start - dt * np.ceil((start - stamps[0]) / dt)
     steps = np.rint((np.asarray(times) - start) / dt).astype(np.int32)
     limits = np.c_[rows[:, [INDEX[name] for name in PROFILE]], rows[:, [INDEX[name] for name in DELAYS]].sum(1)]
     mine = np.flatnonzero((limits[:, :2] < FREE).any(1) & (rows[:, INDEX["coupling"]] == 0))
     later = np.flatnonzero(steps > 0)
     later = later[np.argsort(steps[later], kind="stable")]
-    if not len(mine) or not len(later):
+    if not len(mine) or not len(later) or not len(stamps):
         return out
     shared = targets.shape[1] == 1
     given = np.c_[limits, begun][mine]  # guesses of a search differ in other columns, mostly
