@@ -333,11 +333,16 @@ def test_corners_of_another_mesh_are_forgotten(two_poses):
 
 @pytest.fixture(scope="module")
 def grasping():
-    """Return a closing hand of each setting, the same worlds: (hand, mujoco)."""
-    return tuple(
+    """Return a hand of each setting, the same worlds: (hand, mujoco); that of `hand` has closed."""
+    hand, mujoco_warp = (
         grasp_env("task.objects.baked_scales=[1.25]", f"sim.collision={c}", worlds=9, engine="warp")
         for c in ("hand", "mujoco")
     )
+    action = torch.zeros(9, hand.num_actions)
+    action[:, 4:], action[:, :3] = 0.5, 0.4
+    for k in range(40):
+        hand.step(action if k > 12 else 0 * action)
+    return hand, mujoco_warp
 
 
 @pytest.mark.slow
@@ -345,10 +350,6 @@ def test_both_settings_make_the_same_contacts_of_a_hand(grasping):
     """All that a contact holds: parameters bitwise, places to what MuJoCo-Warp's own search is exact to."""
     hand, mujoco_warp = grasping
     assert hand.engine.narrow is not None and mujoco_warp.engine.narrow is None
-    action = torch.zeros(9, hand.num_actions)
-    action[:, 4:], action[:, :3] = 0.5, 0.4
-    for k in range(40):
-        hand.step(action if k > 12 else 0 * action)
     hand.engine.physics_step()
     theirs, ours = mujoco_warp.engine, hand.engine
     for name in ours._fields:
