@@ -207,10 +207,10 @@ def test_a_profile_in_recordings_of_a_hand_reaches_its_training(tmp_path):
         made.meta["servo"] = ""  # what is hidden is not told
         paths.append(tmp_path / f"m{k}.mcap")
         write(paths[-1], made)
-    asked = Settings(paths, tmp_path / "out", joints={JOINT}, next_recording=False)
-    d = diagnose(asked, say=lambda _: None)
+    settings = Settings(paths, tmp_path / "out", joints={JOINT}, next_recording=False)
+    d = diagnose(settings, say=lambda _: None)
     save(d, tmp_path / "out")
-    believed = diagnose(dataclasses.replace(asked, servo=str(tmp_path / "true.yaml")), say=lambda _: None)
+    believed = diagnose(dataclasses.replace(settings, servo=str(tmp_path / "true.yaml")), say=lambda _: None)
     assert believed.data["verdict"] == "none", believed.sentence
     first = d.data["findings"][0]
     assert first["effect"] == "setpoint_profile" and first["where"]["joints"] == [JOINT], d.sentence
