@@ -86,8 +86,8 @@ def setpoints(
     given = np.c_[limits, begun][mine]  # guesses of a search differ in other columns, mostly
     once, each = np.unique(given, axis=0, return_inverse=True) if shared else (given, np.arange(len(mine)))
     made = np.empty((len(once), len(later), 2))
-    inputs = (once[:, :3], once[:, 3:], np.asarray(stamps, float), targets if shared else targets[:, mine])
-    up: list[Any] = [wp.array(np.ascontiguousarray(x), dtype=f64, device="cpu") for x in inputs]
+    arrays = (once[:, :3], once[:, 3:], np.asarray(stamps, float), targets if shared else targets[:, mine])
+    up: list[Any] = [wp.array(np.ascontiguousarray(x), dtype=f64, device="cpu") for x in arrays]
     there: Any = wp.array(made, dtype=f64, device="cpu", copy=False)
     inputs = [dt, start, *up, wp.array(steps[later], dtype=int, device="cpu"), there]
     wp.launch(_kernel(), dim=len(once), inputs=inputs, device="cpu")
