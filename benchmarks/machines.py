@@ -5,7 +5,9 @@
 
 Each node has folders, an address and, for NCCL, a host of its own: between nodes there are sockets only, within one
 what the machine has (NVLink). Compared are all ranks on one node with the same ranks on `nodes` nodes, for each rate of
-the cable in `gbit` (empty: as fast as the kernel copies). The traffic is what the kernel counted at the cables.
+the cable in `gbit` (empty: as fast as the kernel copies). The traffic is what the kernel counted at the cables, between
+iterations. From it follows what cables of 10 and 100 Gbit/s give: the seconds of an iteration on one node, or on nodes
+with a free cable, and those that the bytes need at that rate while nothing else goes on.
 device=cpu: gloo. Needs root and iproute2; where there are no namespaces, all nodes share the loopback address.
 """
 
@@ -30,6 +32,8 @@ DEFAULTS = {"gpus": "4", "nodes": "2", "gbit": ",10", "iterations": "20", "secon
 PORT = 29471
 FIRST = 5
 """Iterations that are left out of rates: kernels and graphs are made."""
+CABLES = (10.0, 100.0)
+"""Gbit/s for which is computed what they give."""
 
 
 def sh(*command: str, check: bool = True) -> subprocess.CompletedProcess:
@@ -130,46 +134,55 @@ class Nodes:
                                     env=env, stdout=log, stderr=log, start_new_session=True)  # fmt: skip
 
 
-def trained(folder: Path) -> dict[str, float]:
-    """Return medians over the iterations after the first FIRST: seconds of collecting and learning, steps a second."""
-    with open(folder / "progress.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    late = rows[min(FIRST, len(rows) - 1):]
-    return {"iterations": len(rows)} | {
-        key: float(np.median([float(r[key]) for r in late])) for key in ("collect_s", "learn_s", "rate")
-    }
+def progress(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run so far."""
+    try:
+        with open(folder / "progress.csv", newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except OSError:
+        return []
 
 
 def measure(nodes: Nodes, each: int, settings: Sequence[str], devices: Sequence[str], end: float) -> dict[str, object]:
-    """Return one training on all nodes with `each` ranks; its rates and its traffic."""
-    before, began = nodes.sent(), time.perf_counter()
+    """Return one training on all nodes with `each` ranks: medians over the iterations after the first FIRST of seconds
+    and steps a second, and the bytes that each node sent in one of these."""
+    run, began, first = nodes.folder / "node0" / "run", time.perf_counter(), (0, nodes.sent())
     started = [
         nodes.start(k, each, settings, devices[k * each: (k + 1) * each]) for k in range(nodes.count)
     ]
+    while any(p.poll() is None for p in started) and time.perf_counter() < end:
+        time.sleep(0.2)
+        if not first[0] and (done := len(progress(run))) >= FIRST:
+            first = done, nodes.sent()
     for process in started:
-        try:
-            process.wait(max(end - time.perf_counter(), 1))
-        except subprocess.TimeoutExpired:
-            for other in started:
-                other.terminate()  # torchrun passes it on to its ranks
-            break
+        process.terminate()  # torchrun passes it on to its ranks
     for process in started:
         try:
             process.wait(20)
         except subprocess.TimeoutExpired:
             process.kill()
-    sent = [b - a for a, b in zip(before, nodes.sent())]
+    sent, rows = nodes.sent(), progress(run)
     found: dict[str, object] = {
         "nodes": nodes.count, "ranks": nodes.count * each, "gbit": nodes.gbit, "namespaces": nodes.apart,
         "status": [p.returncode for p in started], "seconds": round(time.perf_counter() - began, 1),
+        "iterations": len(rows),
     }  # fmt: skip
-    try:
-        found |= trained(nodes.folder / "node0" / "run")
-        found["bytes_sent_an_iteration"] = [round(x / max(int(found["iterations"]), 1)) for x in sent]
-    except (OSError, IndexError, KeyError, ValueError) as error:
+    if len(rows) <= first[0] or not first[0]:
         tail = (nodes.folder / "node0.log").read_text("utf-8", "replace")[-1500:]
-        found["error"] = f"{type(error).__name__}: {error}; {tail}"
+        return found | {"error": f"only {len(rows)} iterations; {tail}"}
+    for key in ("collect_s", "learn_s", "rate"):
+        found[key] = float(np.median([float(r[key]) for r in rows[first[0]:]]))
+    found["steps"] = round(float(rows[-1]["steps"]) / len(rows))
+    found["bytes_sent"] = [round((b - a) / (len(rows) - first[0])) for a, b in zip(first[1], sent)]
     return found
+
+
+def computed(one: dict, free: dict, gbit: float) -> dict[str, object]:
+    """Return seconds of an iteration and steps a second over a cable of so many Gbit/s: (at most, at least) as long as
+    one node's iteration, or that of nodes with a free cable, and the bytes' own time after it."""
+    wire = 8 * max(free["bytes_sent"]) / (1e9 * gbit)
+    seconds = [row["collect_s"] + row["learn_s"] + wire for row in (one, free)]
+    return {"computed_gbit": gbit, "wire_s": wire, "seconds": seconds, "rate": [free["steps"] / s for s in seconds]}
 
 
 def main(argv: list[str]) -> int:
@@ -195,6 +208,10 @@ def main(argv: list[str]) -> int:
         (out / "machines.json").write_text(json.dumps(rows, indent=1), "utf-8")
         if end - time.perf_counter() < 20:
             break
+    if len(rows) > 1 and rows[1]["gbit"] is None and not {"error"} & {*rows[0], *rows[1]}:
+        rows += [computed(rows[0], rows[1], gbit) for gbit in CABLES]
+        print("\n".join(map(json.dumps, rows[-len(CABLES):])), flush=True)
+        (out / "machines.json").write_text(json.dumps(rows, indent=1), "utf-8")
     return 0 if all("error" not in r for r in rows) else 1
 
 

@@ -181,11 +181,7 @@ def main(argv: list[str]) -> dict[str, Any]:
         )
         for name, seed in each
     ]  # fmt: skip
-    left = [job for job in work if not (job.folder / "judged" / "metrics.json").is_file()]
-    status = jobs.run(left, engine) if left else []
-    for job, ended in zip(left, status, strict=True):
-        if ended:
-            raise UserError(f"{job.folder.name} ended with status {ended}: see {job.note.with_suffix('.txt')}")
+    tools.run(work, engine)
     values = [measured(job.folder / "judged" / "metrics.json", table.measure) for job in work]
     found = {name: [v for (n, _), v in zip(each, values, strict=True) if n == name] for name in names}
     result = {"benchmark": "rows", "table": own["table"], "measure": table.measure, "found": found}

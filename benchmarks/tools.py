@@ -16,6 +16,7 @@ import torch
 from dexsim.actuator.kernel import QUEUE
 from dexsim.cli import machine
 from dexsim.cli import start as start_up
+from dexsim.console import jobs
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -56,6 +57,15 @@ def numbers(text: str, name: str) -> list[int]:
     if not found or min(found) < 1:
         raise UserError(f"{name}={text}: must be whole numbers above 0 with commas between, e.g. {name}=64,128")
     return found
+
+
+def run(work: Sequence[jobs.Job], engine: jobs.Engine) -> None:
+    """Run the jobs that have not ended well before. Raises UserError for one that fails now, when all have ended."""
+    notes = {job: json.loads(job.note.read_text("utf-8")) for job in work if job.note.is_file()}
+    left = [job for job in work if job not in notes or notes[job]["done"] < len(job.commands)]
+    for job, status in zip(left, jobs.run(left, engine) if left else (), strict=True):
+        if status:
+            raise UserError(f"{job.folder.name} ended with status {status}: see {job.note.with_suffix('.txt')}")
 
 
 def config(argv: Sequence[str]) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
         made = sorted(p for p in stage.rglob("*") if p.is_file())
         for path in made:
             _refuse(folder, folder / path.relative_to(stage), setting)
-        sums = {str(p.relative_to(stage)): _sum(p) for p in made}
+        sums = {p.relative_to(stage).as_posix(): _sum(p) for p in made}
         _write_note(folder, _known(folder), {"stage": stage.name, "files": sums})
         _move(folder, stage, sums)
         _write_note(folder, _known(folder) | sums)
@@ -128,7 +128,7 @@ def _refuse(folder: Path, path: Path, setting: str) -> None:
     if not (path.exists() or path.is_symlink()):
         return
     inside = path.parent.resolve().is_relative_to(folder.resolve()) and not path.is_symlink()
-    known = _known(folder).get(str(path.relative_to(folder)))
+    known = _known(folder).get(path.relative_to(folder).as_posix())
     if not inside or known is None or not path.is_file() or _sum(path) != known:
         what = (
             "was changed since it was written"

@@ -1,15 +1,18 @@
 """Another operating system, as far as taking away goes: `python lesser.py SYSTEM`, then commands of dexsim as JSON
 lists, a line each, from standard input. It ends with the first status that is not 0.
 
-SYSTEM: win32 (no fork, no SIGHUP, none of the modules and calls of Unix, and a signal 0 is Ctrl-C), darwin (no
+SYSTEM: win32 (no fork, no SIGHUP, none of the modules and calls of Unix, no symbolic links, no C library without a
+name, a select for sockets only, and a signal 0 is Ctrl-C), darwin (no
 affinity, no /dev/shm, no count of free pages) or linux. On each a file that is opened without its encoding named is an
 error, since what it would be is another on Windows."""
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import json
 import os
+import select
 import signal
 import sys
 import types
@@ -23,6 +26,15 @@ UNIX = {
          "geteuid", "getpgid", "setsid", "killpg", "uname", "mkfifo", "nice"),
     ),
 }  # fmt: skip
+
+
+def refused(why: str):
+    """Return a call that is refused."""
+
+    def call(*_, **__):
+        raise OSError(why)
+
+    return call
 
 
 def become(name: str) -> None:
@@ -46,6 +58,16 @@ def become(name: str) -> None:
             kill(pid, number)
 
         os.kill = careful
+        load = ctypes.CDLL.__init__
+
+        def named(self, name, *rest, **more):
+            if name is None:
+                raise TypeError("argument of type 'NoneType' is not iterable")
+            load(self, name, *rest, **more)
+
+        ctypes.CDLL.__init__ = named
+        os.symlink = refused("a required privilege is not held by the client")
+        select.select = refused("an operation was attempted on something that is not a socket")
     from dexsim import system
 
     system.sys = types.SimpleNamespace(platform=name)

@@ -4,144 +4,58 @@ refuses."""
 from __future__ import annotations
 
 import json
-import threading
-import time
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from benchmarks import tools
 from benchmarks.loop import __main__ as loop
 from benchmarks.loop import worlds
+from dexsim.console import jobs
+from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[1]
 
 
-def test_queue_keeps_order_and_goes_on_where_it_stopped(tmp_path):
-    done = []
+def test_each_step_reads_what_the_steps_before_it_write(tmp_path, monkeypatch):
+    """Every file that a command names is one of an earlier step, of an earlier command of its job, or comes with
+    dexsim."""
+    one = loop.Loop(loop.SETTINGS | {"out": str(tmp_path), "seeds": "2"}, ["worlds=4"])
+    monkeypatch.setattr(one, "fitted", lambda world: tmp_path / f"fitted_{world}.yaml")
+    monkeypatch.setattr(loop.presses, "feels_others", lambda path: True)
+    made, counts = [tmp_path / f"{kind}_{w}.yaml" for kind in ("fitted", "true") for w in one.worlds], {}
+    for step in (one.start, one.naive, one.found, one.summed, one.tuned, one.judged):
+        work = list(step())
+        counts[step.__name__] = len(work)
+        assert len({job.folder for job in work}) == len(work)  # a place of its own each
+        for job in work:
+            for command in job.commands:
+                paths = [(word.partition("=")[0], Path(p)) for word in command if "=" in word
+                         for p in word.partition("=")[2].strip("[]").split(",") if p.startswith(str(tmp_path))]
+                wrong = [p for n, p in paths if n not in ("out", "record") and not any(map(p.is_relative_to, made))]
+                assert not wrong, (step.__name__, command)
+                made += [path for name, path in paths if name in ("out", "record")]
+                assert made[-1].is_relative_to(job.folder)
+    # two tasks, two seeds, two realities: a drive, five fingertips and a pinch each; wide once for both realities
+    assert counts == {"start": 4, "naive": 4, "found": 14, "summed": 2, "tuned": 20, "judged": 32}
+    fitted = next(one.tuned()).commands[0]
+    assert "tactile.feel_others=true" in fitted and fitted[-1] == "worlds=4"
 
-    def job(name, after=(), gpu=False, good=True):
-        def run(slot):
-            done.append((name, slot))
-            return good
 
-        return loop.Job(name, tmp_path / name, run, gpu, list(after))
-
-    jobs = lambda: [  # noqa: E731
-        job("judge", ["train"]),
-        job("train", ["start"], gpu=True),
-        job("start"),
-        job("broken", good=False),
-        job("after", ["broken"]),
+def test_what_ended_well_is_not_repeated_and_what_failed_is_said(tmp_path):
+    code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit(int(sys.argv[2]))"
+    work = [
+        jobs.Job((("-c", code, str(tmp_path / name), status),), tmp_path / "work" / name, (sys.executable,))
+        for name, status in (("good", "0"), ("bad", "3"))
     ]
-    loop.Queue(jobs(), ["3"], 1, 0.0, 0.0, lambda: None).go()
-    names = [n for n, _ in done]
-    assert names.index("start") < names.index("train") < names.index("judge") and "after" not in names
-    assert dict(done)["train"] == "3" and dict(done)["judge"] == "cpu"
-    done.clear()
-    loop.Queue(jobs(), ["3"], 1, 0.0, 0.0, lambda: None).go()
-    assert [n for n, _ in done] == ["broken"]  # only what did not work is tried again
-
-
-def test_queue_without_a_gpu_shares_the_cores_out(tmp_path):
-    """Trainings take cores then; never more than there are, and a large job is not overtaken by small ones of a higher
-    rank."""
-    lock, now, most, order = threading.Lock(), [0], [0], []
-
-    def job(name, cores, rank=0, gpu=False, after=()):
-        def run(slot):
-            with lock:
-                now[0] += min(cores, 3)
-                most[0] = max(most[0], now[0])
-                order.append(name)
-            assert slot == "cpu"
-            time.sleep(0.05)
-            with lock:
-                now[0] -= min(cores, 3)
-            return True
-
-        return loop.Job(name, tmp_path / name, run, gpu, list(after), rank, cores)
-
-    every = [
-        job("record", 1),
-        job("diagnose", 9, rank=1, after=["record"]),
-        *(job(f"train {k}", 1, rank=2, gpu=True, after=["record"]) for k in range(6)),
-    ]
-    queue = loop.Queue(every, [], 3, 0.0, 0.0, lambda: None)
-    queue.go()
-    assert set(queue.state.values()) == {"done"} and most[0] == 3 and order[:2] == ["record", "diagnose"]
-
-
-def test_queue_lets_others_go_before(tmp_path):
-    """A job that is behind another waits until that one has begun, however many cores are free; not for ever for one
-    that failed."""
-    begun = []
-
-    def job(name, after=(), behind=(), good=True):
-        def run(slot):
-            begun.append(name)
-            time.sleep(0.02)
-            return good
-
-        return loop.Job(name, tmp_path / name, run, False, list(after), 0, 1, list(behind))
-
-    loop.Queue(
-        [
-            job("judge", behind=["diagnose", "lost"]),
-            job("record"),
-            job("diagnose", ["record"]),
-            job("bad", good=False),
-            job("lost", ["bad"]),
-        ],
-        [],
-        8,
-        0.0,
-        0.0,
-        lambda: None,
-    ).go()
-    assert begun.index("judge") > begun.index("diagnose") and "lost" not in begun
-
-
-def test_the_first_that_ends_well_counts_and_a_gpu_joins_after_its_diagnosis(tmp_path):
-    one = loop.Loop(
-        loop.SETTINGS
-        | {"out": str(tmp_path), "gpus": "0", "diagnose_gpus": "3", "diagnose_slots": "3", "worlds": "late,stiff"}
-    )
-    wait = lambda s, status=0: (  # noqa: E731
-        ["-c", f"import time; time.sleep({s}); raise SystemExit({status})"],
-        tmp_path / f"{s}.log",
-        "",
-        1,
-    )
-    start = time.perf_counter()
-    assert (
-        one.first([wait(30), wait(0.1, 1), wait(0.3)], 20.0) == 2
-        and time.perf_counter() - start < 25
-        and not one.running
-    )
-    assert (
-        one.first([wait(0.1, 1)], 20.0) is None
-        and one.first([wait(30)], 0.3) is None
-        and one.call(wait(0.1, 3)[0], tmp_path / "x.log") != 0
-    )
-    frees = {j.name: j.frees for j in one.jobs() if j.frees}
-    assert frees == {"diagnose late": ["3", "3"], "diagnose stiff": ["3"]}
-    assert [loop.Loop(one.s | {"diagnose_gpus": g}).helper("stiff") for g in ("", "2", "2,3")] == ["", "2", "3"]
-    used = []
-    job = lambda name, gpu, after=(), frees=(): loop.Job(  # noqa: E731
-        name, tmp_path / name, lambda slot: not used.append((name, slot)), gpu, list(after), frees=list(frees)
-    )
-    loop.Queue(
-        [job("diagnose", False, frees=["3"]), *(job(f"train {k}", True, ["diagnose"]) for k in range(4))],
-        ["0"],
-        2,
-        0.0,
-        0.0,
-        lambda: None,
-    ).go()
-    assert {slot for name, slot in used if name != "diagnose"} == {"0", "3"}
+    for _ in range(2):
+        with pytest.raises(UserError, match="bad ended with status 3: see .*bad.txt"):
+            tools.run(work, jobs.Engine())
+    assert (tmp_path / "good").read_text() == "x" and (tmp_path / "bad").read_text() == "xx"
 
 
 def test_share_recovered_by_hand():
@@ -168,7 +82,7 @@ def test_report_reads_what_was_judged(tmp_path):
     one = loop.Loop(s)
     for seed in (1, 2):
         for variant, held in zip(loop.VARIANTS, (0.5, 0.6, 0.7 + 0.1 * seed, 0.9), strict=True):
-            where = one.folder("grasp", seed, "stiff") / f"judged_{variant}"
+            where = one.place("judged", "grasp", seed, variant, "stiff")
             where.mkdir(parents=True)
             (where / "metrics.json").write_text(json.dumps({"hold_rate_all": held, "force_error_N": 1.0}))
     line = one.report()["lines"][0]
@@ -176,20 +90,6 @@ def test_report_reads_what_was_judged(tmp_path):
         (85 - 50) / 40
     )
     assert "85" in loop.markdown(one.report())
-    jobs = {j.name: j for j in one.jobs()}
-    assert (
-        jobs["fitted grasp 1 stiff"].after == ["diagnose stiff", "touch stiff", "naive grasp 1"]
-        and jobs["naive grasp 1"].gpu
-        and not jobs["judge naive grasp 1 stiff"].gpu
-    )
-    assert (
-        jobs["diagnose stiff"].after == ["excite stiff"]
-        and jobs["excite stiff"].after == ["own grasp stiff"]
-        and jobs["own grasp stiff"].after == ["naive grasp 1"]
-    )
-    assert max(j.rank for j in jobs.values() if j.name.startswith(("fitted", "truth"))) < jobs["wide grasp 1"].rank
-    fewer = {j.name for j in loop.Loop(s | {"variants": "fitted,truth"}).jobs()}
-    assert set(jobs) - fewer == {"wide grasp 1", "wide grasp 2", "judge wide grasp 1 stiff", "judge wide grasp 2 stiff"}
 
 
 def test_excitation_is_as_fast_as_the_policies_were():
@@ -213,13 +113,14 @@ def test_training_draws_near_what_was_found(tmp_path):
     stays."""
     from dexsim.actuator.table import ServoTable
 
-    (tmp_path / "diagnosis_late").mkdir()
+    found = tmp_path / "drives" / "late" / "diagnosis"
+    found.mkdir(parents=True)
     text = (
         "drive: torque\njoints:\n  '*': {kp: 4.0, kd: 0.1}\n  mid_joint1: {lag: {value: 0.02, low: 0.0, high: "
         "0.16}, kp: {value: 4.1, low: 3.0, high: 4.2}}\n"
     )
-    (tmp_path / "diagnosis_late" / "servo.yaml").write_text(text)
-    table = ServoTable.load(loop.Loop(loop.SETTINGS | {"out": str(tmp_path)}).fitted(tmp_path / "x", "late"))
+    (found / "servo.yaml").write_text(text)
+    table = ServoTable.load(loop.Loop(loop.SETTINGS | {"out": str(tmp_path)}).fitted("late"))
     lag, kp = (table.value("mid_joint1", k) for k in ("lag", "kp"))
     assert (lag.value, lag.low, lag.high) == pytest.approx((0.02, 0.015, 0.025)) and (kp.low, kp.high) == pytest.approx(
         (4.1 - 0.205, 4.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import json
 import os
@@ -20,7 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LESSER = Path(__file__).with_name("lesser.py")
 ONLY_HERE = (
     "SIGHUP", "sched_getaffinity", "register_at_fork", "sysconf", "statvfs", "fcntl", "osmesa", "/dev/shm", "getppid",
-    "os.kill(", "sys.platform", "import resource", "import pwd", "os.fork", "killpg", "setsid",
+    "os.kill(", "sys.platform", "import resource", "import pwd", "os.fork", "killpg", "setsid", "CDLL", "sys.stdin]",
+    "symlink_to(", "/proc/", "os.uname", "os.nice", "setpriority", "mkfifo", "AF_UNIX", "getuid", "posix_",
 )  # fmt: skip
 """For one system, or different between them."""
 
@@ -51,6 +53,39 @@ def test_systems_are_named_in_one_file():
         if word in line and ("(" in line or "import" in line) and '"""' not in line and path.name != "system.py"
     ]
     assert not found, "\n".join(found)
+
+
+def test_text_is_read_and_written_as_utf_8():
+    """What a system takes where nothing is said differs. Of calls with a mode of bytes nothing is asked."""
+    found = []
+    for path in sorted((ROOT / "dexsim").rglob("*.py")):
+        for call in (n for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, ast.Call)):
+            name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+            said = [k.arg for k in call.keywords]
+            texts = [a.value for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            if name == "open" and (isinstance(call.func, ast.Name) or texts and set(texts[0]) <= set("rwaxb+")):
+                plain = "encoding" not in said and not any("b" in t for t in texts)
+            elif name in ("read_text", "write_text"):
+                plain = "encoding" not in said and not {"utf-8", "ascii"} & set(texts)
+            else:
+                plain = bool({"text", "universal_newlines"} & set(said)) and "encoding" not in said
+            if plain:
+                found.append(f"{path.relative_to(ROOT)}:{call.lineno}: {ast.unparse(call)[:80]}")
+    assert not found, "\n".join(found)
+
+
+def test_a_key_ends_a_wait_on_each_system(monkeypatch):
+    read, write = os.pipe()
+    with os.fdopen(read) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        assert not system.key_pressed()
+        os.write(write, b"\n")
+        assert system.key_pressed() and not system.key_pressed()
+    os.close(write)
+    keys = ["q"]
+    monkeypatch.setitem(sys.modules, "msvcrt", types.SimpleNamespace(kbhit=lambda: bool(keys), getwch=keys.pop))
+    monkeypatch.setattr(system, "sys", types.SimpleNamespace(platform="win32"))
+    assert system.key_pressed() and not system.key_pressed()
 
 
 @pytest.mark.parametrize("platform, names", [("linux", ("egl", "osmesa")), ("darwin", ("cgl",)), ("win32", ("wgl",))])

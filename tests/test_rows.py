@@ -29,7 +29,10 @@ def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
     asked = []
 
     def attempt(job, env=None):
-        return max(run([*job.program, *command]) for command in job.commands)
+        status = max(run([*job.program, *command]) for command in job.commands)
+        job.note.parent.mkdir(parents=True, exist_ok=True)
+        job.note.write_text(json.dumps({"done": len(job.commands)}))
+        return status
 
     def run(command):
         asked.append(command[3:])

@@ -83,11 +83,11 @@ def test_how_far_a_part_is_is_known_while_it_runs(tmp_path):
 
 
 LEAKS = """
-import runpy, sys, time
+import sys, time
 from pathlib import Path
 import numpy as np
+from dexsim.system import give_back
 from tests.soak import parts
-give_back = runpy.run_path("dexsim/sim/memory.py")["give_back"]  # without the engines, which its package loads
 rng, kept = np.random.default_rng(0), []
 for k in range(100):
     pieces = [bytearray(int(n)) for n in rng.integers(1000, 300_000, 60)]  # an environment, of some 9 MB

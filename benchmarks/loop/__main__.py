@@ -1,25 +1,19 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run
 again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... |
-    gpus=none]
-                              [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0]
-                              [kill_s=0] [report=false] [train_cores=1] [judge_cores=2] [diagnose_cores=8]
-                              [variants=wide,fitted,truth] [diagnose_gpus=2,3 diagnose_slots=3] [train="worlds=64 ..."]
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,...]
+                              [on=slurm|dask] [at_once=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [cap_s=60]
+                              [variants=wide,fitted,truth] [out=out/loop] [report=false] [any setting of train.py]
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without
 randomization of the drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand
 under safe excitation that is as fast as they were, then presses on its five fingertips; all that is diagnosed once.
-Then three fine-tunes of each naive checkpoint of `tune`
-iterations: with the servo table and the touch that `diagnose` fitted (the intervals are the randomization), with wide
-randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in
-the reality on the same episodes. All steps are commands of the product. One GPU a training, as many at a time as `gpus`
-lists (0,0: two share one); judging, recording and diagnosing use the CPUs meanwhile. gpus=none (the default): trainings
-run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU, fine-tuning a policy that has converged
-changes next to nothing, so that is for trying the command. diagnose_gpus: GPUs beside those of gpus= on which the
-diagnoses are computed too (a reality each), and then so many trainings at a time. Resumable: a step that is done is not
-repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
-runs is ended. Writes loop.json and table.md.
+Then three fine-tunes of each naive checkpoint of `tune` iterations: with the servo table and the touch that `diagnose`
+fitted (the intervals are the randomization), with wide randomization of the believed drives alone, and with the true
+drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of
+the product. gpus: as many trainings at a time as there are names (0,0: two share one); none: one, on the CPU, where
+fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. at_once: of what
+runs on cores, recordings, diagnoses and judgements. Goes on where it was interrupted. Writes loop.json and table.md.
 """
 
 from __future__ import annotations
@@ -27,33 +21,27 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
-import subprocess
 import sys
-import threading
-import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
 from scipy.stats import t as student
 
+from benchmarks import tools
 from benchmarks.loop import presses
-from benchmarks.loop.steps import FAST, KEPT
-from benchmarks.options import options
+from benchmarks.loop.steps import EXCITED, FAST, KEPT
 from dexsim import intervals
-from dexsim.console.ending import guard
+from dexsim.console import jobs
+from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
+from dexsim.typed import whole
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "",
-            "cpus": str(os.cpu_count() or 1),
-            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "",
-            "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
-            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth",
-            "diagnose_gpus": "",
-            "diagnose_slots": "3"}  # fmt: skip
+            "episodes": "grasp:256,rotate:64", "out": "out/loop", "report": "false", "cap_s": "60", "diagnose_s": "600",
+            "variants": "wide,fitted,truth"}  # fmt: skip
 # what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand
 # beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
@@ -66,492 +54,158 @@ WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
 OWN_S = 20  # s of a rotation policy's own run that are recorded
 DRAWN = 0.25  # share of what was found by which training draws about it, at most
-JUDGING = 75.0  # s that judging may be begun after the last training
 FINGERS = ("thumb", "index", "mid", "ring", "pinky")
 VARIANTS = ("naive", "wide", "fitted", "truth")
-
-
-@dataclass
-class Job:
-    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or "cpu". gpu:
-    takes a GPU where there are any; cores: that it takes otherwise."""
-
-    name: str
-    mark: Path
-    run: object
-    gpu: bool
-    after: list[str] = field(default_factory=list)
-    rank: int = 0
-    cores: int = 1
-    behind: list[str] = field(default_factory=list)
-    frees: list[str] = field(default_factory=list)
-
-
-class Queue:
-    """Runs jobs on GPUs and CPU cores as their predecessors finish, the lowest rank first: none of a higher one
-    overtakes it."""
-
-    def __init__(self, jobs: list[Job], gpus: list[str], cores: int, stop_s: float, kill_s: float, kill):
-        self.jobs = {j.name: j for j in jobs}
-        self.gpus, self.with_gpus, self.cores, self.free = list(gpus), bool(gpus), cores, cores
-        self.stop_s, self.kill_s, self.kill = stop_s, kill_s, kill
-        self.state = {j.name: "done" if j.mark.is_file() else "waits" for j in jobs}
-        self.gpus += [g for j in jobs if self.state[j.name] == "done" for g in j.frees]
-        self.lock, self.begun = threading.Condition(), time.perf_counter()
-
-    def _takes(self, job: Job) -> int:
-        """Return the cores of a job; a training on a GPU takes none."""
-        return 0 if job.gpu and self.with_gpus else min(job.cores, self.cores)
-
-    def go(self) -> None:
-        """Until nothing can be begun any more."""
-        threads: list[threading.Thread] = []
-        with self.lock:
-            while True:
-                spent = time.perf_counter() - self.begun
-                if self.kill_s and spent > self.kill_s:
-                    self.kill()
-                full = False
-                for job in sorted(self.jobs.values(), key=lambda j: j.rank):
-                    late = self.stop_s and spent > self.stop_s + (0.0 if job.gpu else JUDGING)
-                    if self.state[job.name] != "waits" or late:
-                        continue
-                    before = [self.state[a] for a in job.after]
-                    if "failed" in before:
-                        self.state[job.name] = "failed"
-                        print(f"  {job.name}: left out, what it needs failed", flush=True)
-                        continue
-                    if any(s != "done" for s in before) or any(self.state[b] == "waits" for b in job.behind):
-                        continue
-                    on_gpu = job.gpu and self.with_gpus
-                    if on_gpu and not self.gpus or not on_gpu and (full or self.free < self._takes(job)):
-                        full = full or not on_gpu
-                        continue
-                    slot = self.gpus.pop(0) if on_gpu else "cpu"
-                    self.free -= self._takes(job)
-                    self.state[job.name] = "runs"
-                    threads.append(threading.Thread(target=self._one, args=(job, slot), daemon=True))
-                    threads[-1].start()
-                if not any(s == "runs" for s in self.state.values()):
-                    break
-                self.lock.wait(1.0)
-
-    def _one(self, job: Job, slot: str) -> None:
-        start = time.perf_counter()
-        try:
-            good = bool(job.run(slot))
-        except Exception as error:  # the others go on
-            print(f"  {job.name}: {type(error).__name__}: {error}", flush=True)
-            good = False
-        if good:
-            job.mark.parent.mkdir(parents=True, exist_ok=True)
-            job.mark.write_text(f"{time.perf_counter() - start:.1f}\n", encoding="utf-8")
-        with self.lock:
-            self.state[job.name] = "done" if good else "failed"
-            self.gpus += job.frees + ([slot] if slot != "cpu" else [])
-            self.free += self._takes(job)
-            done = sum(s in ("done", "failed") for s in self.state.values())
-            spent = time.perf_counter() - self.begun
-            print(
-                f"  {done}/{len(self.state)} {job.name} {'done' if good else 'FAILED'}"
-                f" {time.perf_counter() - start:.0f} s; {spent:.0f} s spent",
-                flush=True,
-            )
-            self.lock.notify_all()
+STEPS, PRESSES = "benchmarks.loop.steps", "benchmarks.loop.presses"
 
 
 class Loop:
-    """The jobs and where their results are."""
+    """The jobs, each a command or several of the product, and where their results are. s: settings; extra: those of
+    training; device: of trainings and judgements."""
 
-    def __init__(self, s: dict[str, str]):
+    def __init__(self, s: dict[str, str], extra: Sequence[str] = (), device: str = "cpu") -> None:
         self.s, self.out = s, Path(s["out"]).expanduser().resolve()
-        self.tasks, self.worlds = s["tasks"].split(","), s["worlds"].split(",")
-        self.variants = set(s["variants"].split(","))
-        self.seeds = list(range(1, int(s["seeds"]) + 1))
-        self.gpus = [g for g in s["gpus"].split(",") if g not in ("", "none")]
-        self.episodes = {k: int(v) for k, v in (part.split(":") for part in s["episodes"].split(","))}
-        self.running: set[subprocess.Popen] = set()
-        self.extra = [x for x in s["train"].split(" ") if x]
-        self.cores = int(s["cpus"])
-        self.uses = {k: max(1, min(int(s[f"{k}_cores"]), self.cores)) for k in ("train", "judge", "diagnose")}
+        self.tasks, self.worlds, self.variants = (s[k].split(",") for k in ("tasks", "worlds", "variants"))
+        if wrong := set(self.variants) - set(VARIANTS[1:]):
+            raise UserError(f"variants={wrong.pop()}: must be of {', '.join(VARIANTS[1:])}")
+        self.each = [(task, seed) for task in self.tasks for seed in range(1, whole("seeds", s["seeds"], 1, 99) + 1)]
+        self.episodes = dict(part.split(":") for part in s["episodes"].split(","))
+        self.extra, self.device = list(extra), device
 
-    def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 3600.0, threads: int = 1) -> int:
-        """Return a command of the product, its output in a file. gpu: the one that it sees; threads:
-        OMP_NUM_THREADS."""
-        return 0 if self.first([(argv, log, gpu, threads)], limit) == 0 else 1
+    def place(self, step: str, *names: object) -> Path:
+        """Return the folder of a step: STEP/NAME_NAME."""
+        return self.out / step / "_".join(map(str, names))
 
-    def first(self, commands: list[tuple[list[str], Path, str, int]], limit: float) -> int | None:
-        """Runs commands (argv, log, gpu, threads) side by side until one has ended well, and ends the others: its
-        number, or None."""
-        processes = []
-        for argv, log, gpu, threads in commands:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            env = os.environ | {
-                "OMP_NUM_THREADS": str(threads),
-                "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
-            }
-            env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
-            with open(log, "w", encoding="utf-8") as file:
-                processes.append(
-                    subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
-                )
-            if len(commands) > 1 and not gpu:  # what has a GPU beside it leaves that one its cores
-                os.setpriority(os.PRIO_PROCESS, processes[-1].pid, 10)
-        self.running |= set(processes)
-        end = time.perf_counter() + limit
-        try:
-            while time.perf_counter() < end:
-                status = [p.poll() for p in processes]
-                if 0 in status:
-                    return status.index(0)
-                if None not in status:
-                    return None
-                time.sleep(0.1)
-            return None
-        finally:
-            for p in processes:
-                if p.poll() is None:
-                    p.kill()
-                    p.wait()
-            self.running -= set(processes)
+    def job(self, folder: Path, *commands: Sequence[object], resumes: bool = False) -> jobs.Job:
+        """Return a job of modules with their arguments."""
+        return jobs.Job(tuple(tuple(map(str, c)) for c in commands), folder, (sys.executable, "-m"), resumes)
 
-    def kill(self) -> None:
-        """Ends what this program began."""
-        for process in list(self.running):
-            process.kill()
+    def train(self, resume: Path, iterations: int, out: Path, *settings: object) -> jobs.Job:
+        """Return a training that goes on."""
+        worlds = f"worlds={128 if self.device == 'cpu' else 8192}"
+        return self.job(out, ("dexsim", "train", f"resume={resume}", f"iterations={iterations}", f"out={out / 'run'}",
+                              f"device={self.device}", "final_episodes=0", worlds, *settings, *self.extra),
+                        resumes=True)  # fmt: skip
 
-    def folder(self, task: str, seed: int, world: str = "") -> Path:
-        return self.out / f"{task}_{seed}" / world
+    def policy(self, task: str, seed: int, variant: str, world: str) -> Path:
+        """Return the policy of a variant that is judged in a reality."""
+        return self.place("trained", task, seed, variant, *[world] * (variant in ("fitted", "truth"))) / "run/policy.pt"
 
-    def device(self, slot: str) -> str:
-        return "cpu" if slot == "cpu" else "cuda"
+    def play(self, policy: Path, task: str, world: str, out: Path, cap_s: object, *settings: object) -> tuple:
+        """Return the command that plays a policy in a reality."""
+        cap = [f"task.evaluation.cap_s={cap_s}"] if task == "rotate" else []
+        return ("dexsim", "play", f"checkpoint={policy}", f"reality={world}", "device=cpu", "video=false", f"out={out}",
+                *cap, *settings)  # fmt: skip
 
-    def naive(self, task: str, seed: int):
-        def run(slot: str) -> bool:
-            where = self.folder(task, seed)
-            shutil.rmtree(where / "naive", ignore_errors=True)
-            device = self.device(slot)
-            if not (where / "start.pt").is_file():
-                fixed = [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, FIXED).items()]
-                status = self.call(["-m", "benchmarks.loop.steps", "start",
-                                    f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"out={where / 'start.pt'}",
-                                    f"device={device}", f"seed={seed}", *fixed], where / "start.log", slot)  # fmt: skip
-                if status:
-                    return False
-            worlds = ["worlds=128", f"sim.threads={self.uses['train']}"] if device == "cpu" else ["worlds=8192"]
-            self.call(["train.py", f"resume={where / 'start.pt'}", f"iterations={self.s['naive']}",
-                       f"out={where / 'naive'}", f"device={device}",
-                       "final_episodes=0", "save_interval=100000", *worlds, *self.extra], where / "naive.log",
-                       slot)  # fmt: skip
-            return (where / "naive" / "policy.pt").is_file()
+    def start(self) -> Iterator[jobs.Job]:
+        """Yield what makes of each included policy one that may be trained on, another for each seed."""
+        for task, seed in self.each:
+            out, policy = self.place("start", task, seed), ROOT / "checkpoints" / f"{task}.pt"
+            fixed = [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, FIXED).items()]
+            yield self.job(out, (STEPS, "start", f"checkpoint={policy}", f"out={out / 'last.pt'}",
+                                 f"device={self.device}", f"seed={seed}", *fixed))  # fmt: skip
 
-        return run
+    def naive(self) -> Iterator[jobs.Job]:
+        """Yield the naive trainings."""
+        for task, seed in self.each:
+            begin = self.place("start", task, seed) / "last.pt"
+            yield self.train(begin, int(self.s["naive"]), self.place("trained", task, seed, "naive"))
+
+    def found(self) -> Iterator[jobs.Job]:
+        """Yield what is recorded in each reality, and diagnosed: the empty hand, as fast as the first naive policies
+        move there; and each fingertip. One reality is one hand: it is diagnosed once, from what was excited. The
+        policies' own runs say how fast that has to be, and are not fitted: a joint is judged while nothing is touched,
+        and most of what they touch carries no taxels. What they command, played again on the empty hand, throws the
+        joints against the ends of their motion (lab/results/loop.md)."""
+        diagnose = ("dexsim", "diagnose", "next=false", f"limit={self.s['diagnose_s']}", "replay=none")
+        for w in self.worlds:
+            out, touch, own = self.place("drives", w), self.place("touch", w), []
+            commands: list[tuple] = []
+            for task in self.tasks:
+                policy = self.policy(task, 1, "naive", w)
+                own.append(out / f"{task}.mcap")
+                commands.append(self.play(policy, task, w, out / task, OWN_S, "episodes=4", "seed=101",
+                                          f"record={own[-1]}", "record_worlds=1", "realistic=true"))  # fmt: skip
+            excited = [out / f"excite_{k}.mcap" for k in range(len(EXCITED))]
+            fit, held = [*excited[:-KEPT], out / FAST[0]], [*excited[-KEPT:], out / FAST[1]]
+            yield self.job(
+                out, *commands,
+                (STEPS, "record", f"world={w}", f"own={','.join(map(str, own))}", f"out={out}", "seed=1"),
+                (*diagnose, _listed("recordings", fit), _listed("held_out", held), f"out={out / 'diagnosis'}"),
+            )  # fmt: skip
+            for finger in FINGERS:
+                tip = self.place("presses", w, finger)
+                yield self.job(
+                    tip, (PRESSES, "record", f"world={w}", f"finger={finger}", f"out={tip}"),
+                    (*diagnose, f"recordings={tip / 'press_*.mcap'}", f"model={tip / 'rig.xml'}",
+                     f"servo={tip / 'rig.yaml'}", f"out={tip / 'found'}"),
+                )  # fmt: skip
+            yield self.job(touch, (PRESSES, "pinch", f"world={w}", f"out={touch / 'pinch.mcap'}"))
+
+    def summed(self) -> Iterator[jobs.Job]:
+        """Yield what makes of five fingertips the touch of each reality, as training takes it."""
+        for w in self.worlds:
+            tips = ",".join(str(self.place("presses", w, f)) for f in FINGERS)
+            out = self.place("tactile", w)
+            yield self.job(out, (PRESSES, "sum", f"found={tips}", f"out={out / 'tactile.yaml'}"))
+
+    def tuned(self) -> Iterator[jobs.Job]:
+        """Yield the fine-tunes: fitted and true physics of each reality first, wide randomization last."""
+        last = int(self.s["naive"]) + int(self.s["tune"])
+        for variant in (v for v in ("fitted", "truth", "wide") if v in self.variants):
+            for w in self.worlds[:1] if variant == "wide" else self.worlds:
+                for task, seed in self.each:
+                    out = self.policy(task, seed, variant, w).parents[1]
+                    begin = self.policy(task, seed, "naive", w).with_name("last.pt")
+                    yield self.train(begin, last, out, *getattr(self, f"_{variant}")(task, w))
+
+    def judged(self) -> Iterator[jobs.Job]:
+        """Yield what judges every policy in the realities, on the same episodes."""
+        for task, seed in self.each:
+            for variant in ("naive", *self.variants):
+                for w in self.worlds:
+                    out, policy = self.place("judged", task, seed, variant, w), self.policy(task, seed, variant, w)
+                    yield self.job(out, self.play(policy, task, w, out, self.s["cap_s"], "seed=77",
+                                                  f"episodes={self.episodes[task]}"))  # fmt: skip
 
     def _ranges(self, task: str, values: dict) -> dict:
         """Return those that the task's randomization has."""
-        own = yaml.safe_load(
-            (CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(
-                encoding="utf-8"
-            )
-        )["servo"]
+        file = CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")
+        own = yaml.safe_load(file.read_text(encoding="utf-8"))["servo"]
         return {k: v for k, v in values.items() if k in own}
 
-    def tune(self, task: str, seed: int, variant: str, world: str):
-        def run(slot: str) -> bool:
-            base = self.folder(task, seed)
-            where = base / (f"tune_{variant}" if variant == "wide" else f"{world}/tune_{variant}")
-            shutil.rmtree(where, ignore_errors=True)
-            argv = ["train.py", f"resume={base / 'naive' / 'last.pt'}",
-                    f"iterations={int(self.s['naive']) + int(self.s['tune'])}", f"out={where}",
-                    f"device={self.device(slot)}", "final_episodes=0", "save_interval=100000",
-                    *([f"sim.threads={self.uses['train']}"] if slot == "cpu" else []), *self.extra]  # fmt: skip
-            if variant == "wide":
-                argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
-            elif variant == "fitted":
-                argv += [
-                    f"servo_file={self.fitted(base, world)}",
-                    f"tactile_file={self.out / f'touch_{world}' / 'tactile.yaml'}",
-                ]
-                if presses.feels_others(self.out / f"touch_{world}" / "pinch.mcap"):
-                    argv.append("tactile.feel_others=true")
-            else:
-                true = yaml.safe_load((CONFIGS / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
-                (base / world).mkdir(parents=True, exist_ok=True)
-                (base / world / "true.yaml").write_text(
-                    yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8"
-                )
-                argv.append(f"servo_file={base / world / 'true.yaml'}")
-                argv += [
-                    f"tactile.{k}={str(v).lower() if isinstance(v, bool) else v}" for k, v in true["tactile"].items()
-                ]
-            self.call(argv, where.parent / f"{where.name}.log", slot)
-            return (where / "policy.pt").is_file()
+    def _wide(self, task: str, world: str) -> list[str]:
+        return [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
 
-        return run
+    def _truth(self, task: str, world: str) -> list[str]:
+        true = yaml.safe_load((CONFIGS / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
+        path = self.out / f"true_{world}.yaml"
+        path.write_text(yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8")
+        said = {k: str(v).lower() if isinstance(v, bool) else v for k, v in true["tactile"].items()}
+        return [f"servo_file={path}", *(f"tactile.{k}={v}" for k, v in said.items())]
 
-    def fitted(self, base: Path, world: str) -> Path:
+    def _fitted(self, task: str, world: str) -> list[str]:
+        given = [f"servo_file={self.fitted(world)}", f"tactile_file={self.place('tactile', world) / 'tactile.yaml'}"]
+        others = presses.feels_others(self.place("touch", world) / "pinch.mcap")
+        return given + ["tactile.feel_others=true"] * others
+
+    def fitted(self, world: str) -> Path:
         """Return the servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is
         that of one figure with all others free (a longer delay goes with a shorter lag), and drawn at once their
         corners are drives that no recording allows. A range that `diagnose` let reach the belief, being unsure, is
         cut like the others."""
         from dexsim.actuator.table import ServoTable
 
-        belief, table = (
-            ServoTable.load(CONFIGS / "servo" / "xhand.yaml"),
-            ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml"),
-        )
+        belief = ServoTable.load(CONFIGS / "servo" / "xhand.yaml")
+        table = ServoTable.load(self.place("drives", world) / "diagnosis" / "servo.yaml")
         for joint, columns in table.entries.items():
             for name, v in columns.items():
                 if not v.unknown and v.low < v.high:
                     half = DRAWN * max(abs(v.value - belief.value(joint, name).value), 0.2 * abs(v.value))
                     table.set(joint, name, v.value, max(v.low, v.value - half), min(v.high, v.value + half))
-        (base / world).mkdir(parents=True, exist_ok=True)
-        table.save(base / world / "fitted.yaml")
-        return base / world / "fitted.yaml"
-
-    def policy(self, task: str, seed: int, variant: str, world: str) -> Path:
-        base = self.folder(task, seed)
-        return base / {"naive": "naive", "wide": "tune_wide"}.get(variant, f"{world}/tune_{variant}") / "policy.pt"
-
-    def judge(self, task: str, seed: int, variant: str, world: str):
-        def run(slot: str) -> bool:
-            where = self.folder(task, seed, world) / f"judged_{variant}"
-            cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
-            status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}",
-                                f"episodes={self.episodes[task]}",
-                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap],
-                                where / "log.txt", limit=900)  # fmt: skip
-            return status == 0 and (where / "metrics.json").is_file()
-
-        return run
-
-    def own(self, task: str, world: str):
-        """Return a naive policy's own run in the reality, recorded as its bus reads."""
-
-        def run(slot: str) -> bool:
-            where = self.out / f"own_{world}"
-            cap = [f"task.evaluation.cap_s={OWN_S}"] if task == "rotate" else []
-            argv = ["play.py", f"checkpoint={self.policy(task, self.seeds[0], 'naive', world)}", f"reality={world}",
-                    "episodes=4", "seed=101", "video=false",
-                    f"record={where / f'{task}.mcap'}", "record_worlds=1", "realistic=true", f"out={where / task}",
-                    "sim.threads=1", *cap]  # fmt: skip
-            return self.call(argv, where / f"{task}.log", limit=300) == 0 and (where / f"{task}.mcap").is_file()
-
-        return run
-
-    def excite(self, world: str):
-        """As fast as the policies move there."""
-
-        def run(slot: str) -> bool:
-            where = self.out / f"excited_{world}"
-            own = ",".join(str(self.out / f"own_{world}" / f"{task}.mcap") for task in self.tasks)
-            return (
-                self.call(
-                    ["-m", "benchmarks.loop.steps", "record", f"world={world}", f"own={own}", f"out={where}", "seed=1"],
-                    where / "log.txt",
-                )
-                == 0
-            )
-
-        return run
-
-    def helper(self, world: str) -> str:
-        """Return the GPU on which a reality's diagnosis is computed too; "" for none."""
-        gpus = [g for g in self.s["diagnose_gpus"].split(",") if g]
-        return gpus[self.worlds.index(world) % len(gpus)] if gpus else ""
-
-    def diagnose(self, world: str):
-        """Return one reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say
-        how fast
-        that has to be, and are not fitted: a joint is judged while nothing is touched, and most of what they touch
-        carries no taxels. What they command, played again on the empty hand, throws the joints against the ends of
-        their motion (lab/results/loop.md)."""
-
-        def run(slot: str) -> bool:
-            where = self.out / f"diagnosis_{world}"
-            excited, fast = (
-                sorted((self.out / f"excited_{world}").glob("excite_*.mcap")),
-                [self.out / f"excited_{world}" / name for name in FAST],
-            )
-            fit, held = [*excited[:-KEPT], fast[0]], [*excited[-KEPT:], fast[1]]
-            argv = [
-                "diagnose.py",
-                f"recordings=[{','.join(map(str, fit))}]",
-                f"held_out=[{','.join(map(str, held))}]",
-                "next=false",
-                "replay=none",
-            ]
-            tries = [([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", "", self.uses["diagnose"])]
-            if helper := self.helper(world):  # beside the cores: whichever is done first
-                other = self.out / f"diagnosis_{world}_gpu"
-                tries.append(
-                    ([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", helper, 2)
-                )
-            won = self.first(tries, float(self.s["diagnose_s"]))
-            if won == 1:
-                shutil.rmtree(where, ignore_errors=True)
-                other.rename(where)
-            return won is not None and (where / "servo.yaml").is_file()
-
-        return run
-
-    def press(self, finger: str, world: str):
-        """Return a fingertip pressed in the reality, and its diagnosis."""
-
-        def run(slot: str) -> bool:
-            where = self.out / f"touch_{world}" / finger
-            if self.call(
-                ["-m", "benchmarks.loop.presses", "record", f"world={world}", f"finger={finger}", f"out={where}"],
-                where / "record.log",
-                limit=300,
-            ):
-                return False
-            argv = [
-                "diagnose.py",
-                f"recordings=[{','.join(map(str, sorted(where.glob('press_*.mcap'))))}]",
-                f"model={where / 'rig.xml'}",
-                f"servo={where / 'rig.yaml'}",
-            ]
-            return (
-                self.call(
-                    [*argv, "next=false", f"out={where / 'found'}"],
-                    where / "found.log",
-                    limit=float(self.s["diagnose_s"]),
-                )
-                == 0
-            )
-
-        return run
-
-    def touch(self, world: str):
-        """Return what was found on the five fingertips, as training takes it."""
-
-        def run(slot: str) -> bool:
-            where = self.out / f"touch_{world}"
-            pinched = self.call(
-                ["-m", "benchmarks.loop.presses", "pinch", f"world={world}", f"out={where / 'pinch.mcap'}"],
-                where / "pinch.log",
-                limit=300,
-            )
-            found = ",".join(str(where / f) for f in FINGERS)
-            return (
-                not pinched
-                and self.call(
-                    ["-m", "benchmarks.loop.presses", "sum", f"found={found}", f"out={where / 'tactile.yaml'}"],
-                    where / "sum.log",
-                )
-                == 0
-            )
-
-        return run
-
-    def jobs(self) -> list[Job]:
-        """Return all steps; those that others wait for come first, wide randomization last. Nothing is trained or
-        judged that would keep the diagnoses, or what is fitted, waiting for a GPU or for cores."""
-        out = []
-        for w in self.worlds:
-            for task in self.tasks:
-                out.append(
-                    Job(
-                        f"own {task} {w}",
-                        self.out / f"own_{w}" / f"{task}.done",
-                        self.own(task, w),
-                        False,
-                        [f"naive {task} {self.seeds[0]}"],
-                        0,
-                    )
-                )
-            out.append(
-                Job(
-                    f"excite {w}",
-                    self.out / f"excited_{w}.done",
-                    self.excite(w),
-                    False,
-                    [f"own {task} {w}" for task in self.tasks],
-                    1,
-                )
-            )
-            for finger in FINGERS:
-                out.append(
-                    Job(
-                        f"press {finger} {w}",
-                        self.out / f"touch_{w}" / f"{finger}.done",
-                        self.press(finger, w),
-                        False,
-                        [],
-                        1,
-                    )
-                )
-            out.append(
-                Job(
-                    f"touch {w}",
-                    self.out / f"touch_{w}.done",
-                    self.touch(w),
-                    False,
-                    [f"press {finger} {w}" for finger in FINGERS],
-                    1,
-                )
-            )
-            sharing = [x for x in self.worlds if self.helper(x) == self.helper(w)]
-            free = ([self.helper(w)] if self.helper(w) else []) * int(self.s["diagnose_slots"])
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"],
-                           2, self.uses["diagnose"],
-                           frees=free[sharing.index(w) :: len(sharing)]))  # fmt: skip
-        diagnoses = [f"diagnose {w}" for w in self.worlds]
-        tuned = [
-            f"fitted {task} {seed} {w}"
-            for task in self.tasks
-            for seed in self.seeds
-            for w in self.worlds
-            if "fitted" in self.variants
-        ]
-        for task in self.tasks:
-            for seed in self.seeds:
-                base, name = self.folder(task, seed), f"{task} {seed}"
-                out.append(
-                    Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"])
-                )
-                out.append(
-                    Job(
-                        f"wide {name}",
-                        base / "wide.done",
-                        self.tune(task, seed, "wide", ""),
-                        True,
-                        [f"naive {name}"],
-                        5,
-                        self.uses["train"],
-                        tuned,
-                    )
-                )
-                for w in self.worlds:
-                    here = self.folder(task, seed, w)
-
-                    def add(what, run, gpu, after, rank, behind=(), here=here, name=name, w=w):
-                        uses = self.uses["train" if gpu else "judge"]
-                        done = here / f"{what.replace(' ', '_')}.done"
-                        out.append(Job(f"{what} {name} {w}", done, run, gpu, after, rank, uses, list(behind)))
-
-                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8, diagnoses)
-                    add(
-                        "fitted",
-                        self.tune(task, seed, "fitted", w),
-                        True,
-                        [f"diagnose {w}", f"touch {w}", f"naive {name}"],
-                        3,
-                    )
-                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
-                    add(
-                        "judge wide",
-                        self.judge(task, seed, "wide", w),
-                        False,
-                        [f"wide {name}"],
-                        9,
-                        [f"judge {x}" for x in tuned],
-                    )
-                    add("judge fitted", self.judge(task, seed, "fitted", w), False, [f"fitted {name} {w}"], 6)
-                    add("judge truth", self.judge(task, seed, "truth", w), False, [f"truth {name} {w}"], 7, diagnoses)
-        left_out = {v for v in VARIANTS if v != "naive"} - self.variants
-        return [j for j in out if not left_out & set(j.name.split()[:2])]
+        path = self.out / f"fitted_{world}.yaml"
+        table.save(path)
+        return path
 
     def report(self) -> dict:
         """Return the table: by task, world and measure, the mean of each variant over seeds, and the share of the loss
@@ -561,7 +215,7 @@ class Loop:
             for world in self.worlds:
                 for key, larger, label, unit in METRICS[task]:
                     values: dict[str, list[float]] = {v: [] for v in VARIANTS}
-                    for seed in self.seeds:
+                    for seed in (s for t, s in self.each if t == task):
                         row = {v: self._metric(task, seed, world, v, key) for v in VARIANTS}
                         for v in VARIANTS:
                             values[v].append(math.nan if row[v] is None else row[v] * unit)
@@ -582,7 +236,7 @@ class Loop:
                     lines.append(line)
         found = {}
         for world in self.worlds:
-            path = self.out / f"diagnosis_{world}" / "diagnosis.json"
+            path = self.place("drives", world) / "diagnosis" / "diagnosis.json"
             if path.is_file():
                 d = json.loads(path.read_text(encoding="utf-8"))
                 found[world] = {"verdict": d["verdict"], "before": d["held_out"]["before"],
@@ -592,7 +246,7 @@ class Loop:
         return {"benchmark": "loop", "settings": self.s, "lines": lines, "diagnoses": found}
 
     def _metric(self, task: str, seed: int, world: str, variant: str, key: str) -> float | None:
-        path = self.folder(task, seed, world) / f"judged_{variant}" / "metrics.json"
+        path = self.place("judged", task, seed, variant, world) / "metrics.json"
         if not path.is_file():
             return None
         node = json.loads(path.read_text(encoding="utf-8"))
@@ -653,27 +307,32 @@ def markdown(data: dict) -> str:
     return "\n".join(text) + "\n"
 
 
-def main(argv: list[str]) -> int:
-    """Runs what is not done yet and reports. Raises UserError for a setting that is none."""
-    if any(a in ("-h", "--help", "help") for a in argv):
-        print(__doc__)
-        return 0
-    s = options(argv, SETTINGS)
-    loop = Loop(s)
+def _listed(name: str, paths: Sequence[Path]) -> str:
+    return f"{name}=[{','.join(map(str, paths))}]"
+
+
+def main(argv: list[str]) -> None:
+    """Run what is not done yet, a step after the other, and report. Raises UserError for a setting that is none, or a
+    job that failed."""
+    s, rest = tools.split(argv, SETTINGS)
+    gpus = [g for g in s["gpus"].split(",") if g not in ("", "none")]
+    engine, extra = jobs.taken(rest, gpus)
+    loop = Loop(s, extra, "cuda" if gpus or engine.on != "local" else "cpu")
     loop.out.mkdir(parents=True, exist_ok=True)
-    if s["report"] != "true":
-        Queue(loop.jobs(), loop.gpus, loop.cores, float(s["stop_s"]), float(s["kill_s"]), loop.kill).go()
+    os.environ["OMP_NUM_THREADS"] = os.environ.get("OMP_NUM_THREADS", "1")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    cores = jobs.Engine(engine.on, engine.at_once, slurm=engine.slurm)
+    for step in (loop.start, loop.naive, loop.found, loop.summed, loop.tuned, loop.judged):
+        if s["report"] != "true":
+            print(f"{step.__name__}:", flush=True)
+            tools.run(list(step()), engine if step in (loop.start, loop.naive, loop.tuned) else cores)
     data = loop.report()
     (loop.out / "loop.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")
     print("\n" + markdown(data))
-    print(
-        json.dumps(
-            {"benchmark": "loop", "lines": [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]}
-        )
-    )
-    return 0
+    lines = [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]
+    print(json.dumps({"benchmark": "loop", "lines": lines}))
 
 
 if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:]))
+    tools.command(main, __doc__)

@@ -8,7 +8,6 @@ import contextlib
 import html
 import io
 import json
-import select
 import subprocess
 import sys
 import time
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import typed, yaml_text
+from dexsim import system, typed, yaml_text
 from dexsim.calibration.file import ASSUMED_LSB
 from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState, VirtualClock
 from dexsim.deploy.readings import copied, implausible
@@ -134,8 +133,7 @@ class Session:
             why = f"no new reading for {1e3 * (now - self._fresh_at):.0f} ms"
         if not why and self.state is not None and (self.state.temperature > 70).any():
             why = "a motor is over 70 degC"
-        if not why and self.asks and select.select([sys.stdin], [], [], 0)[0]:
-            sys.stdin.readline()
+        if not why and self.asks and system.key_pressed():
             why = "a key was pressed"
         if why:
             self.relax()
@@ -431,7 +429,7 @@ class Hour:
             self.s.recorder = whole
         self.s.relax()
         audit = _dexsim("audit", str(self.out / "excite.mcap"))
-        (self.out / "audit.txt").write_text(audit.stdout)
+        (self.out / "audit.txt").write_text(audit.stdout, "utf-8")
         folder = self.out / "diagnosis"
         self.say("  diagnosing; a few minutes")
         servo = _dexsim("diagnose", f"recordings=[{self.out / 'excite.mcap'}]", f"out={folder}", "next=false",
@@ -747,7 +745,8 @@ def _sentence(work: Callable) -> str:
 
 
 def _dexsim(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-m", "dexsim", *arguments], capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-X", "utf8", "-m", "dexsim", *arguments], capture_output=True,
+                          encoding="utf-8")  # fmt: skip
 
 
 def _picture(draw: Callable) -> str:

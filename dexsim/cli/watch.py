@@ -37,7 +37,7 @@ class Watch:
                    "device=cpu", f"worlds={WORLDS}", "sim.threads=1", f"view_port={port}", f"view_while={os.getpid()}",
                    f"out={self._where / 'view'}", *task]  # fmt: skip
         env = os.environ | {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-        with log.open("w") as out:
+        with log.open("w", encoding="utf-8") as out:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, start_new_session=True
             )

@@ -41,8 +41,8 @@ class Job:
 
     commands: each the arguments behind `program`. folder: what they write into; what is said of the job, and what it
     says, stands beside it in jobs/NAME.json and jobs/NAME.txt. program: how dexsim is called. resumes: the first
-    command is `train ... out=PLACE`, and a job that was lost goes on from PLACE/last.pt. Commands that had ended are
-    not repeated.
+    command is `[...] train ... out=PLACE`, and a job that was lost goes on from PLACE/last.pt. Commands that had
+    ended are not repeated.
     """
 
     commands: tuple[tuple[str, ...], ...]
@@ -133,7 +133,8 @@ def attempt(job: Job, env: Mapping[str, str] | None = None) -> int:
                 place = Path(next(a for a in reversed(commands[0]) if a.startswith("out=")).removeprefix("out="))
                 last = aside / place.relative_to(job.folder) / "last.pt"
                 if last.is_file():
-                    commands = (("train", f"resume={last}", f"out={place}"), *commands[1:])
+                    train = commands[0][: commands[0].index("train") + 1]
+                    commands = ((*train, f"resume={last}", f"out={place}"), *commands[1:])
     job.folder.mkdir(parents=True, exist_ok=True)
     began, status = time.perf_counter(), 0
 

@@ -83,7 +83,7 @@ def _import(text: str, folder: Path) -> None:
     """Import a named hand as its user would, in a process of its own."""
     print(f"hand={text}: imported once, into {folder} ...", flush=True)
     words = [sys.executable, "-m", "dexsim", "import-hand", text, f"out={folder}"]
-    done = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(words, stderr=subprocess.PIPE, encoding="utf-8", errors="replace")
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"import-hand ended with {done.returncode}"]
         raise UserError(f"hand={text}: {lines[-1].removeprefix('error: ')}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ def search(folder: Path, count: int, seed: int = 0) -> Region:
     quiet_warp("cpu")
     with tempfile.TemporaryDirectory() as place:
         hand = Path(place) / "hand"
-        hand.symlink_to(folder.resolve())  # any characters may be in the folder's own name, which the settings parse
+        shutil.copytree(folder, hand)  # any characters may be in the folder's own name, which the settings parse
         begun = start.for_train(["task=grasp", "device=cpu", f"worlds={WORLDS}", f"hand={hand}"], CONFIGS)
         assert begun is not None  # only --help has nothing to begin
         env = GraspEnv(begun.cfg, WORLDS, "cpu", seed, "mujoco")

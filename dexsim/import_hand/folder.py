@@ -65,7 +65,7 @@ def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterat
 
 def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
     for path in sorted(p for p in old.rglob("*") if p.is_file() and not p.is_symlink()):
-        name = str(path.relative_to(old))
+        name = path.relative_to(old).as_posix()
         if name in (HAND, corrections.NOTE):
             continue
         shown = name == outputs.WRITTEN or (name in SHOWN and outputs.ours(old, name))
@@ -79,7 +79,7 @@ def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
 
 def write_note(folder: Path, hand: dict[str, Any], said: list[str]) -> None:
     """Notes what the importer wrote: content of hand.yaml, sums of the files, and the places that a person said."""
-    sums = {str(p.relative_to(folder)): sha(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    sums = {p.relative_to(folder).as_posix(): sha(p) for p in sorted(folder.rglob("*")) if p.is_file()}
     data = {"hand": hand, "files": sums, "said": said}
     (folder / corrections.NOTE).write_text(json.dumps(data, indent=1), encoding="utf-8")
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import torch
 
-from dexsim import files, model_file
+from dexsim import files, model_file, system
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets.objects.own import named
@@ -24,7 +24,6 @@ from dexsim.hand.places import places
 from dexsim.hand.skin import link_skins, tip_skins
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
-from dexsim.sim.memory import give_back
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
@@ -377,7 +376,7 @@ class Built(VecEnv):
                 vars(held).clear()
         held = None
         self.__dict__.clear()
-        give_back()
+        system.give_back()
 
 
 def _periods(sim: dict, task: dict) -> tuple[int, float]:
