@@ -7,7 +7,7 @@ import pytest
 
 from dexsim import guard
 from dexsim.errors import UserError
-from dexsim.recording import read
+from dexsim.recording import read, write
 from dexsim.recording.columns import _role
 from dexsim.recording.convert import convert
 
@@ -301,22 +301,73 @@ def test_what_a_unit_lacks_is_said(tmp_path):
         read(path, meta={"units.positoin": "rad"})
 
 
-def test_whole_numbers_of_both_sides_are_a_drives_own(tmp_path):
-    """A guess, said as such: of ticks, of registers where the range is known; never of one side alone, which is a
-    fault."""
-    q, ticks = Q["elbow"] * 3, lambda x: np.round(2048 + x * 4096 / (2 * np.pi))
-    both = csv(tmp_path / "a.csv", {"time": T, "command.elbow": ticks(q), "position.elbow": ticks(np.roll(q, 3))})
-    r = read(both)
+WIDE = {"elbow": (-0.3, 1.5), "wrist": (-1.6, 0.3)}
+GUESSES = {  # name -> (values of q rad along the joint's range u from 0 to 1, the unit, whether a model is needed)
+    "ticks": (lambda q, u: np.round(2048 + q * 4096 / (2 * np.pi)), "ticks:4096@2048", False),
+    "registers": (lambda q, u: np.round(1000 * u), "registers", False),
+    "bytes": (lambda q, u: np.round(255 * u), "range:0..255", False),
+    "percent": (lambda q, u: 100 * u, "percent", False),
+    "signed": (lambda q, u: 200 * u - 100, "signed_percent", False),
+    "normalized": (lambda q, u: 2 * u - 1, "normalized", True),
+    "degrees": (lambda q, u: np.degrees(q), "deg", False),
+}
+
+
+@pytest.mark.parametrize("name", GUESSES)
+@pytest.mark.parametrize("known", [True, False])
+def test_units_that_nothing_states_are_guessed_with_a_warning(tmp_path, name, known):
+    """By both sides and all joints together, where rad is not possible. The warning says the guess, what it rests on
+    and the setting that states it; where a range is needed and not known, values are a fraction of the travel."""
+    of, unit, needs_model = GUESSES[name]
+    u = {"elbow": 0.5 + 0.5 * np.sin(4 * T), "wrist": 0.5 + 0.4 * np.cos(3 * T)}
+    q = {j: WIDE[j][0] + u[j] * (WIDE[j][1] - WIDE[j][0]) for j in u}
+    columns = {f"{what}.{j}": np.roll(of(q[j], u[j]), k) for k, what in enumerate(("command", "position")) for j in u}
+    path = csv(tmp_path / "a.csv", {"time": T} | columns)
+    r = read(path, limits=WIDE if known else None)
     said = [f for f in r.findings if f.kind == "unit"]
-    assert all(f.severity == "warning" and "ticks:4096@2048" in f.text for f in said) and len(said) == 2
-    assert np.abs(r.commands.value[:, 0] - q).max() < 1e-3
+    if needs_model and not known:
+        assert not said and np.allclose(r.commands.value[:, 0], of(q["elbow"], u["elbow"]))  # it may be rad
+        return
+    assert [f.severity for f in said] == ["warning"], said
+    text = said[0].text
+    assert f"taken for {unit} by its" in text and f"units.position={unit}" in text
+    along = not known and not unit.startswith(("ticks", "deg"))
+    assert along is ("a fraction of the travel, 0 to 1, not rad. Give model=" in text)
+    for k, j in enumerate(u):
+        assert np.abs(r.commands.value[:, k] - (u if along else q)[j]).max() < 5e-3
+    stated = read(path, meta={"units.position": unit}, limits=WIDE)
+    assert not [f for f in stated.findings if "no unit is stated" in f.text]
+    if along:  # what is written goes on saying so
+        write(tmp_path / "a.mcap", r)
+        assert np.abs(read(tmp_path / "a.mcap", limits=WIDE).commands.value[:, 0] - q["elbow"]).max() < 1e-2
+        with pytest.raises(UserError, match="its range is not known here"):
+            read(tmp_path / "a.mcap")
+
+
+def test_a_unit_is_guessed_only_where_rad_is_not_possible(tmp_path):
+    """Never of one side alone, which is a fault; a joint that hardly moves is in the unit of the others."""
+    q, ticks = Q["elbow"] * 3, lambda x: np.round(2048 + x * 4096 / (2 * np.pi))
     one = csv(tmp_path / "b.csv", {"time": T, "command.elbow": q, "position.elbow": ticks(np.roll(q, 3))})
     assert {f.severity for f in read(one).findings if f.kind == "unit"} == {"error"}
-    registers = np.round(1000 * (Q["elbow"] + 0.5) / 2)
-    path = csv(tmp_path / "c.csv", {"time": T, "command.elbow": registers, "position.elbow": registers})
-    assert np.abs(read(path, limits=LIMITS).commands.value[:, 0] - Q["elbow"]).max() < 2e-3
-    stated = read(both, meta={"units.position": "ticks:4096"})
-    assert not [f for f in stated.findings if "by its values" in f.text]
+    low = np.round(500 + 100 * Q["wrist"])  # alone, registers
+    both = {f"{what}.{j}": x for what in ("command", "position") for j, x in (("elbow", ticks(q)), ("wrist", low))}
+    r = read(csv(tmp_path / "c.csv", {"time": T} | both))
+    assert np.abs(r.commands.value[:, 1] - (low - 2048) * 2 * np.pi / 4096).max() < 1e-9
+    turns = 40 * Q["elbow"]
+    wheel = csv(tmp_path / "d.csv", {"time": T, "command.elbow": turns, "position.elbow": np.roll(turns, 3)})
+    assert np.allclose(read(wheel, limits={}).commands.value[:, 0], turns)  # of a model without limits
+    square = np.where(np.sin(5 * T) > 0, 1.0, -1.0)
+    path = csv(tmp_path / "e.csv", {"time": T, "command.elbow": square, "position.elbow": np.roll(square, 3)})
+    assert not [f for f in read(path, limits=LIMITS).findings if f.kind == "unit"]
+
+
+def test_a_column_may_say_that_it_is_along_its_range(tmp_path):
+    u = 20 + 10 * np.sin(4 * T)
+    path = csv(tmp_path / "a.csv", {"time": T, "command.elbow [%]": u, "position.elbow [%]": u})
+    r = read(path, limits=LIMITS)
+    (f,) = [f for f in r.findings if f.kind == "unit"]
+    assert np.allclose(r.commands.value[:, 0], -0.5 + 2.0 * u / 100) and "percent by the name of its column" in f.text
+    assert np.allclose(read(path).commands.value[:, 0], u / 100)
 
 
 def test_a_current_of_hundreds_is_in_milliamperes(tmp_path):

@@ -25,7 +25,7 @@ from dexsim import files
 from dexsim.errors import UserError
 from dexsim.recording import schema, units
 from dexsim.recording.schema import Finding
-from dexsim.recording.units import UNITS
+from dexsim.recording.units import ALONG, UNITS
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".npz", ".json", ".jsonl")
 EPOCHS = {"ms": 1e11, "us": 1e14, "ns": 1e17}
@@ -90,7 +90,7 @@ class Table:
     meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
     left out; unnamed: whether no column names the one joint; si: (quantity, joint) in SI units, by their own unit;
     told: by quantity and joint, which lines tell of it (all where it is not there); arrays [T, ...]: of other
-    topics."""
+    topics; ranges: the unit along its range that a joint's columns name."""
 
     joints: list[str]
     time: dict[str, np.ndarray]
@@ -102,6 +102,7 @@ class Table:
     si: set[tuple[str, str]] = field(default_factory=set)
     told: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    ranges: dict[str, str] = field(default_factory=dict)
 
     def carried(self, quantity: str) -> np.ndarray | None:
         """Return [T, J] of which joints each of the quantity's samples tells; None: of all."""
@@ -164,6 +165,7 @@ def of_columns(
     joints: list[str] = []
     effort: set[str] = set()
     si: set[tuple[str, str]] = set()
+    along: dict[str, dict[str, str]] = {}
     of = schema.joint_names(meta.get("joint_names", "")) or said
     listed = {j for q, j, _, _ in roles.values() if q not in ("time", "supply_voltage") and j}
     place = lambda x: x.removeprefix("joint").removeprefix("_")  # noqa: E731
@@ -192,7 +194,9 @@ def of_columns(
                 text = f"'{column}' counts {unit} since 1970, by its values (say otherwise with units.time=)"
                 findings.append(Finding("unit", "", np.nan, 1, text, "warning"))
                 roles[column] = (quantity, joint, unit, word)
-        if unit or quantity == "time":
+        if quantity in ("command", "position") and unit in ALONG:
+            along.setdefault(joint, {})[quantity] = ALONG[unit]
+        elif unit or quantity == "time":
             scale = units.parse(unit or time_unit or "s", quantity, f"recording {path}: {column}").scale
             si.add((quantity, joint))
         found.setdefault(quantity, {})[joint] = raw[column] * scale
@@ -234,7 +238,11 @@ def of_columns(
     for column, on in told.items():
         quantity, joint = roles[column][:2]
         lines.setdefault(quantity, {})[joint or joints[0]] = on
-    return Table(joints, time, value, stated, start, findings, nameless, si, lines)
+    ranges = {}
+    for joint, units_ in along.items():
+        if len(units_) == sum(joint in value.get(q, {}) or not joint for q in ("command", "position") if q in value):
+            ranges[joint or joints[0]] = units_.popitem()[1]
+    return Table(joints, time, value, stated, start, findings, nameless, si, lines, ranges=ranges)
 
 
 def _stamped(raw: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -419,7 +427,7 @@ def _unit(column: str) -> tuple[str, str]:
     bare = re.sub(rf"([\s_.]+|\s*[\[(])({'|'.join(_OWN)})[\])]?(?=$|[./:])", "", column, flags=re.I)
     if bare != column and _known(bare):
         return bare, ""
-    known = {u for us in UNITS.values() for u in us} - {"percent"}
+    known = {u for us in UNITS.values() for u in us} | set(ALONG)
     match = re.search(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$", column)
     if match and match.group(2).lower() in known and match.group(1).strip():
         return match.group(1), match.group(2).lower()

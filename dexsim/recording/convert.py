@@ -64,6 +64,8 @@ def to_lerobot(recordings: Sequence[Recording], out: Path, fps: float | None = N
             raise UserError(f"{r.path}: has other joints than {recordings[0].path}; a data set has one set of joints")
         if len(r.states.position) < 2 or not len(r.commands):
             raise UserError(f"{r.path}: a data set needs states and commands")
+        if "position_unit" in r.meta:
+            raise UserError(f"{r.path}: {next(f.text for f in r.findings if 'fraction of the travel' in f.text)}")
     rates = [(len(r.states.position) - 1) / float(np.ptp(r.states.position.t)) for r in recordings]
     fps = float(round(float(np.median(rates)))) if fps is None else fps
     columns: dict[str, list[Any]] = {k: [] for k in ("observation.state", "action", "timestamp", "frame_index",

@@ -108,10 +108,11 @@ def _read(
         own = metadata.own_record([m for c in containers for m in c.metadata])
         stated, units, findings = metadata.collect(path, own, meta, units)
     reading.findings += findings
+    modelled = hand is not None or limits is not None
     if hand is not None or limits is None:
         known = hand or load_hand()
         limits = dict(zip(known.joints, known.limits.tolist(), strict=True)) | dict(limits or {})
-    recording = reading.build(stated, joints, Units(units, limits, str(path)))
+    recording = reading.build(stated, joints, Units(units, limits, str(path), modelled))
     if audit:
         # here, so that `python -m dexsim.recording.audit` does not find its module loaded by the package
         from dexsim.recording.audit import audit as find_faults
@@ -146,6 +147,7 @@ class _Reading:
         self.findings: list[Finding] = []
         self.arrays: dict[str, np.ndarray] = {}
         self.si: set[tuple[str, str]] = set()  # (quantity, their joint) whose values are in SI already
+        self.ranges: dict[str, str] = {}  # their joint -> the unit along its range that its columns name
         self.breaks: list[tuple[float, float]] = []
         self.streams: dict[str, list[_Stream]] = {}
         for c in containers:
@@ -547,41 +549,53 @@ class _Reading:
         return mapping
 
     def _convert(self, r: Recording, units: Units, theirs: Mapping[str, str]) -> None:
-        """The values of each joint in SI: by the unit that is stated, else by what whole numbers of both its command
-        and its position must be, with a warning. theirs: their name of each joint."""
-        s, used, guessed = r.states, dict[Any, Unit | None](), dict[Any, Unit | None]()
+        """The values of each joint in SI: by the unit that is stated, else by a guess, with a warning. theirs: their
+        name of each joint."""
+        s, said = r.states, dict[tuple[str, str, bool], dict[str, dict[str, None]]]()
         parts = {"command": r.commands, "position": s.position, "velocity": s.velocity, "effort": s.effort,
                  "temperature": r.temperature, "duty": r.duty}  # fmt: skip
+
+        def stated(quantity: str, joint: str) -> Unit | None:
+            return units.of(quantity, joint) or units.of(quantity, theirs[joint])
+
+        def free(quantity: str, joint: str) -> bool:
+            return (quantity, theirs[joint]) not in self.si and stated(quantity, joint) is None
+
+        both = {
+            j: (r.commands.value[:, k], s.position.value[:, k])
+            for k, j in enumerate(r.joints)
+            if free("command", j) and free("position", j)
+        }
+        own = {j: self.ranges[n] for j, n in theirs.items() if n in self.ranges and free("position", j)}
+        guessed = units.guess(both, own)
         for k, joint in enumerate(r.joints):
             for quantity, series in parts.items():
                 if series is None or not len(series) or (quantity, theirs[joint]) in self.si:
                     continue
-                unit = units.of(quantity, joint) or units.of(quantity, theirs[joint])
-                if unit is None and quantity == "command" and ("position", theirs[joint]) not in self.si:
-                    unit = guessed.setdefault(joint, units.guess(joint, series.value[:, k], s.position.value[:, k]))
-                elif unit is None and quantity in ("position", "velocity"):
+                unit = stated(quantity, joint)
+                if unit is None and quantity in ("command", "position", "velocity"):
                     unit = guessed.get(joint)
                 elif unit is None and quantity == "effort" and self.milliamperes(r, series.value[:, k]):
-                    unit = Unit(1e-3, 0.0, "ma", False)
+                    unit = Unit(1e-3, 0.0, "mA", why=f"as no joint takes {MOST_CURRENT:g} A")
                 if unit is None:
                     continue
                 series.value[:, k] = unit(series.value[:, k], quantity == "velocity")
-                if unit.text.lower() not in ("rad", "m", "a", "nm", "n.m", "n", "rad/s"):
-                    (used if units.of(quantity, joint) else guessed)[joint, quantity] = unit
-        for found, sure in ((used, True), (guessed, False)):
-            texts: dict[tuple[str, str], list[str]] = {}
-            for key, unit in found.items():
-                if isinstance(key, tuple) and unit is not None:
-                    texts.setdefault((key[1], unit.text), []).append(key[0])
-            for (quantity, text), joints in texts.items():
-                who = "" if len(joints) == len(r.joints) else f" of {', '.join(joints)}"
-                said = (
-                    f"{quantity}{who} in {text}: converted to SI"
-                    if sure
-                    else f"{quantity}{who}: no unit is stated; taken for {text} by its values, and converted: say "
-                    f"units.{quantity}={text}, or what it is"
-                )
-                self.findings.append(Finding("unit", "", NAN, len(joints), said, "info" if sure else "warning"))
+                if unit.why or unit.text.lower() not in ("rad", "m", "a", "nm", "n.m", "n", "rad/s"):
+                    said.setdefault((unit.text, unit.why, unit.fraction), {}).setdefault(quantity, {})[joint] = None
+        for (text, why, fraction), quantities in said.items():
+            joints = dict.fromkeys(j for x in quantities.values() for j in x)
+            what = " and ".join(quantities) + ("" if len(joints) == len(r.joints) else f" of {', '.join(joints)}")
+            setting = f"units.{'effort' if 'effort' in quantities else 'position'}={text}"
+            if fraction:
+                r.meta["position_unit"] = "fraction"
+                then = "whose range is not known here: values are a fraction of the travel, 0 to 1, not rad. Give model="
+                then += f", or {setting}=LOW..HIGH [rad]"
+            else:
+                then = f"and converted: say {setting}, or what it is"
+            line = f"{what} in {text}: converted to SI"
+            if why:
+                line = f"{what}: no unit is stated; taken for {text} {why}, {then}"
+            self.findings.append(Finding("unit", "", NAN, len(joints), line, "warning" if why else "info"))
 
     def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
         """Return whether a current of no stated unit [S] can only be in mA; never of messages, whose effort is in
@@ -727,6 +741,7 @@ class _TableReading(_Reading):
             )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
         self.start_ns, self.config, self.sources, self.si = table.start_ns, None, {}, table.si
+        self.ranges = table.ranges
         self.arrays = table.arrays
 
     def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:

@@ -56,7 +56,7 @@ DEFAULTS: dict[str, str] = {
 }  # fmt: skip
 """What holds where nothing is stated; joint_names and effort_is follow from the messages."""
 UNIT_KEYS: dict[str, tuple[str, ...]] = {
-    "position_unit": ("rad", "deg", "m", "mm"),
+    "position_unit": ("rad", "deg", "m", "mm", "fraction"),
     "effort_unit": ("A", "mA", "N.m", "N", "mN.m"),
     "time_unit": ("s", "ms", "us", "ns"),
 }

@@ -3,16 +3,18 @@
 `position` also holds for commands and, by its scale, for velocities, where those have no unit of their own. Beside
 plain units there are two that a drive's own numbers need: `ticks:4096` (of an encoder, so many a turn;
 `ticks:4096@2048` where 2048 is zero, and the encoder's turn half on either side of it) and positions along a range, of
-which both ends are known: `percent` (0 to 100), `signed_percent` (-100 to 100), `normalized` (-1 to 1), `registers` (0
-to 1000) or `range:A..B`. Such a range is the joint's in the model, or follows: `registers=1.47..0` says that 0 is 1.47
-rad and 1000 is 0 rad.
+which both ends are known: `percent` (0 to 100), `signed_percent` (-100 to 100), `normalized` (-1 to 1), `fraction` (0
+to 1), `registers` (0 to 1000) or `range:A..B`. Such a range is the joint's in the model, or follows:
+`registers=1.47..0` says that 0 is 1.47 rad and 1000 is 0 rad. Where nothing is stated and rad is not possible, the unit
+is guessed (`Units.guess`), and a warning says so.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -39,25 +41,36 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Plain units of each quantity, in SI."""
 RANGES = {"percent": (0.0, 100.0), "signed_percent": (-100.0, 100.0), "normalized": (-1.0, 1.0),
-          "registers": (0.0, 1000.0)}  # fmt: skip
+          "fraction": (0.0, 1.0), "registers": (0.0, 1000.0)}  # fmt: skip
 """What both ends of a joint's range are in units along it."""
+ALONG = {"%": "percent", "percent": "percent", "pct": "percent", "normalized": "normalized"}
+"""How the name of a column says that its positions are along a range."""
 HELP = (
-    "ticks:4096, ticks:4096@2048 (zero), percent, signed_percent, normalized, registers, range:A..B; =LOW..HIGH in rad"
+    "ticks:4096, ticks:4096@2048 (zero), percent, signed_percent, normalized, fraction, registers, range:A..B; "
+    "=LOW..HIGH in rad"
 )
 _NUMBER = r"[-+]?[0-9.]+(?:e[-+]?[0-9]+)?"
+TURNS = 4 * np.pi
+"""rad that a joint without known limits hardly reaches."""
+BEYOND, SHARE = 0.5, 0.25
+"""By how much values in rad may be beyond a joint's limits [rad]; of values within [-1, 1], by what part of its
+range."""
+SIDES = 5.0
+"""How much farther from zero positions may go than commands, or these than positions, in one unit."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A straight line to SI: `scale` x value + `offset`. text: as it was stated; sure: not a guess; turn: values of a
-    turn, for an encoder of one turn, which goes from the largest to 0 within a motion: it is taken half a turn to both
-    sides of its zero."""
+    """A straight line to SI: `scale` x value + `offset`. text: as it was stated; turn: values of a turn, for an encoder
+    of one turn, which goes from the largest to 0 within a motion: it is taken half a turn to both sides of its zero.
+    why: what a guess rests on, and what else it may be; fraction: of a travel whose ends are not known, not in SI."""
 
     scale: float
     offset: float = 0.0
     text: str = ""
-    sure: bool = True
     turn: float = 0.0
+    why: str = ""
+    fraction: bool = False
 
     def __call__(self, x: np.ndarray, rate: bool = False) -> np.ndarray:
         """Return values x in SI; rate: by second, where an offset is none."""
@@ -103,10 +116,16 @@ def _pair(text: str) -> tuple[float, float] | None:
 
 class Units:
     """Units that are stated of a recording. stated: "position", "position.elbow" ... -> unit; limits: range of each
-    joint, where it is known; where: names the recording in errors."""
+    joint, where it is known; where: names the recording in errors; modelled: the limits are of its own model."""
 
-    def __init__(self, stated: Mapping[str, str], limits: Mapping[str, tuple[float, float]] | None, where: str):
-        self.stated, self.limits, self.where = dict(stated), dict(limits or {}), where
+    def __init__(
+        self,
+        stated: Mapping[str, str],
+        limits: Mapping[str, tuple[float, float]] | None,
+        where: str,
+        modelled: bool = False,
+    ):
+        self.stated, self.limits, self.where, self.modelled = dict(stated), dict(limits or {}), where, modelled
         for key in self.stated:
             quantity = key.partition(".")[0]
             if quantity not in UNITS:
@@ -124,19 +143,75 @@ class Units:
             return parse(self.stated[key], kind, f"{self.where}: units.{key}", self.limits.get(joint))
         return None
 
-    def guess(self, joint: str, command: np.ndarray, position: np.ndarray) -> Unit | None:
-        """Return what command [K] and position [S] of a joint, of no stated unit, must be in; None where rad is
-        possible, or several units are: both whole numbers, as a drive's registers have them."""
-        both = [x[np.isfinite(x)] for x in (command, position)]
-        if any(len(x) < 5 or (x != np.round(x)).any() for x in both) or np.ptp(both[1]) < 20:
-            return None
-        low, high = min(x.min() for x in both), max(x.max() for x in both)
-        if low < 0 or high <= 180 or high > 65535:
-            return None
-        if high <= 1000:
-            return parse("registers", "position", "", self.limits[joint]) if joint in self.limits else None
-        count = 4096 if high <= 4095 else 65536
-        return parse(f"ticks:{count}@{count // 2}", "position", "")
+    def guess(
+        self, values: Mapping[str, tuple[np.ndarray, np.ndarray]], named: Mapping[str, str] = MappingProxyType({})
+    ) -> dict[str, Unit]:
+        """Return the unit of joints of no stated one, by their commands [K] and positions [S] together: of those whose
+        values are all whole numbers, as a drive's registers are, and of the rest. named: "percent" ... by joint, where
+        the file's own columns say so. Joints are left out whose values may be rad, or of which nothing tells."""
+        known = {j: [x[np.isfinite(x)] for x in both] for j, both in values.items()}
+        known = {j: both for j, both in known.items() if all(len(x) >= 5 for x in both)}
+        whole = {j: x for j, x in known.items() if all((v == np.round(v)).all() for v in x)}
+        moving = {j: x for j, x in whole.items() if np.ptp(x[1]) >= 20}
+        whole = moving if len(whole) < len(known) or not moving else whole  # one that rests is like the others
+        out: dict[str, Unit] = {}
+        for group in (whole, {j: x for j, x in known.items() if j not in whole}):
+            sides = [max((float(np.abs(x[k]).max()) for x in group.values()), default=0.0) for k in (0, 1)]
+            if group and max(sides) <= SIDES * min(sides):  # else one side is in another unit: a fault
+                ends = {j: (min(x.min() for x in both), max(x.max() for x in both)) for j, both in group.items()}
+                text, why = self._guess(ends, group is whole)
+                for joint, (low, _) in ends.items():
+                    own = "percent" if text == "signed_percent" and low >= 0 and "gripper" in joint else text
+                    unit = self._guessed(joint, own, why) if text and joint not in named else None
+                    out |= {} if unit is None else {joint: unit}
+        for joint, text in named.items():
+            unit = self._guessed(joint, text, "by the name of its column")
+            out |= {} if unit is None else {joint: unit}
+        return out
+
+    def _guess(self, ends: Mapping[str, tuple[float, float]], whole: bool) -> tuple[str, str]:
+        """Return (the unit of values between these ends by joint, what says so); "" where there is none."""
+        low, high = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
+        top, ranged = max(-low, high), any(j in self.limits for j in ends)
+        seen = f"{'whole numbers' if whole else 'values'} from {low:.4g} to {high:.4g}"
+        degrees = self._fits(ends, np.pi / 180, 0.1, 0.1)
+        if whole and low >= 0 and high > 180 and not (high <= 360 and ranged and degrees):
+            if 250 <= high <= 255:
+                return "range:0..255", f"by its {seen}, as one byte has"
+            if high <= 1000:
+                return "registers", f"by its {seen} (or ticks:1024, or range:0..{high:.0f}?)"
+            if high <= 1023:
+                return "range:0..1023=-2.618..2.618", f"by its {seen}: 10 bits over 300 degrees"
+            count = 4096 if high <= 4095 else 65536
+            return (f"ticks:{count}@{count // 2}", f"by its {seen}") if high <= 65535 else ("", "")
+        if self._fits(ends, 1.0, *((0.0, SHARE) if top <= 1.02 else (BEYOND, 0.0))):
+            return "", ""
+        beyond = "its limits in the model" if ranged else "what a joint turns"
+        if top <= 1.02 and low < -0.2 and high > 0.2:
+            return "normalized", f"by its {seen}, which in rad are beyond {beyond}"
+        signed = "percent" if low >= -0.5 else "signed_percent"
+        if TURNS < top <= 101 and (top >= 99 or not degrees):
+            return signed, f"by its {seen}" + (" (or deg?)" if degrees else ", beyond its limits in deg")
+        if TURNS < top <= 400 and degrees:
+            return "deg", f"by its {seen}, which in rad are beyond {beyond}" + (f" (or {signed}?)" if top <= 101 else "")
+        return "", ""
+
+    def _fits(self, ends: Mapping[str, tuple[float, float]], scale: float, slack: float, share: float) -> bool:
+        """Return whether all joints are within their limits, or without a model within two turns, where values are
+        times `scale` in rad; slack [rad], share of the range: by how much they may be beyond."""
+        for joint, (low, high) in ends.items():
+            a, b = self.limits.get(joint, (-np.inf, np.inf) if self.modelled else (-TURNS, TURNS))
+            more = slack + (share * (b - a) if joint in self.limits else 0.0)
+            if low * scale < a - more or high * scale > b + more:
+                return False
+        return True
+
+    def _guessed(self, joint: str, text: str, why: str) -> Unit | None:
+        """Return the unit of a guess; None where its range must be the model's and that has none."""
+        needs = text.partition(":")[0] in (*RANGES, "range") and "=" not in text
+        if not needs or joint in self.limits:
+            return replace(parse(text, "position", "", self.limits.get(joint)), why=why)
+        return None if self.modelled else replace(parse(text, "position", "", (0.0, 1.0)), why=why, fraction=True)
 
 
 def split(meta: Mapping[str, object]) -> tuple[dict[str, object], dict[str, str]]:
