@@ -107,11 +107,11 @@ def test_an_npz_with_arrays_is_the_same_recording(tmp_path):
 
 
 def test_columns_and_joints_called_otherwise_are_named(tmp_path):
-    a = {"clock": T, "soll": Q["elbow"], "ist": Q["elbow"]}
+    a = {"clock": T, "ziel": Q["elbow"], "wert": Q["elbow"]}
     path = csv(tmp_path / "a.csv", a)
-    with pytest.raises(UserError, match="no column of position or command; columns: clock, soll, ist"):
+    with pytest.raises(UserError, match="no column of position or command; columns: clock, ziel, wert"):
         read(path)
-    r = read(path, {"time": "clock", "command.elbow": "soll", "position.elbow": "ist"}, joints=["elbow"], audit=False)
+    r = read(path, {"time": "clock", "command.elbow": "ziel", "position.elbow": "wert"}, joints=["elbow"], audit=False)
     assert r.joints == ("elbow",) and np.allclose(r.commands.value[:, 0], Q["elbow"], atol=1e-8)
     s = read(csv(tmp_path / "b.csv", plain()), {"upper": "elbow"}, joints=["upper"], audit=False)
     assert s.joints == ("upper",)

@@ -63,6 +63,7 @@ FILES = {
     "records.npz": {"log": RECORDS},
     "step.npz": {"dt": 0.01, "q_cmd": GOAL, "q": SHOWN},
     "fps.npz": {"fps": 100, "q_cmd": GOAL[:, None], "q": SHOWN[:, None]},
+    "comment.txt": text(["# time cmd pos", *table(separator=" ")[1:]]),
     "own_clocks.npz": {"t_cmd": T, "cmd": GOAL, "t": T, "pos": SHOWN, "tau_abs": np.abs(GOAL - SHOWN)},
 }  # fmt: skip
 
@@ -94,6 +95,11 @@ def test_a_table_is_read_as_it_was_written(tmp_path, name):
         "goal_velocity.a": None, "desired_torque.a": None, "measured_torque.a": ("effort", "a", ""),
         "target_positions.a": ("command", "a", ""), "joint_positions.a": ("position", "a", ""),
         "cmd_pos_0": ("command", "0", ""), "pos_0": ("position", "0", ""), "observation.a": ("position", "a", ""),
+        "thumb_present_ticks": ("position", "thumb", ""), "q_meas.a": ("position", "a", ""),
+        "actions.a": ("command", "a", ""), "/joint_states/position[1]": ("position", "1", ""),
+        "/hand/commands/data[0]": ("command", "0", ""), "field.position2": ("position", "2", ""),
+        "obs.q.a": ("position", "a", ""), "Soll a [°]": ("command", "a", "°"), "duty [1]": ("duty", "", "1"),
+        "position.a [%]": ("position", "a", "%"), "a_pos_pct": ("position", "a", "pct"),
         "current_position_elbow": ("position", "elbow", ""), "observation.velocity.a": ("velocity", "a", ""),
     }.items(),
 )  # fmt: skip
@@ -153,7 +159,8 @@ def test_an_encoder_that_passes_its_end_is_read_round_its_zero(tmp_path):
     ticks = [np.round(100 + x * 4096 / (2 * np.pi)) % 4096 for x in (GOAL - 0.5, SHOWN - 0.5)]
     (tmp_path / "a.csv").write_bytes(text(table(columns=(T, *ticks))))
     r = read(tmp_path / "a.csv")
-    assert any(f.kind == "wrap" and "units.position=ticks:4096@TICK" in f.text for f in r.findings)
+    assert any("taken for ticks:4096@0 by its whole numbers" in f.text for f in r.findings)
+    assert np.abs(np.diff(r.states.position.value[:, 0])).max() < 0.1
     r = read(tmp_path / "a.csv", meta={"units.position": "ticks:4096@100"})
     assert not any(f.kind == "wrap" for f in r.findings)
     assert np.allclose(r.states.position.value[:, 0], SHOWN - 0.5, atol=2e-3)

@@ -11,7 +11,8 @@ from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, TACTILE, Fin
 from dexsim.recording.spikes import of_effort, spiked
 
 NAN = float("nan")
-MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 65536.0, 65.536, 2.0**32)  # angles, 8, 12, 16 (also in thousandths), 32 bit
+MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 16384.0, 65536.0, 65.536, 2.0**32)
+"""Angles, 8, 12, 14, 16 (also in thousandths) and 32 bit."""
 RATIOS = {
     180 / np.pi: "degrees",
     4096 / (2 * np.pi): "counts of a 12-bit encoder",
@@ -71,7 +72,13 @@ def commanded(r: Recording) -> Iterator[Finding]:
             "diagnose and replay cannot use this recording")  # fmt: skip
         text = f"no commands: {use}; {COMMANDS_FIX}"
         yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if felt else "error")
-    if len(r.commands) and not np.isfinite(r.states.position.value).any():
+    have = [np.isfinite(x.value).any(0) if len(x) else np.zeros(len(r.joints), bool) for x in (
+        r.commands, r.states.position)]  # fmt: skip
+    if have[0].any() and have[1].any() and not (have[0] & have[1]).any():
+        sent, seen = (", ".join(np.array(r.joints)[x][:4]) for x in have)
+        text = f"no joint has both a command ({sent}) and a position ({seen}): say which is which, remap.OURS=THEIRS"
+        yield Finding("joint_names", STATES, NAN, len(r.joints), text, "error")
+    if len(r.commands) and not have[1].any():
         text = "no positions: nothing says where the joints went; name their columns with remap.position.JOINT=COLUMN"
         yield Finding("missing_topic", STATES, NAN, 0, f"{text}, or their topic with remap.{STATES}=TOPIC", "error")
 

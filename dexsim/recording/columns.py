@@ -38,13 +38,13 @@ def _both(of: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for a in of for p in _PLACES for name in (f"{a}_{p}", f"{p}_{a}"))
 
 
-_SEEN = ("measured", "present", "actual", "current", "feedback", "state")
+_SEEN = ("measured", "meas", "present", "actual", "current", "feedback", "state")
 _ASKED = ("command", "cmd", "commanded", "target", "setpoint", "reference", "ref", "desired", "des", "goal")
 QUANTITIES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "timestamp", "stamp", "t", "host_time", "date", "datetime", "zeit", "datum", "temps", "tiempo"),
-    "command": tuple(x for x in _ASKED if x not in ("ref", "des")) + _both(_ASKED) + ("target_value",),
-    "position": ("measured", "measured_value", "actual", "encoder", "qpos", *_PLACES,
-                 *_both(_SEEN)),
+    "time": ("time", "timestamp", "stamp", "t", "ts", "host_time", "date", "datetime", "zeit", "datum", "temps", "tiempo"),
+    "command": (*(x for x in _ASKED if x not in ("ref", "des")), *_both(_ASKED), "target_value", "action", "soll"),
+    "position": ("measured", "measured_value", "actual", "present", "feedback", "encoder", "qpos", "observation", "ist",
+                 *_PLACES, *_both(_SEEN)),
     "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel", "dof_vel"),
     "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
     "temperature": ("temperature", "temp", "present_temperature"),
@@ -261,7 +261,8 @@ def _stamped(raw: Mapping[str, Any]) -> Mapping[str, Any]:
 def _names_in(raw: Mapping[str, Any]) -> tuple[str, ...]:
     """Names of joints that stand in columns `name.0`, `name.1` ..., as messages have them, the same in all lines."""
     for word in ("name", "names", "joint_names"):
-        columns = [raw[f"{word}.{k}"] for k in range(len(raw)) if f"{word}.{k}" in raw]
+        forms = ("{}.{}", "field.{}{}")  # the latter of `rostopic echo -p`
+        columns = [raw[c] for form in forms for k in range(len(raw)) if (c := form.format(word, k)) in raw]
         if columns and all(isinstance(x, list) and x[0].strip() and len(set(x)) == 1 for x in columns):
             return tuple(x[0].strip() for x in columns)
     return ()
@@ -379,12 +380,14 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
             quantity = "command" if quantity == "position" else ""
         return (quantity, joint, "", quantity) if quantity and role not in ("error", "output") else None
     name, unit = _unit(column)
-    name = re.sub(r"^/?joint_states/", "", name)
+    name = re.sub(r"^/?joint_states/|^field[.](?!header)", "", name)
+    name = re.sub(r"^(position|velocity|effort)(\d+)$", r"\1.\2", name)  # of `rostopic echo -p`
+    name = re.sub(r"^(.*commands?)[./]data[.\[]+(\d+)\]?$", r"command.\2", name)
     if name.lstrip("/").startswith("joint_commands/"):  # topics as plotting tools write them out
         name = re.sub(r"^/?joint_commands/(.+)/position$", r"command.\1", name)
     name = re.sub(r"^observation[./]state[./]", "", name)  # LeRobot's names
-    if (seen := re.fullmatch(r"observation[./](.+)", name)) is not None:
-        name = seen[1] if _known(seen[1]) else f"position.{seen[1]}"
+    if (seen := re.fullmatch(r"obs(?:ervation)?s?[./](.+)", name)) is not None:
+        name = seen[1] if _known(seen[1]) or re.match(r"q[./]", seen[1]) else f"position.{seen[1]}"
     name = re.sub(r"^action[./](.+?)([./]pos)?$", r"command.\1", name)
     if (other := _OTHER.fullmatch(name)) is not None:  # a target, or a measured value, that is no position
         if other[1].lower() in _ASKED:
@@ -429,6 +432,8 @@ def _unit(column: str) -> tuple[str, str]:
         return bare, ""
     known = {u for us in UNITS.values() for u in us} | set(ALONG)
     match = re.search(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$", column)
+    if match and match.group(2) == "1" and not match.group(1).rstrip().lower().endswith(QUANTITIES["duty"]):
+        match = None  # the second of an array
     if match and match.group(2).lower() in known and match.group(1).strip():
         return match.group(1), match.group(2).lower()
     match = re.search(r"^(.*[^_\s.])[_\s.]([A-Za-z]+(?:/s|_s)?)$", column)
@@ -631,7 +636,7 @@ def _dates(cells: list[str]) -> tuple[np.ndarray, int]:
 
 
 def _numeric(line: str) -> bool:
-    cells = [c for c in re.split(r"[,;\t]", line) if c.strip()]
+    cells = [c for c in re.split(r"[,;\s]", line) if c.strip()]
     return bool(cells) and not np.isnan(_floats(cells)[0]).all() and _floats(cells)[1] == 0
 
 

@@ -29,7 +29,7 @@ MAGIC = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
 ZSTD = b"\x28\xb5\x2f\xfd"
 PACKED = {b"\x1f\x8b": "gunzip", ZSTD: "zstd -d", b"\xfd7zXZ": "unxz", b"BZh": "bunzip2", b"PK\3\4": "unzip",
-          b"7z\xbc\xaf": "7z x"}  # fmt: skip
+          b"7z\xbc\xaf": "7z x", b"\x04\x22\x4d\x18": "lz4 -d"}  # fmt: skip
 """How packed files begin, and what unpacks them."""
 BAGS = ("*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
 """What the files of a bag's folder are called."""

@@ -588,8 +588,8 @@ class _Reading:
             setting = f"units.{'effort' if 'effort' in quantities else 'position'}={text}"
             if fraction:
                 r.meta["position_unit"] = "fraction"
-                then = "whose range is not known here: values are a fraction of the travel, 0 to 1, not rad. Give model="
-                then += f", or {setting}=LOW..HIGH [rad]"
+                then = "whose range is not known here: values are a fraction of the travel, 0 to 1, not rad. Give "
+                then += f"model=, or {setting}=LOW..HIGH [rad]"
             else:
                 then = f"and converted: say {setting}, or what it is"
             line = f"{what} in {text}: converted to SI"

@@ -159,7 +159,8 @@ class Units:
             sides = [max((float(np.abs(x[k]).max()) for x in group.values()), default=0.0) for k in (0, 1)]
             if group and max(sides) <= SIDES * min(sides):  # else one side is in another unit: a fault
                 ends = {j: (min(x.min() for x in both), max(x.max() for x in both)) for j, both in group.items()}
-                text, why = self._guess(ends, group is whole)
+                turn = max(_turned(x[1]) for x in group.values()) if group is whole else 0
+                text, why = self._guess(ends, group is whole, turn)
                 for joint, (low, _) in ends.items():
                     own = "percent" if text == "signed_percent" and low >= 0 and "gripper" in joint else text
                     unit = self._guessed(joint, own, why) if text and joint not in named else None
@@ -169,21 +170,25 @@ class Units:
             out |= {} if unit is None else {joint: unit}
         return out
 
-    def _guess(self, ends: Mapping[str, tuple[float, float]], whole: bool) -> tuple[str, str]:
-        """Return (the unit of values between these ends by joint, what says so); "" where there is none."""
+    def _guess(self, ends: Mapping[str, tuple[float, float]], whole: bool, turn: int) -> tuple[str, str]:
+        """Return (the unit of values between these ends by joint, what says so); "" where there is none. turn: after
+        how many they begin again at 0; 0 where they never do."""
         low, high = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
         top, ranged = max(-low, high), any(j in self.limits for j in ends)
         seen = f"{'whole numbers' if whole else 'values'} from {low:.4g} to {high:.4g}"
         degrees = self._fits(ends, np.pi / 180, 0.1, 0.1)
         if whole and low >= 0 and high > 180 and not (high <= 360 and ranged and degrees):
+            if turn:
+                return f"ticks:{turn}@0", f"by its {seen}, which begin again at 0"
             if 250 <= high <= 255:
                 return "range:0..255", f"by its {seen}, as one byte has"
             if high <= 1000:
                 return "registers", f"by its {seen} (or ticks:1024, or range:0..{high:.0f}?)"
             if high <= 1023:
                 return "range:0..1023=-2.618..2.618", f"by its {seen}: 10 bits over 300 degrees"
-            count = 4096 if high <= 4095 else 65536
-            return (f"ticks:{count}@{count // 2}", f"by its {seen}") if high <= 65535 else ("", "")
+            count = next((n for n in (4096, 16384, 65536) if high < n), 0)
+            also = "" if count == 4096 else " (or ticks:4096, of several turns?)"
+            return (f"ticks:{count}@{count // 2}", f"by its {seen}{also}") if count else ("", "")
         if self._fits(ends, 1.0, *((0.0, SHARE) if top <= 1.02 else (BEYOND, 0.0))):
             return "", ""
         beyond = "its limits in the model" if ranged else "what a joint turns"
@@ -193,7 +198,8 @@ class Units:
         if TURNS < top <= 101 and (top >= 99 or not degrees):
             return signed, f"by its {seen}" + (" (or deg?)" if degrees else ", beyond its limits in deg")
         if TURNS < top <= 400 and degrees:
-            return "deg", f"by its {seen}, which in rad are beyond {beyond}" + (f" (or {signed}?)" if top <= 101 else "")
+            also = f" (or {signed}?)" if top <= 101 else ""
+            return "deg", f"by its {seen}, which in rad are beyond {beyond}{also}"
         return "", ""
 
     def _fits(self, ends: Mapping[str, tuple[float, float]], scale: float, slack: float, share: float) -> bool:
@@ -212,6 +218,13 @@ class Units:
         if not needs or joint in self.limits:
             return replace(parse(text, "position", "", self.limits.get(joint)), why=why)
         return None if self.modelled else replace(parse(text, "position", "", (0.0, 1.0)), why=why, fraction=True)
+
+
+def _turned(x: np.ndarray) -> int:
+    """Return after how many values of a turn of an encoder positions begin again at 0; 0 where they never do."""
+    top = float(x.max())
+    count = 2 ** int(np.ceil(np.log2(top + 1)))
+    return count if 1024 <= count <= 65536 and top > 0.985 * count and np.abs(np.diff(x)).max() > 0.75 * count else 0
 
 
 def split(meta: Mapping[str, object]) -> tuple[dict[str, object], dict[str, str]]:
