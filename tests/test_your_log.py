@@ -117,6 +117,7 @@ def files(tmp_path):
         "long.csv": long,
         "ticks.csv": lambda p: plain(p, lambda q: np.round(2048 + q * 4096 / (2 * np.pi))),
         "registers.csv": lambda p: plain(p, lambda q: np.round(1000 * (1.47 - q) / 1.47)),
+        "own_numbers.csv": lambda p: plain(p, lambda q: np.round(1000 * (q + 1) / 3)),
         "percent.csv": lambda p: plain(p, lambda q: 100 * (q + 1) / 3),
         "rig.xml": rig,
         "log.jsonl": json_lines,

@@ -41,7 +41,8 @@ def _both(of: Iterable[str]) -> tuple[str, ...]:
 _SEEN = ("measured", "meas", "present", "actual", "current", "feedback", "state")
 _ASKED = ("command", "cmd", "commanded", "target", "setpoint", "reference", "ref", "desired", "des", "goal")
 QUANTITIES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "timestamp", "stamp", "t", "ts", "host_time", "date", "datetime", "zeit", "datum", "temps", "tiempo"),
+    "time": ("time", "timestamp", "stamp", "t", "ts", "host_time", "date", "datetime", "zeit", "datum", "temps",
+             "tiempo"),
     "command": (*(x for x in _ASKED if x not in ("ref", "des")), *_both(_ASKED), "target_value", "action", "soll"),
     "position": ("measured", "measured_value", "actual", "present", "feedback", "encoder", "qpos", "observation", "ist",
                  *_PLACES, *_both(_SEEN)),
