@@ -3,9 +3,6 @@
 
 Recordings of the xHand are made in simulation (C MuJoCo, sampled as the hardware samples) with one hidden effect, read
 back and diagnosed with the whole catalogue. Kernels are compiled before the clock starts. One JSON line at the end.
-With several devices (device=cuda,cuda,cpu) the same recordings are diagnosed on one after the other, a JSON line each,
-and one that says whether the answers agree: the same effects on the same joints, and the size of each inside the
-other's interval.
 """
 
 from __future__ import annotations
@@ -80,52 +77,16 @@ def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool
     return paths, where
 
 
-def cores() -> int:
-    """Return CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def disagreements(a: dict, b: dict) -> list[str]:
-    """In what two answers (as diagnosis.json holds them) differ; empty where they agree."""
-    out = [] if a["verdict"] == b["verdict"] else [f"verdict {a['verdict']}, {b['verdict']}"]
-    mine, other = ({(f["effect"], *f["where"]["joints"]): f for f in d["findings"]} for d in (a, b))
-    out += [f"{' '.join(name)}: found by one only" for name in mine.keys() ^ other.keys()]
-    for name in mine.keys() & other.keys():
-        for key, p in mine[name]["parameters"].items():
-            q = other[name]["parameters"].get(key)
-            if q is None or isinstance(p["value"], str) or p["value"] is None:
-                if q is None or q["value"] != p["value"]:
-                    out.append(f"{' '.join(name)} {key}: {p['value']}, {q and q['value']}")
-                continue
-            inside = [
-                np.all(
-                    (np.asarray(x["low"]) <= np.asarray(y["value"])) & (np.asarray(y["value"]) <= np.asarray(x["high"]))
-                )
-                for x, y in ((p, q), (q, p))
-            ]
-            if not all(inside):
-                out.append(f"{' '.join(name)} {key}: {p['value']}, {q['value']}")
-    h, g = a["held_out"], b["held_out"]
-    if h["after"] and abs(h["after"] / g["after"] - 1) > 0.05:
-        out.append(f"error after {h['after']:.3g}, {g['after']:.3g}")
-    return out
-
-
 def main(argv: list[str]) -> int:
     """Makes the recordings, warms the kernels up, diagnoses, prints."""
-    if argv and argv[0] in ("-h", "--help"):
-        print(__doc__)
-        return 0
     s = options(argv, DEFAULTS)
     from dexsim.gap import demo
     from dexsim.gap.command import available
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
 
-    asked = s["device"].split(",")
-    quiet_warp("cpu" if asked == ["cpu"] else "cuda")
-    devices = [available(d) for d in asked]
-    answers: list[dict] = []
+    quiet_warp("cpu" if s["device"] == "cpu" else "cuda")
+    device = available(s["device"])
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(s["out"] or scratch)
         folder.mkdir(parents=True, exist_ok=True)
@@ -135,59 +96,30 @@ def main(argv: list[str]) -> int:
         )
         print(f"recordings made in {time.perf_counter() - start:.1f} s", flush=True)
         small, model, servo, _ = demo.make(folder / "warm", seconds=2.0)
-        for device in dict.fromkeys(devices):  # compiles what is compiled once
-            start = time.perf_counter()
-            diagnose(
-                Settings(
-                    small[:2],
-                    folder / "warm",
-                    None,
-                    str(model),
-                    str(servo),
-                    device=device,
-                    next_recording=False,
-                    allowed={"lag"},
-                    replay=s["replay"],
-                ),
-                say=lambda _: None,
-            )
-            print(f"{device}: kernels ready in {time.perf_counter() - start:.1f} s", flush=True)
-        for k, device in enumerate(devices):
-            start = time.perf_counter()
-            d = diagnose(
-                Settings(
-                    paths,
-                    folder / f"out{k}",
-                    None,
-                    device=device,
-                    next_recording=s["next"] == "true",
-                    replay=s["replay"],
-                ),
-                say=lambda text: print(text, flush=True),
-            )
-            save(d, folder / f"out{k}")
-            took = time.perf_counter() - start
-            total = sum(d.shares.values())
-            for stage, seconds in sorted(d.shares.items(), key=lambda x: -x[1]):
-                print(f"{stage:<28}{seconds:8.2f} s {100 * seconds / total:6.1f} %")
-            found = [(f["effect"], f["where"]["joints"], f["confidence"]) for f in d.data["findings"]]
-            print(json.dumps({
-                "benchmark": "diagnose", "joints": int(s["joints"]), "recorded_s": float(s["seconds"]),
-                "device": device, "seconds": round(took, 2),
-                "shares": {k: round(v / total, 4) for k, v in d.shares.items()}, "verdict": d.data["verdict"],
-                "found": found,
-                "hidden": ["coulomb_friction", where] if s["hidden"] == "true" else None,
-                "cpu": platform.processor() or platform.machine(), "cores": cores(),
-            }), flush=True)  # fmt: skip
-            answers.append({"device": device, "seconds": took, "data": d.data})
-    if len(answers) > 1:
-        print(json.dumps({"benchmark": "diagnose", "compared": [a["device"] for a in answers],
-                          "seconds": [round(a["seconds"], 2) for a in answers],
-                          "of_the_last": [round(a["seconds"] / answers[-1]["seconds"], 3) for a in answers],
-                          "agree": [disagreements(a["data"],
-                                                  answers[-1]["data"]) or True for a in answers[:-1]]}))  # fmt: skip
+        same = {"device": device, "replay": s["replay"]}
+        start = time.perf_counter()
+        warm = Settings(small[:2], folder / "warm", None, str(model), str(servo), next_recording=False,
+                        allowed={"lag"}, **same)  # fmt: skip
+        diagnose(warm, say=lambda _: None)
+        print(f"{device}: kernels ready in {time.perf_counter() - start:.1f} s", flush=True)
+        start = time.perf_counter()
+        d = diagnose(Settings(paths, folder / "out", None, next_recording=s["next"] == "true", **same),
+                     say=lambda text: print(text, flush=True))  # fmt: skip
+        save(d, folder / "out")
+        took = time.perf_counter() - start
+    total = sum(d.shares.values())
+    for stage, seconds in sorted(d.shares.items(), key=lambda x: -x[1]):
+        print(f"{stage:<28}{seconds:8.2f} s {100 * seconds / total:6.1f} %")
+    print(json.dumps({
+        "benchmark": "diagnose", "joints": int(s["joints"]), "recorded_s": float(s["seconds"]), "device": device,
+        "seconds": round(took, 2), "shares": {k: round(v / total, 4) for k, v in d.shares.items()},
+        "verdict": d.data["verdict"],
+        "found": [(f["effect"], f["where"]["joints"], f["confidence"]) for f in d.data["findings"]],
+        "hidden": ["coulomb_friction", where] if s["hidden"] == "true" else None,
+        "cpu": platform.processor() or platform.machine(), "cores": len(os.sched_getaffinity(0)),
+    }), flush=True)  # fmt: skip
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))

@@ -12,7 +12,6 @@ line. Needs numba (pip install numba) and the plant; where either is absent it s
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import json
 import os
@@ -20,7 +19,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -28,24 +26,16 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks import answers
 from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
-ROOT = Path(__file__).parents[1]
 NULLS = range(49, 61)  # numbers of the plant's cases with nothing missing
 SETTINGS = {
     "seed": "source", "nulls": 40, "cases": "", "jobs": 1, "limit": 300, "plant": "../shared/foreign",
     "out": "out/foreign", "threads": 1,
 }  # fmt: skip
-
-
-def seed_of_sources(folder: Path = ROOT / "dexsim") -> int:
-    """Return a number of five digits that every change of a source or a setting changes."""
-    digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".yaml")):
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    return 10_000 + int(digest.hexdigest()[:8], 16) % 90_000
 
 
 def generate(plant: Path, wanted: Sequence[tuple[int, Sequence[int]]], out: Path, jobs: int) -> None:
@@ -90,35 +80,15 @@ def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
         for path in [*case.glob("train/*.mcap"), *case.glob("repeat/*.mcap"), case / "rig.xml", case / "servo.yaml"]:
             shutil.copy(path, work)
         names = sorted(p.name for p in work.glob("*.mcap"))
-        argv = [
-            sys.executable,
-            str(ROOT / "diagnose.py"),
-            f"recordings=[{','.join(str(work / n) for n in names)}]",
-            f"model={work / 'rig.xml'}",
-            f"servo={work / 'servo.yaml'}",
-            f"out={work / 'out'}",
-            "next=false",
-            f"limit={limit}",
-        ]
-        start = time.perf_counter()
-        with open(out / "log.txt", "w", encoding="utf-8") as log:
-            try:
-                code = subprocess.run(
-                    argv,
-                    cwd=work,
-                    env=os.environ
-                    | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    timeout=1.5 * limit,
-                ).returncode
-            except subprocess.TimeoutExpired:
-                code = 124
+        words = [f"recordings=[{','.join(str(work / n) for n in names)}]", f"model={work / 'rig.xml'}",
+                 f"servo={work / 'servo.yaml'}"]  # fmt: skip
+        code, took, _ = answers.ask(words, work / "out", limit, threads=threads)
+        shutil.copy(work / "out" / "log.txt", out)
         for name in ("diagnosis.json", "details.json"):
             if (work / "out" / name).is_file():
                 shutil.copy(work / "out" / name, out)
         (out / "run.json").write_text(
-            json.dumps({"seconds": time.perf_counter() - start, "rc": code, "recordings": names}), encoding="utf-8"
+            json.dumps({"seconds": took, "rc": code, "recordings": names}), encoding="utf-8"
         )
 
 
@@ -207,7 +177,7 @@ def main(argv: Sequence[str]) -> dict | None:
     if importlib.util.find_spec("numba") is None:
         print("skipped: the plant is compiled by numba, which is not installed (pip install numba)")
         return None
-    seed = seed_of_sources() if s["seed"] == "source" else int(s["seed"])
+    seed = answers.seed_of(s["seed"])
     out, jobs = Path(s["out"]).expanduser().resolve() / f"seed_{seed}", s["jobs"]
     only = [int(x) for x in s["cases"].strip("[]").split(",") if x]
     if not (out / "made").is_file():

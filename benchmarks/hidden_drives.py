@@ -29,7 +29,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benchmarks.foreign import seed_of_sources
+from benchmarks.answers import seed_of_sources
 from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError

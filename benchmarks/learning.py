@@ -1,7 +1,7 @@
 """Environment steps a second with PPO included, where the time goes, and the distance to bare physics with PPO.
 
     python -m benchmarks.learning [worlds=4096,8192,16384,32768] [iterations=6] [policy=checkpoints/grasp.pt]
-                                  [settle=120] [variants=not_recorded,float32] [any other setting of train.py]
+                                  [settle=120] [any other setting of train.py]
 
 For each number of worlds, in one run:
   full   the environment and rsl-rl's PPO as train.py runs them, with the actor of a trained policy, so that the worlds
@@ -9,8 +9,8 @@ For each number of worlds, in one run:
   bare   the same PPO on a stand-in that returns the same observations, rewards and ends, and in whose step only physics
          happens: the physics steps of the last rollout, from the same states, driven by the recorded torques.
 Seconds an iteration are medians, from device clocks: physics, rest of the environment's step, inference (actor, critic,
-storage, statistics), update. ratio: steps a second of full over bare. variants times other settings of learning as
-well: not_recorded (rsl-rl's own update), float32 products instead of TF32, bfloat16 autocast, compiled (torch.compile).
+storage, statistics), update. ratio: steps a second of full over bare. Other settings of learning are timed by setting
+them: graphed_update=false (rsl-rl's own update), tf32=false, agent.algorithm.use_mixed_precision=true.
 """
 
 from __future__ import annotations
@@ -26,17 +26,9 @@ import torch
 from benchmarks import tools
 from benchmarks.tape import Tape
 from dexsim.cli import machine
-from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.runner import Runner
 from dexsim.tasks import make_env
-
-VARIANTS: dict[str, dict[str, Any]] = {
-    "not_recorded": {"graphed": False},
-    "float32": {"tf32": False},
-    "bfloat16": {"use_mixed_precision": True},
-    "compiled": {"compile": "default"},
-}
 
 
 class Bare:
@@ -151,19 +143,7 @@ def _runner(env: Any, cfg: dict, actor: dict) -> Runner:
     return runner
 
 
-def _settings(cfg: dict, changes: dict[str, Any]) -> dict:
-    agent = {**cfg["agent"], "algorithm": dict(cfg["agent"]["algorithm"])}
-    if "compile" in changes:
-        agent["torch_compile_mode"] = changes["compile"]
-    cfg = {**cfg, "tf32": changes.get("tf32", cfg["tf32"])}
-    if "graphed" in changes:
-        cfg["graphed_update"] = changes["graphed"]
-    if "use_mixed_precision" in changes:
-        agent["algorithm"]["use_mixed_precision"] = True
-    return {**cfg, "agent": agent}
-
-
-def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, variants: dict[str, dict]) -> dict:
+def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict) -> dict:
     """Return one row of the table: seconds, rates and the ratio at `worlds` worlds."""
     cfg = {**cfg, "worlds": worlds}
     device, length = cfg["device"], cfg["agent"]["num_steps_per_env"]
@@ -188,12 +168,6 @@ def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, v
         "env_steps_per_s": steps / full["step"],
         "contacts": env.engine.peaks()["contacts"], "bare": bare,
     }  # fmt: skip
-    for name, changes in variants.items():
-        try:
-            found = _timed(_runner(env, _settings(cfg, changes), actor), env, iterations)
-            row[f"{name}_steps_per_s"], row[f"{name}_update_s"] = steps / found["all"], found["update"]
-        except Exception as error:  # a compiler that is not there is a finding, not a failure of the benchmark
-            row[f"{name}_failed"] = str(error).strip().splitlines()[0][:200]
     return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
 
 
@@ -206,19 +180,14 @@ def main(argv: list[str]) -> dict:
             "iterations": "6" if cuda else "3",
             "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"),
             "settle": "120" if cuda else "40",
-            "variants": "",
         },
     )
     cfg = tools.config(rest)
     data = checkpoint.load(own["policy"], cfg["device"])
-    names = list(VARIANTS) if own["variants"] == "all" else [v for v in own["variants"].split(",") if v]
-    if unknown := [v for v in names if v not in VARIANTS]:
-        raise UserError(f"variants={unknown[0]}: must be of {', '.join(VARIANTS)}, or all")
-    variants = {v: VARIANTS[v] for v in names}
     iterations, settle = tools.numbers(own["iterations"], "iterations")[0], tools.numbers(own["settle"], "settle")[0]
     out: dict = {"benchmark": "learning", **tools.about(cfg["device"]), "rows": []}
     for worlds in tools.numbers(own["worlds"], "worlds"):
-        row = measure(cfg, worlds, iterations, settle, data["actor"], variants)
+        row = measure(cfg, worlds, iterations, settle, data["actor"])
         out["rows"].append(row)
         share = {k: row[f"{k}_s"] / row["iteration_s"] for k in ("physics", "rest_of_step", "inference", "update")}
         print(
@@ -227,12 +196,6 @@ def main(argv: list[str]) -> dict:
             f"({row['bare_steps_per_s']:.0f}); " + ", ".join(f"{k} {100 * v:.1f} %" for k, v in share.items()),
             flush=True,
         )
-        for name in variants:
-            said = (
-                row.get(f"{name}_failed")
-                or f"{row[f'{name}_steps_per_s']:.0f} steps/s, update {row[f'{name}_update_s']:.3f} s"
-            )
-            print(f"         {name}: {said}", flush=True)
         gc.collect()
         if cfg["device"].startswith("cuda"):
             torch.cuda.empty_cache()

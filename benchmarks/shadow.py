@@ -19,27 +19,20 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from itertools import chain, zip_longest
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from benchmarks import same_names
+from benchmarks import answers, same_names
 from benchmarks.concealed import score
-from benchmarks.foreign import seed_of_sources
 from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.console.tables import table
-from dexsim.errors import UserError
 from dexsim.gap import posterior
 from dexsim.gap.effects.catalogue import confusable
 from dexsim.gap.posterior import Hypothesis
 
-ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = {"concealed": 60, "spatial": 60, "planted": 30, "foreign": "", "seed": "source", "jobs": 1, "limit": 300,
             "until": 0, "out": "out/shadow"}  # fmt: skip
 SETS = ("spatial", "concealed", "planted", "foreign")
@@ -55,15 +48,9 @@ def case(job: tuple[str, int, dict[str, Any], Path, float]) -> dict[str, Any] | 
     which, number, s, out, ends = job
     if time.time() > ends:
         return None
-    if which == "foreign":
-        made = same_names.foreign(number, Path(s["foreign"]))
-    elif which == "planted":
-        made = same_names.planted(number, s["seed"], out / which)
-    else:
-        mix = {"spatial": s["spatial"]} if which == "spatial" else same_names.MIX
-        made = same_names.concealed(number, s["seed"], out / which, mix)
+    made = same_names.made(which, number, s, out)
     folder = out / "answers" / f"{which}_{number}"
-    said = same_names.answer(ROOT, made, folder, s["limit"], ends)
+    said = answers.diagnosed(answers.ROOT, made["words"], folder, s["limit"], ends)
     if said is None:
         return None
     details = folder / "details.json"
@@ -166,30 +153,8 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Diagnoses the cases, and prints the table; returns the exit status."""
-    s = options(argv, SETTINGS)
-    if s["foreign"] and not (Path(s["foreign"]) / "truth").is_dir():
-        raise UserError(f"foreign={s['foreign']}: must be a folder with cases/ and truth/")
-    s["seed"] = seed_of_sources() if s["seed"] == "source" else int(s["seed"])
-    ends = time.time() + (s["until"] or 1e9)
-    out = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
-    out.mkdir(parents=True, exist_ok=True)
-    log = out / "cases.jsonl"
-    rows = [json.loads(x) for x in log.read_text(encoding="utf-8").splitlines()] if log.is_file() else []
-    done = {(r["set"], r["number"]) for r in rows}
-    there = len(list(Path(s["foreign"]).glob("truth/*.json"))) if s["foreign"] else 0
-    counts = {k: s[k] for k in SETS[:3]} | {"foreign": there}
-    turns = chain.from_iterable(zip_longest(*([(w, k) for k in range(counts[w])] for w in SETS)))
-    jobs = [(*t, s, out, ends) for t in turns if t is not None and t not in done]
-    with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(case, job) for job in jobs]
-        for finished in tqdm(as_completed(waiting), "cases", len(waiting)):
-            row = finished.result()
-            if row is not None:
-                rows.append(row)
-                with log.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(row) + "\n")
-    print("\n" + text_of(rows))
+    """Diagnose the cases, and print the table; return the exit status."""
+    print("\n" + text_of(same_names.run(case, options(argv, SETTINGS), SETS, "cases")))
     return 0
 
 

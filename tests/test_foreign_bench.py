@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from benchmarks import foreign
+from benchmarks import answers, foreign
 
 
 def answer(verdict: str, *found: tuple[str, float]) -> dict:
@@ -22,14 +22,14 @@ def test_counts_by_confidence():
         case("4", "null"),
         case("5", "null"),
     ]
-    answers = {
+    said = {
         "1": answer("explained", ("lag", 0.9)),
         "2": answer("explained", ("lag", 0.85), ("backlash", 0.6)),
         "3": answer("none", ("lag", 0.4)),
         "4": answer("unknown", ("lag", 0.55)),
         "5": None,
     }
-    s = foreign.summary(truths, answers)
+    s = foreign.summary(truths, said)
     assert s["easy_first_name_at_0"] == [1, 2] and s["easy_first_name_at_0.8"] == [1, 2]
     assert s["false_alarms"] == [2, 3]  # a name of 0.55, and no answer
     assert s["confident_and_wrong"] == [1, 5] and s["answered"] == 4
@@ -37,11 +37,11 @@ def test_counts_by_confidence():
 
 def test_the_seed_follows_the_sources(tmp_path):
     (tmp_path / "a.py").write_text("x = 1\n")
-    first = foreign.seed_of_sources(tmp_path)
+    first = answers.seed_of_sources(tmp_path)
     (tmp_path / "notes.txt").write_text("no source")
-    assert foreign.seed_of_sources(tmp_path) == first and 10_000 <= first < 100_000
+    assert answers.seed_of_sources(tmp_path) == first and 10_000 <= first < 100_000
     (tmp_path / "a.py").write_text("x = 2\n")
-    assert foreign.seed_of_sources(tmp_path) != first
+    assert answers.seed_of_sources(tmp_path) != first
 
 
 def test_it_skips_where_the_plant_is_absent(tmp_path, capsys):

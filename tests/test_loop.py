@@ -143,21 +143,6 @@ def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
             )
 
 
-def test_forced_mass_follows_its_formula():
-    """EMPS driven by its own force: exact parameters leave next to nothing, wrong ones do not."""
-    from benchmarks.real import emps_force
-
-    dt, n = 1e-3, 4000
-    t = np.arange(n) * dt
-    v = 0.1 * np.sin(2 * np.pi * 0.7 * t)
-    q = np.concatenate([[0.0], np.cumsum(v[:-1]) * dt])
-    force = 95.0 * np.gradient(v, dt) + 200.0 * v + 20.0 * np.sign(v) - 3.0
-    assert emps_force.open_loop(t, q, force, 95.0, 200.0, 20.0, -3.0) < 2e-3
-    assert emps_force.open_loop(t, q, force, 95.0, 120.0, 20.0, -3.0) > 4e-3
-    late = np.interp(t + 5e-3, t, force)  # a force that is logged 5 ms before it acts
-    assert emps_force.open_loop(t, q, late, 95.0, 200.0, 20.0, -3.0, late=5e-3) < 2e-3
-
-
 def test_gains_scatter_as_those_that_were_listed():
     """200 gains of spread 0.2: those over 0.08 off are known, the others only as nearer than that."""
     from benchmarks.loop.presses import LISTED, spread

@@ -1,6 +1,8 @@
-"""The planted benchmark: how large an effect is, is what a refit leaves of it."""
+"""The planted benchmark: what a case hides, and how large it is."""
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -8,25 +10,23 @@ import pytest
 from benchmarks import planted
 
 
+def test_effects_and_sizes_take_turns():
+    entries = planted.plan(3, 6 * len(planted.PLANTS))
+    counts = Counter(e["effect"] for e in entries)
+    assert counts.pop("none") == len(planted.PLANTS) and set(counts.values()) == {5}
+    assert {e["tier"] for e in entries} == {*planted.TIERS, "none"}
+
+
 @pytest.mark.slow
-def test_what_refitted_figures_take_over_is_no_size_and_sizes_grow_to_what_is_wanted():
-    rng = np.random.default_rng([5, 2, 0])
-    b = planted.rig(rng, "damped")
-    b["off"] = planted._off(rng, b)
-    runs = planted._not_the_hardest_last(b, planted._runs(b, rng, "damped"))
-    noise = 5e-4
-    kind = planted.PLANTS["coulomb_friction"]
-    sizes = np.geomspace(*kind.span, 5)
-    # inside the beliefs
-    hidden = planted._joined(
-        b["off"], {"*kp": 0.999 * 1.05 / b["off"]["*kp"], "*gravity_scale": 1.04 / b["off"]["*gravity_scale"]}
-    )
-    tries = [b["off"], *(planted._joined(b["off"], kind.change(b, s)) for s in sizes), hidden]
-    cases, q, _ = planted._simulate(b, runs, tries, 1e-3, 2)
-    none = planted._apply(cases[0].plant.base()[0], b["off"])
-    assert np.sqrt(np.mean((q[-1] - q[0]) ** 2)) > 2 * noise
-    assert planted._left(cases[0], q[-1], none, noise) < 1.2
-    pick, ratio = planted._sized(cases[0], tries[:-1], q[:-1], noise, 4.0)
-    assert pick >= 1 and ratio == pytest.approx(planted._left(cases[0], q[pick], none, noise))
-    others = [planted._left(cases[0], q[i], none, noise) for i in (max(pick - 1, 1), min(pick + 1, len(sizes)))]
-    assert all(abs(np.log(ratio / 4.0)) <= abs(np.log(x / 4.0)) + 1e-9 for x in others)
+def test_an_effect_changes_the_motion_by_what_its_size_says_and_repeats(tmp_path):
+    made = []
+    for name in ("first", "again"):
+        entry = {"effect": "coulomb_friction", "tier": "medium"}
+        made.append(planted.make(entry, 3, 7, tmp_path / name))
+        assert sorted(p.name for p in (tmp_path / name).iterdir()) == [
+            "a.mcap", "b.mcap", "c.mcap", "d.mcap", "rig.xml", "servo.yaml"]  # fmt: skip
+    assert made[0] == made[1] and made[0]["times_noise"] == pytest.approx(8.0, rel=0.3)
+    from dexsim.recording import read
+
+    first, again = (read(tmp_path / name / "a.mcap").states.position.value for name in ("first", "again"))
+    assert np.array_equal(first, again, equal_nan=True)

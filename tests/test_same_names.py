@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks import same_names
+from benchmarks import answers, same_names
 from dexsim.errors import UserError
 
 
@@ -48,10 +48,10 @@ def test_right_and_sure():
 def test_the_time_left_is_held_against_what_was_left():
     lines = [(2.0, "  searching elbow (1/1), 20 % done, about 9 s left"),
              (8.0, "  searching elbow (1/1), 50 % done, about 9 s left"), (12.0, "  searched 1 in 12 s")]  # fmt: skip
-    times = same_names.times_of(lines)
+    times = answers.times_of(lines)
     assert times == [(2.0, 0.2, 9.0), (8.0, 0.5, 9.0), (12.0, 1.0, 0.0)]
     assert same_names.told_right([row(said(times=times), said())], "before") == "1 of 2"
-    assert same_names.times_of(lines[:2]) == []  # nobody knows how long it would have taken
+    assert answers.times_of(lines[:2]) == []  # nobody knows how long it would have taken
 
 
 def test_what_both_have_answered_is_not_run_again(tmp_path, monkeypatch, capsys):

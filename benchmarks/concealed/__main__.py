@@ -19,8 +19,6 @@ with laws=one, seed_N_NAME of another hand, seed_N_said with braking=said); prin
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
@@ -30,14 +28,13 @@ from pathlib import Path
 import yaml
 from tqdm import tqdm
 
+from benchmarks import answers
 from benchmarks.concealed import generate, laws, score
-from benchmarks.foreign import seed_of_sources
 from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 
-ROOT = Path(__file__).parents[2]
 SETTINGS = {"mix": "", "seed": "1", "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
             "budget": 0, "until": 0, "first": 0, "ci": False, "one_joint": False,
             "hand": "xhand", "mirror": False, "braking": "unsaid"}
@@ -51,9 +48,7 @@ def parse(argv: list[str]) -> dict:
     if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
         raise UserError(f"mix={given['mix']}: must read like effect:14,none:4, groups of {', '.join(generate.MIX)}")
     given["mix"] = {group: int(number) for group, number in pairs} or dict(generate.MIX)
-    if given["seed"] != "source" and not given["seed"].isdigit():
-        raise UserError(f"seed={given['seed']}: must be a whole number or source")
-    given["seed"] = seed_of_sources() if given["seed"] == "source" else int(given["seed"])
+    given["seed"] = answers.seed_of(given["seed"])
     if given["ci"]:
         given["mix"] = dict(CI)
     return given
@@ -64,26 +59,12 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     case, out = root / "cases" / m["name"], root / "diagnoses" / m["name"]
     if (out / "seconds").is_file() or _spent(s, begun):
         return
-    longest = 1.5 * s["limit"]  # it ends itself at its limit with what it has; this is for one that does not
-    room = _room(s | {"limit": longest}, begun)
+    room = max(s["until"] - (time.perf_counter() - begun), 1.0) if s["until"] else 1e9
     out.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
-    fit, held = files[: -generate.HELD], files[-generate.HELD :]
-    servo = _with_braking(case, out) if s.get("braking") == "said" else case / "servo.yaml"
-    own = [f"model={case / 'rig.xml'}", f"servo={servo}"] if (case / "rig.xml").is_file() else []
-    argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]",
-            *own, f"out={out}", "next=false", f"limit={s['limit']}"]
-    env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with open(out / "log.txt", "w", encoding="utf-8") as log:
-        try:
-            status = subprocess.run(argv, cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT,
-                                    timeout=room).returncode
-        except subprocess.TimeoutExpired:
-            if room < longest:  # the run ends, not its time: left out
-                return
-            status = "out of time"
-    spent = time.perf_counter() - start
+    servo = _with_braking(case, out) if s["braking"] == "said" else None
+    status, spent, _ = answers.ask(generate.words(case, servo), out, s["limit"], room)
+    if status is None:  # the run ends, not its time: left out
+        return
     if status != 0 or not (out / "diagnosis.json").is_file():
         # counted, not dropped: no answer is a wrong one
         failed = {"verdict": "failed", "findings": [], "held_out": None, "status": status}
@@ -107,11 +88,6 @@ def _with_braking(case: Path, out: Path) -> Path:
 
 def _spent(s: dict, begun: float) -> bool:
     return bool(s["budget"]) and time.perf_counter() - begun > s["budget"]
-
-
-def _room(s: dict, begun: float) -> float:
-    """Return the seconds that what begins now may take."""
-    return min(s["limit"], max(s["until"] - (time.perf_counter() - begun), 1.0)) if s.get("until") else s["limit"]
 
 
 def main(argv: list[str]) -> dict:

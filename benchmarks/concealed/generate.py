@@ -281,6 +281,14 @@ def _over(count: int) -> np.ndarray:
     return np.arange(count) / count
 
 
+def words(case: Path, servo: Path | None = None) -> list[str]:
+    """Return the settings of `diagnose` on a case's folder; servo: another table than its own."""
+    files = [str(case / f"{letter}.mcap") for letter in RECORDINGS]
+    rig = [f"model={case / 'rig.xml'}", f"servo={servo or case / 'servo.yaml'}"]
+    return [f"recordings=[{','.join(files[:-HELD])}]", f"held_out=[{','.join(files[-HELD:])}]",
+            *(rig if (case / "rig.xml").is_file() else [])]  # fmt: skip
+
+
 def metadata(effort: bool, hand: str) -> dict[str, str]:
     """Return what every recording states: nothing of it depends on the effect."""
     return {"source": "real", "robot": hand or "rig", "gravity": "0 0 -9.81",

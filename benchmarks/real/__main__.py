@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.fold import brief, finger, fold, joint
+from benchmarks.real.fold import diagnosed, finger, fold, joint
 from dexsim import intervals
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 USAGE = """\
 usage: python -m benchmarks.real bam|emps|sage|panda|ergocub [data=PATH] [out=out/real/NAME] [jobs=1] [fit=20]
-                                 [figure=FILE.png]
 
 data: where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml;
 the Panda's trajectory; the ergoCub fingers' runs), or the folder of all of them with one folder each; without it
@@ -76,48 +75,23 @@ def _named(f: dict) -> str:
 
 
 def emps(data: Path, out: Path, jobs: int) -> dict:
-    """Return the fitted on the estimation data, judged on the pulses; in closed loop, and driven by the recorded force
-    alone."""
-    from benchmarks.real import emps_force as force
-    from benchmarks.real.convert_emps import REFERENCE, convert
-    from dexsim.gap.diagnosis import Settings, diagnose, save
+    """Return what was fitted to the estimation data and judged on the pulses: by the search in closed loop, and by the
+    tool's own stage for a logged motor torque."""
+    from benchmarks.real.convert_emps import FILES, REFERENCE, convert, load
 
     made = convert(data, out / "recordings")
-    start = time.perf_counter()
-    d = diagnose(
-        Settings([made.estimation], out, [made.pulses], str(made.model), str(made.servo), next_recording=False),
-        say=lambda _: None,
-    )
-    save(d, out)
-    result = {
-        "benchmark": "emps",
-        "verdict": d.data["verdict"],
-        "findings": [brief(f) for f in d.data["findings"]],
-        "nuisance": d.data["nuisance"],
-        "reference": REFERENCE,
-        "held_out": d.data["held_out"],
-        "joints": d.joints,
-        "notes": d.notes,
-        "seconds": round(time.perf_counter() - start, 1),
-    }
+    d, said = diagnosed(out, "found", [made.estimation], [made.pulses], made)
+    result = {"benchmark": "emps", "reference": REFERENCE, "joints": d.joints, **said}
     found = _emps_parameters(d)
     result["found"] = found
     result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
     # the tool's own stage for a logged motor torque, as its report has it
-    from dexsim.gap.search.inverse_dynamics import SQUARE, identify
+    from dexsim.gap.search.inverse_dynamics import identify
 
-    given = {n: force.load(data, n) for n in force.FILES}
+    given = {n: load(data, n)[:3] for n in FILES}
     tool = identify(*given["estimation"], test=given["pulses"])
     names = {"mass": "inertia", "viscous": "viscous_friction", "coulomb": "coulomb_friction", "offset": "offset"}
     by = {k: tool.value[n] for k, n in names.items()}
-    more = {k: tool.full[n] for k, n in names.items()}
-    for n in tool.named:
-        if n.effect == "lag":
-            more["late"] = n.value / tool.full["inertia"]
-        elif n.effect == "viscous_friction":
-            more["by_direction"] = n.value
-        elif n.text != SQUARE and n.speed:
-            more |= {"peak": n.value, "v_s": n.speed}
     result["inverse"] = {
         "value": by,
         "low": {k: tool.low[n] for k, n in names.items()},
@@ -125,27 +99,11 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
         "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 3) for k in by},
         "extra": tool.extra[:3],
         "residual": tool.residual,
-        "with_named": more,
         "named": [
-            {
-                "text": n.text,
-                "effect": n.effect,
-                "value": n.value,
-                "low": n.low,
-                "high": n.high,
-                "share": n.share,
-                "before_N": n.before,
-                "after_N": n.after,
-            }
+            {k: getattr(n, k) for k in ("text", "effect", "value", "low", "high", "share")}
+            | {"before_N": n.before, "after_N": n.after}
             for n in tool.named
         ],
-    }
-    result["open_loop_mm"] = {
-        name: {
-            label: round(1e3 * force.open_loop(*x, **p), 3)
-            for label, p in (("reference", REFERENCE), ("found", found), ("inverse", by), ("named", more))
-        }
-        for name, x in given.items()
     }
     return result
 
@@ -197,37 +155,18 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
     """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is
     kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
-    from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.gap.rules import JUDGE
 
     made = convert(data, out / "recordings")
-    wall, cpu = time.perf_counter(), time.process_time()
-    d = diagnose(
-        Settings([made.recording], out, None, str(made.model), str(made.servo), next_recording=False), say=print
-    )
-    save(d, out)
-    cpu = time.process_time() - cpu
+    d, said = diagnosed(out, "found", [made.recording], [], made)
     rows, plainly = {}, plain(data, 1 - JUDGE.kept_end)
     for j in JOINTS:
         v = d.servo.value(j, "coulomb_friction")
         x = plainly[j]
         rows[j] = {"handed_on": None if v.unknown else v.value, "low": v.low, "high": v.high, "plain": x,
                    "inside": bool(not v.unknown and x["low"] <= v.value <= x["high"]), "sigma": d.joints.get(j)}
-    return {
-        "benchmark": "panda",
-        "inside": sum(r["inside"] for r in rows.values()),
-        "of": len(JOINTS),
-        "joints": rows,
-        "stages": d.stages,
-        "verdict": d.data["verdict"],
-        "findings": [brief(f) for f in d.data["findings"]],
-        "sentence": d.sentence,
-        "held_out": d.data["held_out"],
-        "notes": d.notes,
-        "cpu_seconds": round(cpu, 1),
-        "seconds": round(time.perf_counter() - wall, 1),
-        "shares": d.shares,
-    }
+    inside = sum(r["inside"] for r in rows.values())
+    return {"benchmark": "panda", "inside": inside, "of": len(JOINTS), "joints": rows, **said}
 
 
 def ergocub(data: Path, out: Path, jobs: int) -> dict:
@@ -257,46 +196,6 @@ def ergocub(data: Path, out: Path, jobs: int) -> dict:
 
 HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
 JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda, "ergocub": ergocub}
-FIGURES = ("bam", "emps", "sage")
-
-
-def figure(result: dict, path: Path) -> None:
-    """Errors before and after, by recording (BAM), by joint (SAGE), or the open loop (EMPS)."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    if result["benchmark"] == "bam":
-        rows = [
-            (f"gain {f['gain']}", *(1e3 * np.mean([e[i] for e in f["recordings"].values()]) for i in (0, 1)))
-            for f in result["folds"]
-        ]
-        label = "position MAE, left-out gain (mrad)"
-    elif result["benchmark"] == "sage":
-        rows = [(j, v["before_mrad"], v["after_mrad"]) for j, v in result["joints"].items()]
-        label = "position RMSE, held-out motions (mrad)"
-    else:
-        n = result["inverse"]["named"]
-        rows = [("as published", n[0]["before_N"], 0.0), *((f"+ {x['text']}", 0.0, x["after_N"]) for x in n)]
-        label = "force left on the pulses, not fitted (N, rms)"
-    fig, ax = plt.subplots(figsize=(7.2, 0.42 * len(rows) + 1.5), layout="constrained")
-    y, pair = np.arange(len(rows)), 0.2 if result["benchmark"] != "emps" else 0.0
-    ax.barh(
-        y - pair,
-        [r[1] for r in rows],
-        0.38,
-        color="#a0aec0",
-        label="as believed, refitted within its ranges" if pair else "published structure",
-    )
-    ax.barh(y + pair, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
-    ax.set_yticks(y, [r[0] for r in rows])
-    ax.invert_yaxis()
-    ax.set_xlabel(label)
-    fig.legend(loc="outside upper center", ncols=2, fontsize=8, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=120)
-    plt.close(fig)
 
 
 def folder(name: str, given: str | None) -> Path | None:
@@ -322,13 +221,11 @@ def main(argv: list[str]) -> int:
         not plain
         or len(plain) > 2
         or plain[0] not in JOBS
-        or set(given) - {"data", "out", "jobs", "figure", "fit"}
+        or set(given) - {"data", "out", "jobs", "fit"}
         or not given.get("jobs", "1").isdigit()
     ):
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
-    if "figure" in given and plain[0] not in FIGURES:
-        raise UserError(f"figure= is drawn for {', '.join(FIGURES)}, not for {plain[0]}")
     data = folder(plain[0], plain[1] if len(plain) == 2 else given.get("data"))
     if data is None:
         print(
@@ -350,8 +247,6 @@ def main(argv: list[str]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(result, default=float)
     (out / f"{plain[0]}.json").write_text(text, encoding="utf-8")
-    if "figure" in given:
-        figure(result, Path(given["figure"]))
     print(text)
     return 0
 

@@ -23,6 +23,7 @@ MODEL = """<mujoco model="emps">
   </worldbody>
 </mujoco>
 """
+FILES = {"estimation": "DATA_EMPS.mat", "pulses": "DATA_EMPS_PULSES.mat"}
 REFERENCE = {"mass": 95.1089, "viscous": 203.5034, "coulomb": 20.3935, "offset": -3.1648}
 
 
@@ -36,10 +37,17 @@ class Emps:
     servo: Path
 
 
-def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
-    """Converts DATA_EMPS.mat and DATA_EMPS_PULSES.mat. mass: believed [kg]; of the friction nothing is."""
+def load(data: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return times s, positions m, forces N and targets m of one of FILES."""
     from scipy.io import loadmat
 
+    raw = loadmat(data / FILES[name])
+    get = lambda key: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
+    return get("t"), get("qm"), float(raw["gtau"].squeeze()) * get("vir"), get("qg")
+
+
+def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
+    """Converts DATA_EMPS.mat and DATA_EMPS_PULSES.mat. mass: believed [kg]; of the friction nothing is."""
     if not (data / "DATA_EMPS.mat").is_file():
         raise UserError(f"{data}: no DATA_EMPS.mat; download the EMPS benchmark from nonlinearbenchmark.org")
     out.mkdir(parents=True, exist_ok=True)
@@ -63,13 +71,11 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
         },
     )
     paths = []
-    for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
-        raw = loadmat(data / f"{name}.mat")
-        get = lambda key, raw=raw: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
-        t, q, target, force = get("t"), get("qm"), get("qg"), float(raw["gtau"].squeeze()) * get("vir")
+    for name, file in FILES.items():
+        t, q, force, target = load(data, name)
         paths.append(
             save(
-                out / f"{name.lower()}.mcap",
+                out / f"{Path(file).stem.lower()}.mcap",
                 ("carriage",),
                 t,
                 target[:, None],

@@ -1,22 +1,19 @@
-"""Which of SAGE's motions log their commands a period late: python -m benchmarks.real.sage_clock DATA_DIR
+"""Which of SAGE's motions log their commands a period late.
 
 A servo's current follows its position error and its speed (the law of its firmware and motor, whatever the load):
 |current| = |a error - b speed + c| + d, one a, b, c, d a joint. The error that explains the current best is the one
 with the command that was in force: the logged one, or that of a period later, where the log writes each command down
 after the servo has had it. What most motions have counts as right (a delay that all share is for the fit). The current
-has lost its sign and is used for nothing else; no model of the motion takes part. One JSON line.
+has lost its sign and is used for nothing else; no model of the motion takes part.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 JAW = 2.34  # rad per unit of the jaw's 0..1
@@ -78,24 +75,3 @@ def late(data: Path) -> dict[str, float]:
                     out[name] += float(a - b) / ALIKE / 2
         choice = {n: int(v > 0) for n, v in out.items()}
     return out
-
-
-def main(argv: list[str]) -> int:
-    """Prints the motions whose commands are logged a period late; returns the exit status."""
-    if len(argv) != 1 or argv[0] in ("-h", "--help"):
-        print(__doc__)
-        return 0 if argv else 2
-    found = late(Path(argv[0]).expanduser())
-    print(
-        json.dumps(
-            {
-                "late": {n: round(v, 1) for n, v in found.items() if v > SURE},
-                "not": {n: round(v, 1) for n, v in found.items() if v <= SURE},
-            }
-        )
-    )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:], __doc__))

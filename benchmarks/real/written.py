@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.real.fold import brief
+from benchmarks.real import fold
 from dexsim.console.ending import guard
 from dexsim.console.tables import table
 from dexsim.errors import UserError
@@ -111,32 +111,10 @@ MAKE: dict[str, Callable[[Path, Path, str], list[Part]]] = {
 
 def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
     """Diagnose one part, write its files and replay them."""
-    from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.sim.quiet import quiet_warp
-
     part, out, limit = job
-    quiet_warp("cpu")
-    begun, folder = time.perf_counter(), out / part.name
-    log = (out / f"{part.name}.log").open("w", encoding="utf-8", buffering=1)
-    d = diagnose(
-        Settings(
-            part.recordings,
-            folder,
-            part.held_out or None,
-            str(part.model),
-            str(part.servo),
-            next_recording=False,
-            joints=None if part.judged is None else set(part.judged),
-            limit=limit,
-        ),
-        say=lambda text: print(f"{time.perf_counter() - begun:6.0f} s  {text}", file=log),
-        progress=lambda done, of, name, remaining=None: print(
-            f"{time.perf_counter() - begun:6.0f} s  searching {name}, {done:.3f} of {of}", file=log
-        ),
-    )
-    save(d, folder)
-    took = time.perf_counter() - begun
-    said = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    judged = None if part.judged is None else set(part.judged)
+    d, said = fold.diagnosed(out, part.name, part.recordings, part.held_out, part, joints=judged, limit=limit)
+    folder = out / part.name
     reported = said["held_out"].get("replayed")
     files = {p.name: p for p in (*part.recordings, *part.held_out)}
     rows, parts = {}, [] if reported is None else reported["parts"]
@@ -153,20 +131,14 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
             "reported": None if reported is None else reported["joints"].get(joint),
             "replayed": played.get(joint),
         }
-    log.close()
     result = {
         "part": part.name,
+        **said,
         "joints": rows,
         "parts": parts,
-        "verdict": said["verdict"],
-        "sentence": d.sentence,
-        "findings": [brief(f) for f in said["findings"]],
         "reported": None if reported is None else reported["error"],
-        "floor": said["noise_floor"],
-        "baseline": said["baseline"],
-        "notes": d.notes,
-        "seconds": took,
-        "shares": d.shares,
+        "floor": d.data["noise_floor"],
+        "baseline": d.data["baseline"],
     }
     (out / f"{part.name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
     return result
