@@ -401,13 +401,16 @@ def _path(
     each = [w.led.at(t, o, s) for w, o, s in zip(worlds, offset, scale, strict=True) if w.led is not None]
     to = lambda x: torch.as_tensor(np.stack(x, 1), dtype=engine.t.qpos.dtype, device=engine.t.qpos.device)  # noqa: E731
     q, v, a = (to(x) for x in zip(*each, strict=True))
-    at, dofs, begun = engine.qpos_index(joints), engine.dof_index(joints), [False]
+    index = lambda x: torch.as_tensor(x, device=q.device).long()  # noqa: E731
+    at, dofs = index(engine.qpos_index(joints)), index(engine.dof_index(joints))
+    force, begun = HEAVY * a, [False]
 
-    def lead(k: int) -> None:
+    def lead(k: int) -> None:  # index_copy_ takes a third of an assignment's time, and there are three a step
         if begun[0]:
-            engine.t.qfrc_applied[:, dofs] = HEAVY * a[k]
+            engine.t.qfrc_applied.index_copy_(1, dofs, force[k])
         else:
-            engine.t.qpos[:, at], engine.t.qvel[:, dofs] = q[k], v[k]
+            engine.t.qpos.index_copy_(1, at, q[k])
+            engine.t.qvel.index_copy_(1, dofs, v[k])
         begun[0] = not begun[0]
 
     return lead
