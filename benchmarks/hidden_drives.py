@@ -39,7 +39,8 @@ KINDS = {"play": "backlash", "friction": "coulomb_friction", "elasticity": "comp
 """What is hidden, and the effect of the catalogue that it is."""
 OFF = 0.03  # how far off each believed figure may be
 MOVED = 2  # drives that a recording moves
-NOISE = 6e-4  # rad: of the readings, a 4096th of a turn and its jitter
+DRAWS = 9  # of a case that can be, at most
+NOISE = 6e-4  # rad: of the readings, a 4096th of a turn and its jitter; a slide goes through its range in one turn
 LARGE = (16.0, 32.0)  # times that, in what the effect alone changes; what a refit leaves of it is about half
 SIZED = 40.0  # s of the drive's own motions in the first recording that it is sized on
 MOST = {"play": 0.2, "friction": 0.4, "elasticity": 1.5}
@@ -94,7 +95,7 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
     from dexsim.recording import write
     from dexsim.recording.excitation import plan
     from dexsim.recording.mechanism import drive, of_hand, recorded
-    from dexsim.recording.realistic import CURRENT_PER_TORQUE, realistic
+    from dexsim.recording.realistic import CURRENT_PER_TORQUE, Hardware, realistic
     from dexsim.recording.schema import COMMANDS, Series
     from dexsim.sim.quiet import quiet_warp
 
@@ -114,14 +115,19 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     believed.table.save(folder / "servo.yaml")
     plans = [plan(believed, moved, kinds, seed=int(rng.integers(1 << 30))) for kinds in RECORDINGS.values()]
-    least = float(rng.uniform(*LARGE)) * NOISE
+    slides = hand.compiled.jnt_type[[hand.compiled.joint(j).id for j in hand.joints]] == mujoco.mjtJoint.mjJNT_SLIDE
+    radius = np.where(slides, np.ptp(hand.limits, axis=1) / (2 * np.pi), 1.0)  # m a rad of the motor
+    least = float(rng.uniform(*LARGE)) * NOISE * float(radius[k])
+    bus = Hardware(position_lsb=np.append(radius, np.ones(len(hand.sensed))) * Hardware.position_lsb)
     for kind in rng.permutation(list(KINDS)).tolist():  # a light finger shows no spring in its tendon: then another
         if changed := sized(true, hidden, kind, least, plans[0], float(np.ptp(hand.limits[k]))):
             break
+    else:
+        raise UserError(f"hand={which}: neither play nor friction nor a spring in the drive of {hidden} shows")
     for name, p in zip(RECORDINGS, plans, strict=True):
         run = drive(true, Series(p.t, p.value), hand.joints, float(p.t[-1]), initial=p.home)
         dense = recorded(run, believed, Series(p.t, p.value, COMMANDS), hand.joints, rate=500.0)
-        seen = realistic(dense, seed=int(rng.integers(1 << 30)))
+        seen = realistic(dense, seed=int(rng.integers(1 << 30)), hardware=bus)
         seen.meta["source"] = "real"
         write(folder / f"{name}.mcap", seen)
     return {"hand": str(which), "kind": kind, "effect": KINDS[kind], "joint": hidden, "moved": moved, **changed,
@@ -144,7 +150,14 @@ def case(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> di
     if done.is_file():
         return json.loads(done.read_text(encoding="utf-8"))
     rng = np.random.default_rng([seed, number])
-    truth = make(folder, hands[int(rng.integers(len(hands)))], rng)
+    for more in reversed(range(DRAWS)):
+        try:
+            truth = make(folder, hands[int(rng.integers(len(hands)))], rng)
+            break
+        except UserError as error:  # another drive, or another hand
+            if not more:
+                raise
+            print(f"{number:>3} drawn again: {error}", flush=True)
     row = {"number": number, **truth, **diagnosed(folder, truth, limit)}
     done.write_text(json.dumps(row), encoding="utf-8")
     return row

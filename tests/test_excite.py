@@ -258,6 +258,15 @@ def test_a_servo_that_cannot_move_safely_is_refused():
         excitation.plan(m, kinds=("holds",))
 
 
+def test_links_that_no_drive_carries_are_said_at_once(monkeypatch):
+    m = rig()
+    m.spec.option.gravity = [9.81, 0, 0]
+    m.table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1e-3, "no_load_speed": 10.0}}})
+    monkeypatch.setattr(excitation, "_motion", None)  # none is tried
+    with pytest.raises(UserError, match="rig is not held at rest.*torque of joint reaches"):
+        excitation.plan(m)
+
+
 def test_help(capsys):
     assert excite.main(["--help"]) == 0
     text = capsys.readouterr().out

@@ -148,6 +148,16 @@ def test_gains_and_torques_of_actuators_are_seen_at_the_joint(tmp_path):
     assert result.hand["joints"][0]["effort"] == 0.6
 
 
+def test_a_guessed_torque_carries_the_links(tmp_path):
+    """Where no file says a motor's torque: what presses with a fingertip, and twice the weight of what it moves."""
+    plain = jaws().replace('actuatorfrcrange="-0.8 0.8"', "")
+    heavy = plain.replace('pos="0 0 0.02" mass="0.05"', 'pos="0.3 0 0.02" mass="0.5"')
+    efforts = [imported(tmp_path / str(k), x)[0].efforts[:2] for k, x in enumerate((plain, heavy))]
+    assert efforts[0][0] == pytest.approx(5.0 * 0.078, rel=0.02)
+    weight = 9.81 * (0.5 * np.hypot(0.3, 0.02) + 0.04 * 0.06)
+    assert efforts[1][0] == pytest.approx(2 * weight, rel=0.02) and efforts[1][1] == efforts[0][1]
+
+
 def test_velocity_beside_position_motors_and_other_laws(tmp_path):
     two = '<position joint="{joint}" kp="5"/><velocity joint="{joint}" kv="0.2"/>'
     imported(tmp_path, jaws(actuators=two))

@@ -14,6 +14,7 @@ from dexsim.import_hand.source import Source
 from dexsim.import_hand.tree import Tree
 
 PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
+HOLD = 2.0  # times the weight of what it moves, in its worst pose: such a motor has at least that
 SPEED = 6.0  # rad/s, of a small geared motor, where no file says it
 MESH = 12.0  # times the size of the hand, or a twelve-hundredth of it: no mesh of a hand is so large, or so small
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}  # m
@@ -69,7 +70,8 @@ def check(
             if j in tree.passive:
                 continue
             slides = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
-            guess = (PRESS, SPEED * x.reach) if slides else (PRESS * x.reach, SPEED)
+            press, fast = (PRESS, SPEED * x.reach) if slides else (PRESS * x.reach, SPEED)
+            guess = max(press, HOLD * _weight(m, j)), fast
             out.effort[name] = _stated(source.drives.effort, name, effort, out.guessed_effort, guess[0])
             out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, guess[1])
             for what, value, (low, high), unit in (
@@ -98,6 +100,18 @@ def check(
     out.warnings += _inertias(m, tree)
     out.massless = _massless(m, tree)
     return out
+
+
+def _weight(m: mujoco.MjModel, j: int) -> float:
+    """Return the torque [N m] (a slide's force, N) of the weight of all that a joint moves, at the worst attitude of
+    the hand, drawn as the file has it."""
+    d = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, d)
+    moved = [b for b in range(m.nbody) if _under(m, b, int(m.jnt_bodyid[j]))]
+    arms = np.linalg.norm(np.cross(d.xaxis[j], d.xipos[moved] - d.xanchor[j]), axis=1)
+    if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
+        arms = np.ones(len(moved))
+    return float(9.81 * arms @ m.body_mass[moved])
 
 
 def mended(source: Source, tree: Tree, inertia: str | None) -> list[str]:

@@ -23,6 +23,7 @@ SHRINK, TRIES = 0.8, 14
 SMALLEST = 0.05  # of the free range: a motion that must be smaller than this to be safe is left out
 RESERVE = 0.9  # of the limits, for a motion alone: within the sequence it starts from a little elsewhere
 REST = 0.3  # s at home between two motions
+SETTLES = 1.0  # s, in which a drive that cannot carry its links lets them sink
 PASSED = 1e-3  # rad (m) beyond a limit: where a weak drive lets a joint rest on one, it passes by a tenth of that
 CHECK_STEP, FRAME = 0.004, 0.008  # s: physics step and spacing of contact checks of the simulation
 
@@ -109,6 +110,13 @@ def plan(
     rng, dt = np.random.default_rng(seed), 1.0 / rate
     low, high, home = _range(m, limits)
     check = safety.ContactCheck(m, home, limits.clearance)
+    rest = np.tile(home, (round(SETTLES / dt), 1))
+    held = safety.peaks(m, _simulate(m, np.arange(len(rest)) * dt, rest, home), check)
+    if faults := _faults(m, held, limits):
+        raise UserError(
+            f"{m.robot} is not held at rest, where each motion begins: {faults}; correct torque_limit and kp of its"
+            " servo.yaml, or its links' masses"
+        )
     free = {j: _free(check, home, m.joints.index(j), low, high) for j in moving}
     jobs: list[tuple[str, tuple[str, ...]]] = []
     for group in groups(m, moving):

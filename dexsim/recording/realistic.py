@@ -21,14 +21,14 @@ mrad, which is 0.062 N.m with the table's kp of 4 N.m/rad. A stand-in until cali
 class Hardware:
     """The readings. rates [Hz]: range from which a recording's rate is drawn; jitter: standard deviation of a period
     over the period; late: share of readings delayed by `late_s` on average; drop: share that is lost; position_lsb
-    [rad]; current_lsb [A]; taxel_lsb [N]; axis_sign: the vendor's taxel axes over ours."""
+    [rad, or rad and m by joint]; current_lsb [A]; taxel_lsb [N]; axis_sign: the vendor's taxel axes over ours."""
 
     rates: tuple[float, float] = (83.0, 104.0)
     jitter: float = 0.01
     late: float = 0.005
     late_s: float = 0.002
     drop: float = 0.005
-    position_lsb: float = 2 * np.pi / 4096
+    position_lsb: float | np.ndarray = 2 * np.pi / 4096
     current_lsb: float = 1e-3
     current_sign: int = -1
     taxel_lsb: float = 0.1

@@ -41,6 +41,7 @@ MOONEY_RIVLIN = 2
 LAWS = {"linear": LINEAR, "hertz": HERTZ, "mooney_rivlin": MOONEY_RIVLIN}
 MAX_STRAIN = 0.8
 """Compression at which the rubber model saturates (stress grows without bound as it goes to 1)."""
+FAR = wp.constant(1.0e9)  # m
 
 
 @wp.struct
@@ -203,15 +204,60 @@ def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3
 
 
 @wp.func
-def nearest_link(here: Surroundings, tips: Shapes, w: int, body: int, point: wp.vec3):
-    """Return the signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links."""
-    out = float(1.0e9)
-    for g in range(here.link_body.shape[0]):
+def from_link(here: Surroundings, tips: Shapes, w: int, body: int, point: wp.vec3, g: int):
+    """Return the signed distance [m] of a point of a body, in the world, to link g; far where that is the body."""
+    out = float(FAR)
+    if g < here.link_body.shape[0]:
         other = here.link_body[g]
         if other != body:
-            q = wp.transpose(here.xmat[w, other]) * (point - here.xpos[w, other])
-            out = wp.min(out, sd_grid(tips, g, 1.0, q))
+            out = sd_grid(tips, g, 1.0, wp.transpose(here.xmat[w, other]) * (point - here.xpos[w, other]))
     return out
+
+
+@wp.func
+def links_near(here: Surroundings, tips: Shapes, w: int, body: int, ball: wp.vec4, lane: int):
+    """Return bits of the links (of the first 64) that may be the nearest to a point of a ball, in the world, and a
+    distance [m] that no point of it is below: along a way, distances change by no more than its length."""
+    low = int(0)
+    high = int(0)
+    least = float(FAR)
+    for g in range(here.link_body.shape[0]):
+        least = wp.min(least, from_link(here, tips, w, body, xyz(ball), g))
+    for g in range(wp.min(here.link_body.shape[0], 64)):
+        if from_link(here, tips, w, body, xyz(ball), g) <= least + 2.0 * ball[3]:
+            low = low | wp.where(g < 32, 1 << (g & 31), 0)
+            high = high | wp.where(g < 32, 0, 1 << (g & 31))
+    return wp.vec2i(low, high), least - ball[3]
+
+
+@wp.func
+def links_near_lanes(here: Surroundings, tips: Shapes, w: int, body: int, ball: wp.vec4, lane: int):
+    """Return the same, a link a lane."""
+    a = from_link(here, tips, w, body, xyz(ball), lane)
+    b = from_link(here, tips, w, body, xyz(ball), lane + 32)
+    least = lanes_min(wp.min(a, b))
+    far = least + 2.0 * ball[3]
+    return wp.vec2i(lane_ballot(a <= far), lane_ballot(b <= far)), least - ball[3]
+
+
+@wp.func
+def nearest_link(here: Surroundings, tips: Shapes, w: int, body: int, near: wp.vec2i, point: wp.vec3):
+    """Return the signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links
+    `near`."""
+    out = float(FAR)
+    for g in range(here.link_body.shape[0]):
+        bits = wp.where(g < 32, near[0], near[1])
+        if g >= 64 or ((bits >> (g & 31)) & 1) != 0:
+            out = wp.min(out, from_link(here, tips, w, body, point, g))
+    return out
+
+
+@wp.func
+def ball_of(here: Surroundings, pads: Pads, w: int, f: int):
+    """Return the ball of pad f's taxels in the world: centre, and radius with a millimetre for coarse grids [m]."""
+    body = pads.body[f]
+    c = here.xmat[w, body] * xyz(pads.bound[f]) + here.xpos[w, body]
+    return wp.vec4(c[0], c[1], c[2], pads.bound[f][3] + 1.0e-3)
 
 
 @wp.func
@@ -234,24 +280,30 @@ def beside_object(
     return wp.vec2(nearest, weight)
 
 
-@wp.func
-def beside_links(
-    here: Surroundings, pads: Pads, tips: Shapes, w: int, f: int, first: int, step: int, level: float
-):
-    """Return the same for the rest of the hand: of the other pads on pad f's body."""
-    nearest = float(1.0e9)
-    weight = float(0.0)
-    body = pads.body[f]
-    for g in range(pads.body.shape[0]):
-        if g != f and pads.body[g] == body:
-            t = int(first)
-            while t < pads.count[g]:
-                point = here.xmat[w, body] * xyz(pads.taxel[g, t]) + here.xpos[w, body]
-                d = nearest_link(here, tips, w, body, point)
-                nearest = wp.min(nearest, d)
-                weight += spread_weight(d, pads.taxel[g, t][3], level)
-                t += step
-    return wp.vec2(nearest, weight)
+@cache
+def _beside_links(lanes: bool) -> Callable:
+    look = links_near_lanes if lanes else links_near
+
+    @wp.func
+    def beside_links(here: Surroundings, pads: Pads, tips: Shapes, w: int, f: int, lane: int, level: float):
+        """Return the same for the rest of the hand, of the other pads on pad f's body. Pads that are no nearer than
+        `level` are passed over."""
+        nearest = float(FAR)
+        weight = float(0.0)
+        body = pads.body[f]
+        for g in range(pads.body.shape[0]):
+            if g != f and pads.body[g] == body:
+                near, least = look(here, tips, w, body, ball_of(here, pads, w, g), lane)
+                t = int(lane)
+                while least < level and t < pads.count[g]:
+                    point = here.xmat[w, body] * xyz(pads.taxel[g, t]) + here.xpos[w, body]
+                    d = nearest_link(here, tips, w, body, near, point)
+                    nearest = wp.min(nearest, d)
+                    weight += spread_weight(d, pads.taxel[g, t][3], level)
+                    t += wp.static(LANES if lanes else 1)
+        return wp.vec2(nearest, weight)
+
+    return beside_links
 
 
 @cache
@@ -298,6 +350,8 @@ def _serial(
     solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
     links: int, selves: bool, shared: bool, rounds: int,
 ) -> Callable:  # fmt: skip
+    beside_links = _beside_links(False)
+
     def serial(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: Felt):
         w, f = wp.tid()
         body = pads.body[f]
@@ -358,20 +412,21 @@ def _serial(
             other = here.pair_normal[w, here.self_column[f]]
             if other > 0.0:
                 nearest = float(1.0e9)
+                near, _ = links_near(here, tips, w, body, ball_of(here, pads, w, f), 0)
                 for t in range(n):
                     point = here.xmat[w, body] * xyz(pads.taxel[f, t]) + here.xpos[w, body]
-                    d = nearest_link(here, tips, w, body, point)
+                    d = nearest_link(here, tips, w, body, near, point)
                     out.distance[w, f, t] = d
                     nearest = wp.min(nearest, d)
                 if wp.static(shared):
-                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, 0, 1, 0.0)[0])
+                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, 0, nearest)[0])
                 level = spread_level(nearest, law.reach)
                 own = float(0.0)
                 for t in range(n):
                     own += spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
                 whole = own
                 if wp.static(shared):
-                    whole += beside_links(here, pads, tips, w, f, 0, 1, level)[1]
+                    whole += beside_links(here, pads, tips, w, f, 0, level)[1]
                 c = other / whole
                 if wp.static(raw and feel_others):
                     for t in range(n):
@@ -408,6 +463,7 @@ def _lanes(
 ) -> Callable:  # fmt: skip
     Reals = wp.types.vector(length=rounds, dtype=float)
     width = rounds * LANES
+    beside_links = _beside_links(True)
 
     @wp.func
     def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, px: Reals, py: Reals, pz: Reals):
@@ -519,13 +575,16 @@ def _lanes(
             other = here.pair_normal[w, here.self_column[f]]
             if other > 0.0:
                 d = Reals()
+                near, _ = links_near_lanes(here, tips, w, body, ball_of(here, pads, w, f), lane)
                 for r in range(wp.static(rounds)):
-                    d[r] = nearest_link(here, tips, w, body, rot * wp.vec3(px[r], py[r], pz[r]) + pos)
+                    d[r] = FAR
+                    if wp.static(32) * r < pads.count[f]:
+                        d[r] = nearest_link(here, tips, w, body, near, rot * wp.vec3(px[r], py[r], pz[r]) + pos)
                 nearest = d[0]
                 for r in range(1, wp.static(rounds)):
                     nearest = wp.min(nearest, d[r])
                 if wp.static(shared):
-                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, lane, 32, 0.0)[0])
+                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, lane, nearest)[0])
                 level = spread_level(lanes_min(nearest), law.reach)
                 own = float(0.0)
                 for r in range(wp.static(rounds)):
@@ -534,7 +593,7 @@ def _lanes(
                 own = lanes_sum(own)
                 whole = own
                 if wp.static(shared):
-                    whole += lanes_sum(beside_links(here, pads, tips, w, f, lane, 32, level)[1])
+                    whole += lanes_sum(beside_links(here, pads, tips, w, f, lane, level)[1])
                 if wp.static(raw and feel_others):
                     mine += other / whole * d
                 if wp.static(shared):
