@@ -302,20 +302,6 @@ MUTATIONS = (
         "tests/test_gap_rules.py::test_what_looked_like_an_effect_is_let_go_for_it",
     ),
     Mutation(
-        "a search's hypotheses wait behind those of joints that are soon done",
-        "dexsim/gap/compute.py",
-        'rank = getattr(_MINE, "rank", 0.0)  # of the search that asks',
-        "rank = 0.0",
-        "tests/test_gap_at_once.py::test_a_joints_hypotheses_have_their_joints_rank",
-    ),
-    Mutation(
-        "a series is held where its next time is known",
-        "dexsim/gap/plant/lines.py",
-        "past == wp.float64(0.0)",
-        "past < wp.float64(1e-2)",
-        "tests/test_gap_side_by_side.py::test_lines_between_rows_are_those_of_interp",
-    ),
-    Mutation(
         "of a dead zone one kind is tried",
         "dexsim/gap/effects/drive.py",
         "    kinds = 3\n",

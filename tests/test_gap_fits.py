@@ -86,7 +86,7 @@ def test_an_interval_holds_what_a_size_trades_with_a_belief():
         Param("inertia", ("inertia_scale",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025),
     ]
     J = np.stack([1e5 * a, 500 * c, 1e5 * 2e-3 * a], 1)
-    f = Fitted(params, np.array([4e-4, 0.3, 1.0]), np.zeros(3000), J, np.zeros(3000, int), 1.0, np.zeros(1))
+    f = Fitted(params, np.array([4e-4, 0.3, 1.0]), np.zeros(3000), J, np.zeros(3000, int), 1.0)
     half = traded(f)
     assert half[0] == pytest.approx(1.645 * 0.025 * 2e-3, rel=0.05) and half[1] < 1e-4 and half[2] == 0.0
     tight = np.array([[3.9e-4, 4.1e-4], [0.25, 0.35], [0.99, 1.01]])

@@ -160,7 +160,6 @@ def test_what_looked_like_an_effect_is_let_go_for_it(alone, found):
     losses = {(): 100.0, ("lag",): 50.0, ("deadband", "lag"): 2.0, ("deadband",): alone}
     search = Selecting(lambda ids: (losses[tuple(sorted(ids))],) * 2, ("lag", 0.0), ("deadband", 0.0))
     search._shortlist = lambda scan, *_: scan[:1]  # the dead zone is not thought of at first
-    search._values = lambda trial: np.zeros(sum(len(m.variant.params) for m in trial.members))
     search._nothing_of = lambda m, trial: m.id == "lag" and trial.ids == ("lag", "deadband")
     search._shrunk = lambda trial: any(search._nothing_of(m, trial) for m in trial.members)
     assert search.run().best.ids == found
@@ -355,7 +354,7 @@ def test_a_size_that_fits_without_a_condition_do_not_repeat_is_a_hint():
 
 def test_intervals_grow_with_what_is_left():
     p = param("time_constant", "lag", "set", -1e3, 1e3)
-    fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0, np.zeros(1))
+    fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0)
     factor = lambda left: float(stretched(np.array([[-1.0, 1.0]]), fit, left)[0, 1])  # noqa: E731
     assert (
         factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)

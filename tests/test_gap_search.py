@@ -180,7 +180,7 @@ def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
 
 def test_intervals_follow_how_well_what_was_held_out_is_followed():
     params = [Param("a", ("kp",), "set", 0.0, 3.0, 0.0), Param("b", ("kd",), "set", 0.0, 100.0, 0.0)]
-    f = Fitted(params, np.array([2.0, 50.0]), np.zeros(4), np.zeros((4, 2)), np.zeros(4, int), 1.0, np.zeros(1))
+    f = Fitted(params, np.array([2.0, 50.0]), np.zeros(4), np.zeros((4, 2)), np.zeros(4, int), 1.0)
     bounds = np.array([[1.0, 2.5], [40.0, 60.0]])
     width = lambda left: np.diff(stretched(bounds, f, left))[:, 0]  # noqa: E731
     assert np.allclose(width(1.0), JUDGE.stretch_least * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)

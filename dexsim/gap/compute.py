@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import heapq
-import itertools
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
@@ -89,99 +87,6 @@ def workers(device: str, jobs: int) -> int:
     return max(1, min(jobs, MOST_GPU if device != "cpu" else min(MOST_CPU, cores())))
 
 
-# searches that compute in Python at a time. One more would hide what numpy does without the interpreter, and each more
-# makes the others wait for it: a search hands the interpreter over thousands of times a second
-TURNS = 2
-_MINE = threading.local()
-
-
-class Turns:
-    """The interpreter, for `count` searches at a time. Of those that wait it goes to the one of the lowest rank, and of
-    these to the one that came first: the search that takes longest must not wait for those that are soon done."""
-
-    def __init__(self, count: int):
-        self._free, self._lock, self._came = count, threading.Lock(), itertools.count()
-        self._waiting: list[tuple[float, int, threading.Lock]] = []
-
-    def take(self, rank: float) -> None:
-        """Waits for a turn."""
-        with self._lock:
-            if self._free:
-                self._free -= 1
-                return
-            mine = threading.Lock()
-            mine.acquire()
-            heapq.heappush(self._waiting, (rank, next(self._came), mine))
-        mine.acquire()  # until `give` hands it over
-
-    def give(self) -> None:
-        """Hands a turn on."""
-        with self._lock:
-            if self._waiting:
-                heapq.heappop(self._waiting)[2].release()
-            else:
-                self._free += 1
-
-
-_TURNS = Turns(TURNS)
-
-
-@contextmanager
-def turn(rank: float) -> Iterator[None]:
-    """Yield a search's turn at the interpreter: what runs inside waits until it is one of the few."""
-    _TURNS.take(rank)
-    _MINE.held, _MINE.rank = True, rank
-    try:
-        yield
-    finally:
-        _MINE.held = False
-        _TURNS.give()
-
-
-@contextmanager
-def away() -> Iterator[None]:
-    """Yield what a search waits for without the interpreter (a launch): another has its turn meanwhile."""
-    if not getattr(_MINE, "held", False):
-        yield
-        return
-    _MINE.held = False
-    _TURNS.give()
-    try:
-        yield
-    finally:
-        _TURNS.take(_MINE.rank)
-        _MINE.held = True
-
-
-def side_by_side(work: Sequence[Callable[[], T]], device: str) -> Iterator[T]:
-    """Yield what each of `work` returns, in order. On a GPU all are begun at once: a launch of few guesses takes as
-    long as one of many there, so they wait together. On a CPU, whose cores share each launch already, one after the
-    other, each when it is asked for."""
-    if device == "cpu" or len(work) < 2:
-        yield from (one() for one in work)
-        return
-
-    rank = getattr(_MINE, "rank", 0.0)  # of the search that asks
-
-    def begun(one: Callable[[], T]) -> T:
-        with turn(rank):
-            return one()
-
-    waiting = [_hands().submit(begun, one) for one in work]
-    for done in waiting:
-        with away():
-            wait([done])
-        yield done.result()
-
-
-@cache
-def _hands() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_GPU, thread_name_prefix="hypothesis")
-
-
-system.after_fork(_hands.cache_clear)
-
-
 def each(count: int, work: Callable[[int], T]) -> list[T]:
     """work(k) for k below `count`, in order: side by side on the cores, for what numpy does without the interpreter."""
     at_once = min(MOST_CPU, cores(), count)
@@ -231,10 +136,9 @@ class Pace:
 
 
 def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
-             progress: Callable[..., None] | None = None, left: Sequence[float] = ()) -> list[T]:
+             progress: Callable[..., None] | None = None) -> list[T]:
     """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is
-    worked on, s that are left or None). left: what is to be explained of each, where that is known: the more, the
-    sooner it has its turns."""
+    worked on, s that are left or None)."""
     parts, lock, at_once = [0.0] * len(names), threading.Lock(), workers(device, len(names))
     pace = Pace(len(names), at_once)
 
@@ -246,9 +150,8 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None
                 if progress and part < 1.0:
                     progress(sum(parts), len(names), names[k], pace.left())
 
-        with turn(-left[k] if len(left) else 0.0):
-            tell(0.0)
-            out = work(k, tell)
+        tell(0.0)
+        out = work(k, tell)
         tell(1.0)
         return out
 

@@ -132,8 +132,8 @@ __all__ = ["Diagnosis", "Settings", "diagnose", "save"]
 
 Answers = list[tuple[JointSearch, Outcome | None]]
 # shares of a limit of time: that the model along the motion may take; that must be left for stand-ins, and for plans of
-# a replay or a recording; and of what is left then the replay's
-MODELLING, STANDING_IN, PLANNING, REPLAYING = 0.2, 0.1, 0.07, 0.5
+# a replay or a recording
+MODELLING, STANDING_IN, PLANNING = 0.2, 0.1, 0.07
 PLAN = 60.0  # s that must be left for a plan of the next recording: one call, of 37 s on a busy machine
 MUCH = 20.0  # s of all joints' recordings for each second of a limit: the model along less is not worth a look
 
@@ -294,16 +294,14 @@ class Drives(Steps):
         if linked and 2 * self.modelling > w.limit.left():
             w.limit.leave_out("the joints' motion is not refined by what the others were fitted to")
             linked = False
-        left: list[float] = []  # by what each leaves as believed
         if linked:
             first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
             begun = [t for t in first if t is not None]
             if len(begun) == len(first):
-                left = [t.fit.loss for t in begun]
                 self._coupled_by(begun)
             w.clock.lap("model along the motion")
         self._test_stages()
-        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress, left)
+        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
         self._search_longer(answers)
         if linked:
             self._search_again(answers)

@@ -165,8 +165,8 @@ class JointAnswer:
     def _without(self, mm: Member) -> tuple[Trial, np.ndarray, np.ndarray]:
         """Return (the best hypothesis without an effect, position and effort (rows,) of its free run)."""
         if mm.id not in self._trials:
-            rest = tuple(x for x in self.best.members if x is not mm)
-            trial = without(self.search, self.best, mm) if rest else self.none
+            rest, kept = self.best.but(self.best.members.index(mm))
+            trial = self.search.fit(rest, kept, self.best, quick=True) if rest else self.none
             fixed = [f for x in rest for f in x.variant.fixed]
             run = free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, fixed, True)
             self._trials[mm.id] = trial, *run
@@ -447,15 +447,6 @@ def nuisances(joint: str, trial: Trial) -> dict[str, float]:
     """Return the refitted beliefs of one joint by the keys of `diagnosis.json`."""
     return {f"{p.key}_factor@{joint}" if p.mode == "factor" else f"{p.key}@{joint}": round(float(x), 6)
             for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
-
-
-def without(search: JointSearch, best: Trial, member: Member) -> Trial:
-    """Return the best hypothesis without one member, refitted."""
-    rest = tuple(x for x in best.members if x is not member)
-    sizes = np.cumsum([len(x.variant.params) for x in best.members])[:-1]
-    values = np.split(search._values(best), sizes)
-    kept = [v for x, v in zip(best.members, values, strict=True) if x is not member]
-    return search.fit(rest, np.concatenate(kept) if kept else np.zeros(0), best, quick=True)
 
 
 def _curve(

@@ -93,7 +93,6 @@ class Known:
 
     def __init__(self, room: int = KNOWN):
         self._room, self._rows = room, OrderedDict[bytes, tuple[np.ndarray, np.ndarray]]()
-        self._lock = threading.Lock()  # hypotheses are fitted side by side on the same windows
 
     def clear(self) -> None:
         """Forgets all."""
@@ -104,8 +103,7 @@ class Known:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and torques [H, n] of the keys. simulate(which [h]) makes those [h, n] of the keys with
         these numbers; it is asked for each that is not known, once."""
-        with self._lock:
-            rows = {key: self._rows[key] for key in keys if key in self._rows}
+        rows = {key: self._rows[key] for key in keys if key in self._rows}
         new = {key: k for k, key in reversed(list(enumerate(keys))) if key not in rows}
         made = simulate(np.array(sorted(new.values()))) if new else None
         if made is not None and len(new) == len(keys):
@@ -120,12 +118,11 @@ class Known:
         copies: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         for some in (kept[a : a + CHUNK] for a in range(0, len(kept), CHUNK)):
             copies |= {keys[k]: row for k, row in zip(some, zip(q[some], torque[some], strict=True), strict=True)}
-        with self._lock:
-            for k in last:
-                self._rows.setdefault(keys[k], copies.get(keys[k]) or rows[keys[k]])
-                self._rows.move_to_end(keys[k])
-            while len(self._rows) > most:
-                self._rows.popitem(last=False)
+        for k in last:
+            self._rows.setdefault(keys[k], copies.get(keys[k]) or rows[keys[k]])
+            self._rows.move_to_end(keys[k])
+        while len(self._rows) > most:
+            self._rows.popitem(last=False)
         return q, torque
 
 
@@ -419,8 +416,7 @@ class JointPlant:
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
-        with compute.away():
-            wp.synchronize_stream(mine.stream)
+        wp.synchronize_stream(mine.stream)
         numbers = host.numpy()
         for keep, at, size in parts:
             q[:, keep] = numbers[at : at + size].reshape(H, -1)
@@ -489,8 +485,7 @@ class JointPlant:
                 device="cpu",
             )
 
-        with compute.away():
-            compute.run(launch, compute.parts(steps, H))
+        compute.run(launch, compute.parts(steps, H))
 
     def base(self) -> np.ndarray:
         """Return [R, C] nominal parameters by run."""

@@ -138,21 +138,7 @@ class Recorded:
     out_torque: wp.array2d(dtype=f64)  # [H, n]
 
 
-FIELDS = (
-    "params",
-    "inits",
-    "setpoints",
-    "consts",
-    "series",
-    "cmd_t",
-    "cmd",
-    "window",
-    "window_t",
-    "sample_step",
-    "sample_part",
-    "out_q",
-    "out_torque",
-)
+FIELDS = tuple(Recorded.vars)
 
 
 @wp.struct

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -70,7 +70,7 @@ class Residuals:
 @dataclass
 class Fitted:
     """A fit: x [P]; residual [m], jacobian [m, P] in sigmas at x with the initial states eliminated; of each residual
-    the window [m]; loss, the mean (Huber) square; by window loss [W]."""
+    the window [m]; loss, the mean (Huber) square."""
 
     params: list[Param]
     x: np.ndarray
@@ -78,13 +78,7 @@ class Fitted:
     jacobian: np.ndarray
     window: np.ndarray
     loss: float
-    by_window: np.ndarray
-    weight: np.ndarray | None = None
     iterations: int = 0
-    extra: dict = field(default_factory=dict)
-
-    def value(self, key: str) -> float:
-        return float(self.x[[p.key for p in self.params].index(key)])
 
 
 class Fitter:
@@ -188,7 +182,7 @@ class Fitter:
         most."""
         m, W = len(self.window), self.count
         if rows not in self._sparse:
-            most = max([rows, *self._sparse])  # a list: hypotheses are fitted side by side
+            most = max([rows, *self._sparse])
             if most == rows:
                 order = np.argsort(self.window, kind="stable")
                 at = (order + m * np.arange(rows)[:, None]).ravel().astype(np.int32)
@@ -203,10 +197,6 @@ class Fitter:
     def loss(self, res: np.ndarray) -> np.ndarray:
         """Return [H] mean of Huber's square."""
         return huber_square(res, self.r.huber).mean(-1)
-
-    def window_loss(self, res: np.ndarray) -> np.ndarray:
-        """Return [W] sum of Huber's square by window."""
-        return np.bincount(self.window, huber_square(res, self.r.huber), self.count)
 
     def evaluate(self, params: list[Param], x: np.ndarray) -> np.ndarray:
         """Return [m] residuals at x, initial states taken out."""
@@ -415,7 +405,6 @@ class Fitter:
             jac / span if P else np.zeros((len(res), 0)),
             self.window,
             float(self.loss(res)),
-            self.window_loss(res),
             iterations=it,
         )
 

@@ -51,6 +51,18 @@ class Trial:
     def ids(self) -> tuple[str, ...]:
         return tuple(m.id for m in self.members)
 
+    @property
+    def values(self) -> list[np.ndarray]:
+        """Fitted values of each member's parameters."""
+        ends = np.cumsum([0, *(len(m.variant.params) for m in self.members)])
+        return [self.fit.x[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    def but(self, *gone: int) -> tuple[tuple[Member, ...], np.ndarray]:
+        """Return the members without those of these numbers, and the fitted values of their parameters."""
+        stay = [k for k in range(len(self.members)) if k not in gone]
+        values = self.values
+        return tuple(self.members[k] for k in stay), np.concatenate([np.zeros(0), *(values[k] for k in stay)])
+
 
 @dataclass
 class Outcome:
@@ -478,9 +490,9 @@ class JointHypotheses:
         members, x0, short = self.draft(members, starts, like)
         return self.finish(members, x0, short, like, quick)
 
-    def _values(self, trial: Trial) -> np.ndarray:
-        n = sum(len(m.variant.params) for m in trial.members)
-        return trial.fit.x[:n]
+    def _asked(self, effect: Effect) -> bool:
+        """Return whether an effect is looked for."""
+        return self.allowed is None or effect.id in self.allowed
 
     def _shrunk(self, trial: Trial) -> bool:
         """Return whether an effect was fitted down to the size at which it begins: what it gained is another's."""

@@ -218,7 +218,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     if swings.loud.sum() < SEARCH.shaking:
         return found
     before = swings.of(found.best)
-    asked = [e for e in CATALOGUE if e.rings and (search.allowed is None or e.id in search.allowed)]
+    asked = [e for e in CATALOGUE if e.rings and search._asked(e)]
     tries: dict[str, tuple[float, Trial]] = {}
     for effect in asked:
         if effect.id in found.best.ids:

@@ -41,10 +41,8 @@ class JointLosses(JointHypotheses):
     def _price_factor(self, trial: Trial) -> float:
         """Return factor on the losses of a hypothesis that can imitate simpler ones, or whose size stopped at the end
         of what is physical: the data would have it where it cannot be."""
-        at, begin = complexity_price(trial), 0
-        for m in trial.members:
-            fitted = trial.fit.x[begin : begin + len(m.variant.params)]
-            begin += len(m.variant.params)
+        at = complexity_price(trial)
+        for m, fitted in zip(trial.members, trial.values, strict=True):
             values = {p.key: x for p, x in zip(m.variant.params, fitted, strict=True) if p.key not in SHAPES}
             if at_bound([p for p in m.variant.params if p.key in values], values, self.case):
                 at *= SEARCH.bounded
@@ -233,7 +231,7 @@ class JointScan(JointLosses):
         guesses: list[np.ndarray] = []
         owners: list[tuple[Member, np.ndarray]] = []
         for effect in CATALOGUE:
-            if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
+            if effect.id in taken or not self._asked(effect):
                 continue
             for whole in effect.variants(case.scales):
                 variant = None if whole.refines or whole.approximate else self._narrow(effect, whole)

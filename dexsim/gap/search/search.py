@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 
 from dexsim import intervals
-from dexsim.gap import compute
 from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
@@ -148,7 +146,7 @@ class JointSelection(JointScan):
             rest = tuple(m for m in current.members if m is not member)
             for effect in more:
                 starts = effect.begun_from(columns, self.case)
-                if not starts or (self.allowed is not None and effect.id not in self.allowed) or self.deadline.over():
+                if not starts or not self._asked(effect) or self.deadline.over():
                     continue
                 wider = Member(effect, effect.variants(self.case.scales)[0])
                 if len(columns) == len(member.variant.params) or any(not fits_beside(wider, m) for m in rest):
@@ -178,7 +176,7 @@ class JointSelection(JointScan):
         on short windows: those that follow best, the best first. pool, price: by effect, are filled."""
         drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
         followed: dict[str, float] = {}
-        begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
+        begin = lambda x: np.concatenate([*current.values, x])  # noqa: E731
 
         def drafted(k: int) -> tuple[tuple[Member, ...], np.ndarray, Fitted] | None:
             _, _, member, start = listed[k]
@@ -189,8 +187,7 @@ class JointSelection(JointScan):
                 tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
             return min(tries, key=lambda d: d[2].loss)
 
-        each = compute.side_by_side([partial(drafted, k) for k in range(len(listed))], self.case.plant.device)
-        for (_, p, member, start), draft in zip(listed, each, strict=True):
+        for (_, p, member, start), draft in zip(listed, map(drafted, range(len(listed))), strict=True):
             if draft is None:
                 break
             if member.id not in pool or price.get(member.id, 1.0) > p:
@@ -214,7 +211,7 @@ class JointSelection(JointScan):
         def finished(k: int) -> Trial | None:
             return self.finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
 
-        each = compute.side_by_side([partial(finished, k) for k in range(len(drafts))], self.case.plant.device)
+        each = map(finished, range(len(drafts)))
         trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
         least = trials[0].fit.loss
         # those that may still be the best are looked at closely
@@ -312,7 +309,7 @@ class JointSelection(JointScan):
         starts: list[np.ndarray] = []
         for effect in CATALOGUE:
             moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
-            if not moved or (self.allowed is not None and effect.id not in self.allowed):
+            if not moved or not self._asked(effect):
                 continue
             variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.approximate]
             variant = self._narrow(effect, variants[0]) if variants else None
@@ -343,7 +340,7 @@ class JointSelection(JointScan):
                 if m1.id == m2.id or not fits_beside(m1, m2):
                     continue
                 trial = self.fit(
-                    (*current.members, m1, m2), np.concatenate([self._values(current), s1, s2]), current, quick=True
+                    (*current.members, m1, m2), np.concatenate([*current.values, s1, s2]), current, quick=True
                 )
                 if best is None or trial.fit.loss < best.fit.loss:
                     best = trial
@@ -361,13 +358,11 @@ class JointSelection(JointScan):
         """Return each earlier member replaced by others of the pool, while the rest stays."""
         best = current
         for i, member in enumerate(current.members[:-1]):
-            rest = [m for k, m in enumerate(current.members) if k != i]
-            values = np.split(self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1])
-            kept = [v for k, v in enumerate(values) if k != i]
+            rest, kept = current.but(i)
             for key, (other, start) in list(pool.items()):
                 if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
                     continue
-                trial = self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                trial = self.fit((*rest, other), np.concatenate([kept, start]), current, quick=True)
                 if (
                     trial.fit.loss < best.fit.loss
                     and self._left(trial).sum() < self._left(best).sum()
@@ -382,12 +377,10 @@ class JointSelection(JointScan):
         for trial in sorted(trials, key=lambda t: t.fit.loss):
             if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or self.deadline.over():
                 break
-            kept = [k for k, m in enumerate(trial.members) if not self._nothing_of(m, trial)]
-            if not 0 < len(kept) < len(trial.members) or len(trial.members) - 1 not in kept:
+            nothing = [k for k, m in enumerate(trial.members) if self._nothing_of(m, trial)]
+            if not 0 < len(nothing) < len(trial.members) or len(trial.members) - 1 in nothing:
                 continue
-            sizes = np.cumsum([len(m.variant.params) for m in trial.members])[:-1]
-            values = np.split(self._values(trial), sizes)
-            alone = self.fit(tuple(trial.members[k] for k in kept), np.concatenate([values[k] for k in kept]), trial)
+            alone = self.fit(*trial.but(*nothing), trial)
             lasts = self._left(alone).sum() < (1 - SEARCH.least) * self._left(current).sum()
             if lasts and not self._shrunk(alone):
                 return alone
@@ -399,12 +392,7 @@ class JointSelection(JointScan):
         while changed and len(current.members) > 1:
             changed = False
             for i in range(len(current.members)):
-                rest = tuple(m for k, m in enumerate(current.members) if k != i)
-                values = np.split(
-                    self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1]
-                )
-                kept = np.concatenate([v for k, v in enumerate(values) if k != i])
-                less = self.fit(rest, kept, current, quick=True)
+                less = self.fit(*current.but(i), current, quick=True)
                 if not self._earns(current, less):
                     current, changed = less, True
                     break
@@ -417,8 +405,7 @@ class JointSelection(JointScan):
                 variant = self._narrow(member.effect, whole) if whole.refines else None
                 if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
                     continue
-                sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
-                values = np.split(self._values(current), sizes)
+                values = current.values
                 known = dict(zip([p.key for p in member.variant.params], values[i], strict=True))
                 members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
                 extra = {
@@ -447,26 +434,23 @@ class JointSelection(JointScan):
         if mine < SEARCH.unsettled * noise:
             return current
         best, count = current, range(len(current.members))
-        sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
-        values = np.split(self._values(current), sizes)
         for effect in CATALOGUE:
             laws = [v for v in effect.variants(self.case.scales) if v.approximate]
-            if not laws or (self.allowed is not None and effect.id not in self.allowed):
+            if not laws or not self._asked(effect):
                 continue
             likes = [e.id for e in CATALOGUE if confusable(effect.id, e.id)]
             near = tuple(k for k in count if not confusable(effect.id, current.members[k].id))
             far = tuple(k for k in near if not any(confusable(e, current.members[k].id) for e in likes))
             for rest in dict.fromkeys((near, far)):
-                others = tuple(current.members[k] for k in rest)
+                others, kept = current.but(*(k for k in count if k not in rest))
                 for variant in laws if len(rest) < len(count) else ():
                     if self.deadline.over():
                         return best
                     member = Member(effect, variant)
                     if any(not fits_beside(member, m) for m in others):
                         continue
-                    kept = [values[k] for k in rest]
                     drafts = [
-                        self.draft((*others, member), np.concatenate([*kept, np.array(start)]), current)
+                        self.draft((*others, member), np.concatenate([kept, np.array(start)]), current)
                         for start in variant.starts
                     ]
                     trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
@@ -483,7 +467,7 @@ class JointSelection(JointScan):
             tries = [current]
             for variant in self._laws_of(member):
                 members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
-                tries.append(self.fit(members, self._values(current), current, quick=True))
+                tries.append(self.fit(members, np.concatenate(current.values), current, quick=True))
             current = min(tries, key=self._score)
             self.by_law[member.id] = tries
         return current
@@ -527,15 +511,10 @@ class JointSelection(JointScan):
         out = {}
         self.costs: dict[str, list[float]] = {}
         mine = self._left(current)
-        sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
-        values = np.split(self._values(current), sizes)
         short = self._short_loss(current)
         for i, member in enumerate(current.members):
-            rest = tuple(m for k, m in enumerate(current.members) if k != i)
-            kept = [v for k, v in enumerate(values) if k != i]
-            without = (
-                self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
-            )
+            rest, kept = current.but(i)
+            without = self.fit(rest, kept, current, quick=True) if rest else None
             lost = self._left(without) if without else self.none_loss
             self.costs[member.id] = self._by_condition(lost, mine)
             others: list[Trial] = []
@@ -550,7 +529,7 @@ class JointSelection(JointScan):
                     continue
                 trial = known
                 if trial is None:
-                    draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
+                    draft = self.draft((*rest, other), np.concatenate([kept, start]), current)
                     # one that cannot follow even short stretches is no rival
                     if draft[2].loss > SEARCH.rival * max(short, 1.0):
                         continue
