@@ -18,7 +18,7 @@ from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
+from dexsim.gap.search.fit import Box, Fitted, Fitter
 from dexsim.gap.search.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
 
@@ -173,7 +173,7 @@ def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
     astray = fitter.fit(params, x0=np.array([0.7, 1.6, 1.0]), iterations=0)
     home = fitter.toward_prior(params, astray)
     starts = np.array([p.start for p in params])
-    score = lambda f: f.loss + prior_weight(params) @ (f.x - starts) ** 2 / len(f.residual)  # noqa: E731
+    score = lambda f: f.loss + Box(params).prior @ (f.x - starts) ** 2 / len(f.residual)  # noqa: E731
     assert abs(home.x[1] - 1.0) < 0.02 and abs(home.x[0] - 1.3) < 0.03 and score(home) < 0.1 * score(astray)
     assert fitter.toward_prior(params, home) is home  # there is nothing to gain
 

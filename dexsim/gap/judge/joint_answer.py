@@ -22,7 +22,7 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
-from dexsim.gap.search.fit import Fitted, Fitter, intervals, prior_weight
+from dexsim.gap.search.fit import Box, Fitted, Fitter, intervals
 from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
@@ -165,8 +165,9 @@ class JointAnswer:
     def _without(self, mm: Member) -> tuple[Trial, np.ndarray, np.ndarray]:
         """Return (the best hypothesis without an effect, position and effort (rows,) of its free run)."""
         if mm.id not in self._trials:
-            rest, kept = self.best.but(self.best.members.index(mm))
-            trial = self.search.fit(rest, kept, self.best, quick=True) if rest else self.none
+            rest = tuple(x for x in self.best.members if x is not mm)
+            less = lambda: self.best.but(self.best.members.index(mm))  # noqa: E731
+            trial = self.search.fit(*less(), self.best, quick=True) if rest else self.none
             fixed = [f for x in rest for f in x.variant.fixed]
             run = free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, fixed, True)
             self._trials[mm.id] = trial, *run
@@ -413,7 +414,7 @@ def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
     else. The law is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:
         return bounds
-    low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
+    low, high = Box(fit.params).low[:, None], Box(fit.params).high[:, None]
     x, least = fit.x[:, None], traded(fit)[:, None] * np.array([-1.0, 1.0])
     by = np.clip(JUDGE.stretch * left**2, JUDGE.stretch_least, JUDGE.stretch_most) * (bounds - x)
     return np.clip(x + np.where(np.abs(by) < np.abs(least), least, by), low, high)
@@ -423,11 +424,10 @@ def traded(fit: Fitted) -> np.ndarray:
     """Return [P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the
     link's), however well all is followed: the variance that the beliefs' own, as far as the residuals leave it, adds to
     that of the sizes alone. 0 for beliefs."""
-    low, high = (np.array([getattr(p, k) for p in fit.params]) for k in ("low", "high"))
-    span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
+    span, mine = Box(fit.params).span, np.array([not p.nuisance for p in fit.params], bool)
     J = fit.jacobian * span
     A = J.T @ J
-    believed = prior_weight(fit.params) * span**2
+    believed = Box(fit.params).prior * span**2
     A[np.diag_indices(len(A))] += np.where(
         mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * BELIEF.prior)
     )

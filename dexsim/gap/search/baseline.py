@@ -27,7 +27,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
-from dexsim.gap.search.fit import Fitter, Residuals
+from dexsim.gap.search.fit import Box, Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
@@ -164,7 +164,8 @@ def fitted(
     seconds = [np.ptp(t[whole.sample_window == w]) for w in range(len(whole.window))]
     some = np.cumsum(seconds) - seconds[0] <= WHOLE
     runs = Fitter(case.plant, subset(whole, some), Residuals(case.sigma, huber=max(FAR / case.sigma, 3.0)), passed)
-    start = np.clip([p.start for p in params], [p.low for p in params], [p.high for p in params])
+    box = Box(params)
+    start = np.clip(box.centre, box.low, box.high)
     tried = np.array([start, *fits])
     best = tried[int(np.argmin(runs.loss(runs.residuals(params, tried))))]
     return params, best if passed() else runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3).x
@@ -207,8 +208,8 @@ def judged(
 
 def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list[np.ndarray]:
     """Return [P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
-    low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
-    start = np.clip([p.start for p in params], low, high)
+    box = Box(params)
+    low, high, start = box.low, box.high, np.clip(box.centre, box.low, box.high)
     # a Latin square
     cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))
     share = cells / GUESSES

@@ -23,6 +23,7 @@ STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
+ROUNDS, GUESSES = 2, 20  # of what is tried about a fit, and guesses of each
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
 MOST = 1e6  # sigmas of a residual
@@ -34,14 +35,27 @@ def centre_of(params: list[Param]) -> np.ndarray:
     return np.array([{"add": 0.0, "factor": 1.0}.get(p.mode, p.start) for p in params], float)
 
 
-def prior_weight(params: list[Param]) -> np.ndarray:
-    """Return [P] weight of each belief on the sum of squares, per squared unit of its parameter."""
-    return np.array([BELIEF.prior / p.sd**2 if p.sd > 0 else 0.0 for p in params])
+class Box:
+    """Where parameters may be: low, high, span and centre [P], the value that each starts from; prior [P]: weight of
+    each belief on the sum of squares, per squared unit of its parameter."""
+
+    def __init__(self, params: Sequence[Param]):
+        self.low, self.high, self.centre = (
+            np.array([getattr(p, k) for p in params], float) for k in ("low", "high", "start")
+        )
+        self.span = self.high - self.low
+        self.prior = np.array([BELIEF.prior / p.sd**2 if p.sd > 0 else 0.0 for p in params])
 
 
 def disbelief(params: list[Param], x: np.ndarray) -> float:
     """Return how far x [P] is from what is believed, on the scale of a sum of squared residuals."""
-    return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
+    box = Box(params)
+    return float(box.prior @ (x - box.centre) ** 2) if params else 0.0
+
+
+def robust(res: np.ndarray, k: float) -> np.ndarray:
+    """Return weights [m] of residuals by which least squares count them linearly from `k` on; 1 where k is 0."""
+    return np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12)) if k > 0 else np.ones(len(res))
 
 
 def huber_square(res: np.ndarray, k: float) -> np.ndarray:
@@ -205,43 +219,36 @@ class Fitter:
         res, s = self.init_directions(params, x)
         return self.eliminated(res[None], s)[0]
 
-    def perturbed_restarts(
-        self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20
-    ) -> Fitted:
+    def perturbed_restarts(self, params: list[Param], f: Fitted, rng: np.random.Generator) -> Fitted:
         """Return the fit again from the best of random guesses about it, where one is better: stick, play and limits
         make the loss rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
         P = len(params)
         if P == 0:
             return f
-        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
-        centre, believed = np.array([p.start for p in params], float), prior_weight(params)
-        for _ in range(rounds):
+        box = Box(params)
+        for _ in range(ROUNDS):
             if self.passed():
                 break
-            span = high - low
-            J = f.jacobian * span
-            k = self.r.huber
-            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
-            A = (J * w[:, None]).T @ J + np.diag(believed * span**2)
+            J = f.jacobian * box.span
+            A = (J * robust(f.residual, self.r.huber)[:, None]).T @ J + np.diag(box.prior * box.span**2)
             # what a rise of the loss by 5 % allows
             A = A / (0.05 * max(f.loss, 1e-12) * len(f.residual)) + 4.0 * np.eye(P)
             values, vectors = np.linalg.eigh(A)
-            size = np.where(np.arange(count) % 2, 1.0, 0.3)[:, None]
-            z = (rng.standard_normal((count, P)) / np.sqrt(P) * size) @ (vectors / np.sqrt(np.maximum(values, 1e-12))).T
-            trial = np.clip(f.x + z * span, low, high)
+            size = np.where(np.arange(GUESSES) % 2, 1.0, 0.3)[:, None]
+            way = vectors / np.sqrt(np.maximum(values, 1e-12))
+            z = (rng.standard_normal((GUESSES, P)) / np.sqrt(P) * size) @ way.T
+            trial = np.clip(f.x + z * box.span, box.low, box.high)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
-            score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: B023, E731
-            tried = score(trial, self.eliminated(self.residuals(params, trial), s))
-            here = float(score(f.x, f.residual))
+            tried, here = self._tried(box, params, trial, s), float(self._score(box, f.x, f.residual))
             best = int(np.argmin(tried))
             start = trial[best] if tried[best] < here else f.x
             again = self.fit(params, x0=start, iterations=4, tolerance=5e-3, slopes=slopes_of(f))
-            if not float(score(again.x, again.residual)) < here * (1 - 5e-3):
+            if not float(self._score(box, again.x, again.residual)) < here * (1 - 5e-3):
                 break
             f = again
         return f
 
-    def toward_prior(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
+    def toward_prior(self, params: list[Param], f: Fitted) -> Fitted:
         """Return the fit again from where one belief, or all of them, are back at what is believed, all else following
         by its slopes, where that is better: in a valley of what acts alike (a damping in the loop, a viscous friction),
         and at kinks, steps end before they are there."""
@@ -249,16 +256,13 @@ class Fitter:
         nuisance = np.array([p.nuisance for p in params], bool)
         if not nuisance.any():
             return f
-        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
-        span, centre, believed = high - low, np.array([p.start for p in params], float), prior_weight(params)
-        score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: E731
-        for _ in range(rounds):
+        box = Box(params)
+        low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
+        for _ in range(ROUNDS):
             if self.passed():
                 break
-            k = self.r.huber
-            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
             J = f.jacobian * span
-            weighed = J * w[:, None]
+            weighed = J * robust(f.residual, self.r.huber)[:, None]
             A = weighed.T @ J
             A[np.diag_indices(P)] += believed * span**2 + 1e-3 * np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
             b = -weighed.T @ f.residual - believed * (f.x - centre) * span
@@ -278,8 +282,8 @@ class Fitter:
                     guesses.append(np.clip(f.x + z * span, low, high))
             moved = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
-            tried = score(guesses, self.eliminated(self.residuals(params, moved), s))
-            here, best = float(score(f.x, f.residual)), int(np.argmin(tried))
+            tried = self._tried(box, params, moved, s)
+            here, best = float(self._score(box, f.x, f.residual)), int(np.argmin(tried))
             if not tried[best] < here * (1 - 5e-3):
                 return f
             f = self.fit(params, x0=moved[best], iterations=4, tolerance=5e-3, slopes=slopes_of(f))
@@ -301,11 +305,13 @@ class Fitter:
                 out.append(g)
         return np.array(out)
 
-    def _tried(self, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
+    def _score(self, box: Box, x: np.ndarray, res: np.ndarray) -> np.ndarray:
+        """Return loss and disbelief at x [.., P], where res [.., m] is left."""
+        return self.loss(res) + ((x - box.centre) ** 2 @ box.prior) / res.shape[-1]
+
+    def _tried(self, box: Box, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
         """Return [K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
-        res = self.residuals(params, trial)
-        centre = np.array([p.start for p in params], float)
-        return self.loss(self.eliminated(res, s)) + ((trial - centre) ** 2 @ prior_weight(params)) / res.shape[-1]
+        return self._score(box, trial, self.eliminated(self.residuals(params, trial), s))
 
     def fit(
         self,
@@ -325,14 +331,12 @@ class Fitter:
         follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only
         where they lead no further: a third of the simulations. exact: end with slopes that were simulated at the
         end."""
-        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
-        x = np.array([p.start for p in params], float) if x0 is None else np.array(x0, float)
-        x = np.clip(x, low, high)
-        span = high - low
+        box = Box(params)
+        low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
+        x = np.clip(centre if x0 is None else np.array(x0, float), low, high)
         belief = np.array([p.nuisance for p in params], bool)
         damping = 1e-2
         P = len(params)
-        believed, centre = prior_weight(params), np.array([p.start for p in params], float)
         jac, known = self._known(params, slopes)  # known: slopes that were not simulated here
         follow = (belief | known) if lazy or slopes is not None else np.zeros(P, bool)
         moved = last = s = None
@@ -350,9 +354,7 @@ class Fitter:
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             if it >= iterations or P == 0 or self.passed():
                 break
-            k = self.r.huber
-            weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
-            weighed = jac * weight[:, None]
+            weighed = jac * robust(res, self.r.huber)[:, None]
             A = weighed.T @ jac
             b = -weighed.T @ res - believed * (x - centre) * span
             A[np.diag_indices(P)] += believed * span**2
@@ -362,7 +364,7 @@ class Fitter:
                 break
             lambdas = damping * np.array([1e-2, 0.1, 1.0, 10.0, 100.0, 1000.0])
             trial = np.clip(x + _damped(A, b, free, lambdas) * span, low, high)
-            tried = self._tried(params, trial, s)
+            tried = self._tried(box, params, trial, s)
             best = int(np.argmin(tried))
             gain = (loss - float(tried[best])) / max(loss, 1e-30)
             # by slopes from elsewhere: here they are simulated before this is the end
@@ -381,7 +383,7 @@ class Fitter:
                     continue
                 # a kinked loss has no slope to follow: try sizes outright
                 trial = np.clip(self.pattern(params, x), low, high)
-                tried = self._tried(params, trial, s)
+                tried = self._tried(box, params, trial, s)
                 best = int(np.argmin(tried))
                 if not tried[best] < loss * (1 - tolerance):
                     break
@@ -438,8 +440,8 @@ class Fitter:
 def _differences(params: list[Param], x: np.ndarray, step: float) -> np.ndarray:
     """Return [P] steps of the finite differences at x, backward where forward would leave the bounds: `step` of a
     range, and small beside the value too, for a range may be wide and many effects are kinked where they begin."""
-    low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
-    span, belief = high - low, np.array([p.nuisance for p in params], bool)
+    box, belief = Box(params), np.array([p.nuisance for p in params], bool)
+    high, span = box.high, box.span
     size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
     size = np.where(belief, STEP_OF_BELIEF * span, size)
     return np.where(x + size <= high, size, -size)
@@ -479,7 +481,7 @@ def slopes_of(f: Fitted) -> dict[str, np.ndarray]:
     return {p.key: f.jacobian[:, i] * p.span for i, p in enumerate(f.params)}
 
 
-def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, huber: float = 0.0) -> np.ndarray:
+def intervals(fitted: Fitted, blocks: np.ndarray, huber: float = 0.0) -> np.ndarray:
     """Return [P, 2] 90 % intervals that let residuals be correlated inside a block: the sandwich over blocks [m] of
     each residual, with the small-sample factor of the number of blocks."""
     P = len(fitted.params)
@@ -487,8 +489,8 @@ def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, huber: f
         return np.zeros((0, 2))
     J, r = fitted.jacobian, fitted.residual
     psi = r if huber <= 0 else np.clip(r, -huber, huber)
-    low, high = np.array([p.low for p in fitted.params]), np.array([p.high for p in fitted.params])
-    span = high - low
+    box = Box(fitted.params)
+    low, high, span = box.low, box.high, box.span
     Js = J * span
     # the bounds are priors: a parameter is not known worse than its range
     A = Js.T @ Js
@@ -504,4 +506,4 @@ def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, huber: f
     cov = inverse @ (B + np.diag(prior * typical)) @ inverse
     se = np.sqrt(np.maximum(np.diag(cov), 0.0)) * span
     x = fitted.x
-    return np.stack([np.maximum(x - level * se, low), np.minimum(x + level * se, high)], 1)
+    return np.stack([np.maximum(x - 1.645 * se, low), np.minimum(x + 1.645 * se, high)], 1)

@@ -19,7 +19,7 @@ from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.posterior import Shadow
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
-from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
+from dexsim.gap.search.fit import Box, Fitted, Fitter, Residuals, disbelief, slopes_of
 
 # -- a hypothesis -----------------------------------------------------------------------------------------------------
 # A hypothesis: its effects, its fit, and what a search ends with.
@@ -382,8 +382,7 @@ class JointHypotheses:
             self.r.sigma_torque *= max(1.0, SEARCH.apart * parts[1], restless)
             f = self.scan_fitter.fit(params, x0=f.x, iterations=4, lazy=True)
         if params:
-            span = np.array([p.span for p in params])
-            trace = np.sqrt((f.jacobian**2).mean(0)) * span
+            trace = np.sqrt((f.jacobian**2).mean(0)) * Box(params).span
             self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > BELIEF.trace]
         keep = [i for i, p in enumerate(params) if p in self.nuisances]
         x = f.x[keep]
@@ -433,7 +432,7 @@ class JointHypotheses:
             known = {p.key: v for p, v in zip(like.fit.params, like.fit.x, strict=True)}
             x0 = np.array([known.get(p.key, v) for p, v in zip(params, x0, strict=True)])
         x0[: len(starts)] = starts
-        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        low, high = Box(params).low, Box(params).high
         n = sum(len(m.variant.params) for m in members)
         # an optimizer stalls at a bound: start inside it
         inside = np.clip(x0, low + 0.02 * (high - low), high - 0.02 * (high - low))

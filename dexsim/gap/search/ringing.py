@@ -26,6 +26,7 @@ from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param, expand, neutral_of
 from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.fit import Box
 from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, subset, thin
 from dexsim.gap.search.search import JointSearch
 
@@ -162,12 +163,13 @@ class Ringing:
         # as in a fit: keys of the effect's own parameters are unique in the hypothesis
         params = [p for p in search._params((member,)) if not p.nuisance]
         params += [p for p in search.all_nuisances if not taken & set(p.columns)]
-        low, high = (np.array([getattr(p, k) for p in params]) for k in ("low", "high"))
+        box = Box(params)
+        low, high = box.low, box.high
         keys = [p.key for p in params]
         guesses = []
         for start in _starts(member):
             for limits in LIMITS:
-                x = np.array([p.start for p in params], float)
+                x = box.centre.copy()
                 x[:own] = start
                 for key, value in limits.items():
                     if key in keys:

@@ -16,7 +16,7 @@ from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.fit import Fitter, Residuals, disbelief, huber_square, prior_weight, slopes_of
+from dexsim.gap.search.fit import Box, Fitter, Residuals, disbelief, huber_square, robust, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
@@ -62,14 +62,13 @@ class JointLosses(JointHypotheses):
         f, fitter = trial.fit, self.fitter
         P = len(f.params)
         out = np.zeros(int(self.blocks.max()) + 1)
-        low, high = np.array([p.low for p in f.params]), np.array([p.high for p in f.params])
-        span = high - low
+        box = Box(f.params)
+        low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
         folds = np.unique(self.fold_of)
         fold = self.fold_of[fitter.window]
         k = self.r.huber
-        weight = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+        weight = robust(f.residual, k)
         guesses = [f.x]
-        believed, centre = prior_weight(f.params), np.array([p.start for p in f.params], float)
         lengths = (0.35, 1.0)
         for number in folds:
             on = fold != number if len(folds) > 1 else fold == number
@@ -260,14 +259,15 @@ class JointScan(JointLosses):
         r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
         guesses, owners = self._guesses(current, expand_one(case, params, x))
         rows, dots, squares, cross = [], [], [], []
-        J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
+        box = Box(params)
+        J = here.jacobian * box.span if params else np.zeros((len(r0), 0))
         k = self.r.huber
         weight = np.minimum(1.0, k / np.maximum(np.abs(r0), 1e-9)) if k > 0 else np.ones_like(r0)
         sw = np.sqrt(weight)
         Jw, rw = J * sw[:, None], r0 * sw
         all_J = Jw
         # nuisances absorb what they may: a prior of a quarter of their span
-        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        low, high = box.low, box.high
         inside = (x > low + 0.02 * (high - low)) & (x < high - 0.02 * (high - low)) if params else np.zeros(0, bool)
         Jw = Jw[:, inside]  # one at its bound has nothing left to give
         gram = Jw.T @ Jw + 16.0 * float(np.mean(rw**2)) * np.eye(Jw.shape[1])
@@ -343,10 +343,9 @@ class JointScan(JointLosses):
         if not owners:
             return []
         P = len(params)
-        span = np.array([p.span for p in params])
-        centre, believed = np.array([p.start for p in params], float), prior_weight(params) * span**2
-        low, high = (np.array([p.low for p in params]) - x) / span, (np.array([p.high for p in params]) - x) / span
-        off = (x - centre) / span
+        box = Box(params)
+        span, believed = box.span, box.prior * box.span**2
+        low, high, off = (box.low - x) / span, (box.high - x) / span, (x - box.centre) / span
         A = J.T @ J + np.diag(believed + 1e-9 * max(float(r @ r), 1e-12))
         b = -(J.T @ r) - believed * off  # of the beliefs' moves z: A z = b + c * cross
         total = float(r @ r) + float(believed @ off**2)

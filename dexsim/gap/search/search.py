@@ -16,7 +16,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, huber_square, slopes_of
+from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, huber_square, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
@@ -690,8 +690,8 @@ class JointSearch(JointSelection):
         x, P = f.x, len(f.x)
         if P == 0:
             return bounds
-        low, high = np.array([p.low for p in f.params]), np.array([p.high for p in f.params])
-        span = high - low
+        box = Box(f.params)
+        low, high, span = box.low, box.high, box.span
         square = (0.75 * (bounds[:, 1] - bounds[:, 0])) ** 2
         folds = np.array([g for g in trial.folds if len(g) == P])
         if len(folds) >= 2:
