@@ -45,3 +45,12 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
+
+
+def felt(recordings, m, held=frozenset(), allowed=None):
+    """Return what a diagnosis says of touch alone."""
+    from dexsim.gap.touch.diagnosis import Touch
+
+    touch = Touch(recordings, m, set(held), allowed=allowed)
+    touch.run()
+    return touch.result

@@ -18,10 +18,10 @@ from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import plant as touch_plant
 from dexsim.gap.touch import read as touch_read
 from dexsim.gap.touch import search as touch_search
-from dexsim.gap.touch.diagnosis import diagnose as diagnose_touch
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import mechanism
 from dexsim.tactile import reference as ref
+from tests.tactile_fixtures import felt
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def found(folder, seconds=4.0, allowed=None, count=3, **planted):
     """Return the touch of some rig recordings with what was planted."""
     paths, model, servo = press_rig.record(folder, count, seconds, seed=4, **planted)
     m = mechanism(model, servo)
-    return diagnose_touch([read(p, joints=m.joints, audit=False) for p in paths], m, set(), allowed=allowed)
+    return felt([read(p, joints=m.joints, audit=False) for p in paths], m, set(), allowed=allowed)
 
 
 def test_catalogue_of_touch_is_that_of_the_specification():
@@ -160,7 +160,7 @@ def test_more_planted_touch_effects(tmp_path, effect, planted, values):
 def test_nothing_planted_nothing_found(plain):
     paths, model, servo = plain
     m = mechanism(model, servo)
-    out = diagnose_touch([read(p, joints=m.joints, audit=False) for p in paths], m, set())
+    out = felt([read(p, joints=m.joints, audit=False) for p in paths], m, set())
     assert not out.findings and not out.structured and out.before[0] < 1.3 * out.floor
 
 
@@ -247,7 +247,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 
     kinds, td.KINDS = td.KINDS, {}
     try:
-        out = diagnose_touch([read(tmp_path / "a.mcap", joints=m.joints, audit=False)], m, set())
+        out = felt([read(tmp_path / "a.mcap", joints=m.joints, audit=False)], m, set())
     finally:
         td.KINDS = kinds
     assert out.before is None and any("not what was touched" in n for n in out.notes)
@@ -258,7 +258,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
     paths, model, servo = press_rig.record(tmp_path, 3, 4.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
     m = mechanism(model, servo)
-    out = diagnose_touch(
+    out = felt(
         [read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set()
     )
     assert not out.findings and any("tactile_lsb is unknown" in n for n in out.notes)

@@ -20,6 +20,7 @@ from dexsim.recording.mechanism import mechanism
 from dexsim.tactile.file import load
 from dexsim.tactile.sensors import Sensors
 from tests import hands
+from tests.tactile_fixtures import felt
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def test_the_plant_reads_what_a_hands_taxels_read(claw, tmp_path, mirror):
 def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     k = Sensors(claw).middle(2)
     m, recordings = pressed(tmp_path, claw, "middle", 5.0, gains={k: 0.4})
-    result = diagnosis.diagnose(recordings, m, set(), allowed={"tactile_gain"})
+    result = felt(recordings, m, set(), allowed={"tactile_gain"})
     (f,) = result.findings
     assert f.effect == "tactile_gain" and list(f.taxels) == [f"2:{k}"], f
     assert f.parameters["gain"]["value"] == pytest.approx(0.4, abs=0.08) and result.names[2] == "middle"
@@ -90,5 +91,5 @@ def test_a_hand_without_touch_says_so(tmp_path):
     hand = load_hand(made_hand(tmp_path / "made", pads=False))
     m = mechanism(hand.folder)
     r = replace(signal(joints=hand.joints, tactile=True), joints=hand.joints)
-    result = diagnosis.diagnose([r], m, set())
+    result = felt([r], m, set())
     assert not result.findings and any("made_left has no touch pads" in note for note in result.notes)

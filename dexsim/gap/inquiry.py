@@ -5,7 +5,6 @@ through, its drives (`gap.diagnosis`) and its touch (`gap.touch.diagnosis`) alik
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -242,40 +241,16 @@ class NothingToJudge(Exception):
     """A part of which nothing can be said, and why."""
 
 
-class Steps(ABC):
-    """One part of a machine under diagnosis. Each step keeps what it found out for the next ones; any may raise
-    NothingToJudge."""
-
-    @abstractmethod
-    def read(self) -> None:
-        """What of the recordings tells of this part alone, as arrays."""
-
-    @abstractmethod
-    def plant(self) -> None:
-        """The plant that simulates it along the recordings, what is held out of the fit, and the noise."""
-
-    @abstractmethod
-    def search(self) -> None:
-        """Which effects it has: scan, fit, select on conditions left out, and what of that stands on what was held out
-        of the fit."""
-
-    @abstractmethod
-    def locate(self) -> None:
-        """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the
-        recordings. After the search, which refits them: it also says where what was found leaves something."""
-
-    @abstractmethod
-    def judge(self) -> None:
-        """Findings, confidences and errors on what was held out of the fit."""
-
-    @abstractmethod
-    def report(self, d: Diagnosis) -> None:
-        """Adds the answer to a diagnosis: findings, verdict, sentence, what is handed on to training."""
+class Steps:
+    """One part of a machine under diagnosis: what of the recordings tells of it (`read`), its plant along them and what
+    is held out (`plant`), which effects it has (`search`), where its belief is off (`locate`), findings and errors on
+    what was held out (`judge`); `report` adds the answer to a diagnosis. Each step keeps what it found out for the next
+    ones; any may raise NothingToJudge."""
 
     def run(self) -> None:
         """All steps up to the judgement, in order."""
-        for step in (self.read, self.plant, self.search, self.locate, self.judge):
-            step()
+        for step in ("read", "plant", "search", "locate", "judge"):
+            getattr(self, step)()
 
 
 def read_files(w: Inquiry) -> None:

@@ -212,13 +212,12 @@ class JointPlant:
         self.nominal.append(nominal)
         self._start.append(t0)
 
-    def finish(self, room: np.ndarray | None = None) -> None:
-        """After the last `add`. room [G, E]: memory for the series (None: fresh)."""
+    def finish(self) -> None:
+        """After the last `add`."""
         self.t, self.q = np.concatenate(self._t), np.concatenate(self._q)
         self.torque = np.concatenate(self._torque)
         self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
-        # long recordings of many joints are gigabytes: one copy
-        self.series = np.empty((self._grid[-1], len(SERIES))) if room is None else room
+        self.series = np.empty((self._grid[-1], len(SERIES)))  # long recordings of many joints are gigabytes: one copy
         for run in range(len(self._t)):
             self._fill(run)
         self._added = []

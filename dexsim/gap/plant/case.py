@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import mujoco
@@ -221,12 +220,9 @@ def moved(
     dt: float = 1e-3,
     only: set[str] | None = None,
     added: bool = True,
-    rooms: SimpleQueue[np.ndarray] | None = None,
 ) -> Motion:
     """Return the joints (of `only`) along all runs. use(j, plant): what is made of each one's plant, which is not kept
-    here; added: also what a mass that is added, or a tilt, would do to them. rooms: memory for the series of plants
-    that nobody keeps, taken from there and given back after `use`: fresh memory costs as much as what is written to
-    it."""
+    here; added: also what a mass that is added, or a tilt, would do to them."""
     joints = runs[0].joints
     J = len(joints)
     servo = runs[0].servo
@@ -270,22 +266,11 @@ def moved(
                 None if run.read is None else run.read[:, j],
             )
         out.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
-        out.finish(_taken(rooms))
-        made = use(j, out)
-        if rooms is not None:
-            rooms.put(out.series)
-        return made
+        out.finish()
+        return use(j, out)
 
     used = dict(zip(wanted, compute.each(len(wanted), one), strict=True))
     return Motion(mech, constants, rows, others, used)
-
-
-def _taken(rooms: SimpleQueue[np.ndarray] | None) -> np.ndarray | None:
-    """Return one of `rooms`; None where there is none."""
-    try:
-        return None if rooms is None else rooms.get_nowait()
-    except Empty:
-        return None
 
 
 def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
@@ -651,10 +636,9 @@ def refined_cases(
     """Return a case a joint (of `only`), built along refined motions (`Run.fine`) where there are several joints."""
     if len(runs[0].joints) < 2:
         return build(model, runs, device, dt)
-    rooms: SimpleQueue[np.ndarray] = SimpleQueue()
     for _ in range(PASSES):
         by_joint = moved(
-            model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False, rooms=rooms
+            model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False
         ).used
         _refine(runs, [by_joint[j] for j in range(len(by_joint))])
     return build(model, runs, device, dt, only)

@@ -174,20 +174,6 @@ class Touch(Steps):
         into_diagnosis(d, self.result)
 
 
-def diagnose(
-    recordings: list[Recording],
-    m: Mechanism,
-    held: set[str],
-    seed: int = 0,
-    allowed: set[str] | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> TouchResult:
-    """Touch of all recordings, whatever the joints do. held: names of those held out of the fit."""
-    touch = Touch(recordings, m, held, seed, allowed, progress)
-    touch.run()
-    return touch.result
-
-
 # -- touch beside the joints ------------------------------------------------------------------------------------------
 # Touch beside the joints: one list of findings; the verdict on both is `conclude.decide`'s.
 
