@@ -295,13 +295,6 @@ MUTATIONS = (
         "tests/test_gap_ends.py::test_no_end_is_where_a_joint_was_recorded_to_be",
     ),
     Mutation(
-        "what hid an effect keeps its place",
-        "dexsim/gap/search/search.py",
-        "instead = self._in_its_place(trials, current)",
-        "instead = current",
-        "tests/test_gap_rules.py::test_what_looked_like_an_effect_is_let_go_for_it",
-    ),
-    Mutation(
         "of a dead zone one kind is tried",
         "dexsim/gap/effects/drive.py",
         "    kinds = 3\n",

@@ -373,7 +373,7 @@ def judged(self):
     x = self.searched[0]
     case, search, outcome = x.case, x.search, x.outcome
     for trial in (outcome.none, outcome.best):
-        torque, on = residual_torque(case, self.w.runs, search.polish(trial), 0)
+        torque, on = residual_torque(case, self.w.runs, polished(search, trial), 0)
         left.append(float(np.sqrt(np.mean(torque[on] ** 2))))
     judge(self)
 Steps.judge = judged

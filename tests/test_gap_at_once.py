@@ -12,6 +12,8 @@ from test_gap_search import searched
 from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.scan import scan_catalogue
+from dexsim.gap.search.search import drafts_of, finished_drafts
 
 
 @pytest.mark.slow
@@ -19,11 +21,11 @@ def test_of_hypotheses_that_are_out_of_time_the_first_is_fitted(monkeypatch):
     s = searched({"torque_limit": 0.12})
     none = s.start()
     s.fitted = {}
-    listed = s.scan(none)[:4]
+    listed = scan_catalogue(s, none)[:4]
     s.deadline = SimpleNamespace(over=lambda: True)
-    drafts = s._drafts(listed, none, {}, {})
+    drafts = drafts_of(s, listed, none, {}, {})
     assert len(drafts) == 1 and drafts[0][0][0].id == listed[0][2].id
-    assert len(s._finished(drafts * 2, none)) == 1
+    assert len(finished_drafts(s, drafts * 2, none)) == 1
 
 
 @pytest.mark.parametrize("seconds, stopped, settled, ahead", [
@@ -43,7 +45,7 @@ def test_a_joint_that_is_not_searched_again_is_judged_ahead(seconds, stopped, se
     drives.w, drives.ahead = SimpleNamespace(limit=limit, runs=[]), {}
     drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None, apart={}, proven=True)
     case = SimpleNamespace(moved=True)
-    search = SimpleNamespace(case=case, plain=lambda: ([], np.zeros(0)), whole=None)
+    search = SimpleNamespace(case=case, plain=[([], np.zeros(0))], whole=None)
     loss = 0.5 * SEARCH.unsettled if settled else 2 * SEARCH.unsettled
     found = SimpleNamespace(best=SimpleNamespace(members=(), fit=SimpleNamespace(loss=loss)))
     drives._judged_ahead(search, found)

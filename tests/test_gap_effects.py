@@ -26,7 +26,7 @@ from dexsim.gap.plant.columns import NAMES, SERIES
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.fit import intervals
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, search_joint, widened
 
 ROOM = Path(dexsim.gap.__file__).parent
 IDS = {*EFFECTS, *TOUCH_EFFECTS}
@@ -212,9 +212,9 @@ def test_an_interval_holds_the_size_by_another_law():
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"stribeck_friction"})
-    best = search.run().best
+    best = search_joint(search).best
     assert best.ids == ("stribeck_friction",) and len(search.by_law["stribeck_friction"]) == 2
-    low, high = search.widen(best, intervals(best.fit, search.blocks, huber=search.r.huber))[0]
+    low, high = widened(search, best, intervals(best.fit, search.blocks, huber=search.r.huber))[0]
     assert low < 0.06 < high < 0.1
     assert best.members[0].variant.label == "exponential in speed"
 
@@ -228,7 +228,7 @@ def test_a_law_is_tried_before_what_it_gets_wrong_is_named():
         r.smooth()
     allowed = {"stribeck_friction", "load_friction", "torque_ripple"}
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed=allowed)
-    best = search.run().best
+    best = search_joint(search).best
     assert best.ids == ("stribeck_friction",) and best.members[0].variant.label == "exponential in speed"
 
 

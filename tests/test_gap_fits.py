@@ -14,7 +14,8 @@ from dexsim.gap.judge.joint_answer import stretched, traded
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted, bounded
-from dexsim.gap.search.search import JointSearch, Member, Trial
+from dexsim.gap.search.scan import scan_catalogue
+from dexsim.gap.search.search import JointSearch, Member, Trial, begun_again
 from tests.test_gap import model, plant_run
 
 BRAKES = ("torque_limit", "viscous_friction", "braking_limit")
@@ -40,18 +41,19 @@ def test_no_effect_is_begun_again_from_where_an_effect_ended():
     ]
     s = JointSearch(build(model(), runs)[0], [0, 1, 2], None, [0, 1, 2])
     none = s.start()
-    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in s.scan(none) if m.id == "command_delay")
+    listed = scan_catalogue(s, none)
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in listed if m.id == "command_delay")
     there = s.fit((member,), start, none)
     params = none.fit.params
     x = none.fit.x.copy()
     x[[p.key for p in params].index("kp")] = 1.04
     short = Trial((), s.fitter.fit(params, x0=x, iterations=0))  # a fit that has stopped on the way
     assert short.fit.loss > 1.2 * there.fit.loss
-    again = s._begun_again(short, [there])
-    assert again is not short and s._here(again) < 1.05 * s._here(none)
-    assert s._begun_again(again, [there]) is again  # what follows as well is left alone
+    again = begun_again(s, short, [there])
+    assert again is not short and s.objective(again) < 1.05 * s.objective(none)
+    assert begun_again(s, again, [there]) is again  # what follows as well is left alone
     worse = replace(there, fit=replace(there.fit, loss=2 * short.fit.loss))
-    assert s._begun_again(short, [worse]) is short
+    assert begun_again(s, short, [worse]) is short
 
 
 def test_what_left_a_trace_beside_one_effect_begins_there_beside_a_further_one():

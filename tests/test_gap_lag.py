@@ -17,7 +17,7 @@ from dexsim.gap.plant.columns import INDEX, NEUTRAL, SERIES, SERIES_INDEX
 from dexsim.gap.read import conditions
 from dexsim.gap.search import ringing
 from dexsim.gap.search.hypotheses import Member, Outcome, Trial
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, without_search
 
 DT, TIME = 5e-4, 0.04  # s
 
@@ -101,7 +101,7 @@ def swinging() -> tuple[JointSearch, Outcome]:
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs), allowed={"lag", "compliance"})
-    return search, search.without_search()
+    return search, without_search(search)
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_training_gets_the_first_order_with_the_same_mean_delay_and_is_told(swin
     for variant in (first, *first.by_law()):
         second = bool(variant.fixed)
         table = ServoTable.from_dict({"joints": {"joint": SERVO}})
-        params = search._params((Member(EFFECTS["lag"], variant),))[:1]
+        params = search.params_of((Member(EFFECTS["lag"], variant),))[:1]
         trial = Trial((Member(EFFECTS["lag"], variant),), search.fitter.fit(params, np.array([0.02]), iterations=0))
         servo_changes(table, search.case, trial, np.array([[0.01, 0.03]]), ["joint"])
         left = missing_of(search.case, trial)

@@ -137,7 +137,8 @@ def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
     drives.w = SimpleNamespace(limit=TimeLimit(100.0), runs=[], settings=SimpleNamespace(seed=0))
     drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None)
     drives.noise, drives.written = SimpleNamespace(floor=1.0), SimpleNamespace(plain=lambda joint: False)
-    search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=None, best=None)
+    search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
+    outcome = SimpleNamespace(none=None, best=None)
     drives.searched = [SearchedJoint(SimpleNamespace(joint=j), search, outcome) for j in "abc"]
     joints = {j: {"after": 1e3} for j in "abc"}
     d = SimpleNamespace(joints=joints, findings=[], standins=[], notes=[])

@@ -13,6 +13,7 @@ from dexsim.gap.finding import Finding
 from dexsim.gap.plant.case import build, dragged_by
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run
+from dexsim.gap.search.search import search_joint
 
 ROTOR, BOB = 5e-4, 0.2 * 0.1**2
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody>
@@ -185,7 +186,7 @@ def test_a_linkage_with_a_joint_further_off_is_found(ratio):
     drives._left = 1
     search = drives._begun(0, lambda _: None)
     assert isinstance(search, JointSearch)
-    first = search.run()
+    first = search_joint(search)
     assert not first.best.members
     answers = [(search, first)] + [(drives._begun(k, lambda _: None), None) for k in range(1, 6)]
     drives._dragged_from_afar(answers)

@@ -16,7 +16,7 @@ from dexsim.gap.judge.handed_on import columns_beside
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read import Run, conditions
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, search_joint
 
 ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" armature="1e-4"/>
 <geom type="sphere" size="1e-3" mass="0.2" pos="0.1 0 0"/></body></worldbody></mujoco>"""
@@ -71,7 +71,7 @@ def searched():
         r.smooth()
     allowed = {"coulomb_friction", "load_friction"}
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed=allowed)
-    return search, search.run()
+    return search, search_joint(search)
 
 
 def test_it_is_named_where_dry_friction_and_a_share_of_the_motors_torque_leave_much(searched):

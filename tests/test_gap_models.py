@@ -20,7 +20,7 @@ from dexsim.gap.plant.mechanics import leaf_of
 from dexsim.gap.read import Run, conditions
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import intervals
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, search_joint, widened, without_search
 
 OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 
@@ -33,9 +33,9 @@ def found(changes: dict[str, float], effect: str, seconds: float = 4.0) -> tuple
         r.smooth()
     case = build(model(), runs)[0]
     search = JointSearch(case, [0, 1, 2], None, conditions(runs), allowed={effect})
-    best = search.run().best
+    best = search_joint(search).best
     assert best.ids == (effect,)
-    bounds = search.widen(best, intervals(best.fit, search.blocks, huber=search.r.huber))
+    bounds = widened(search, best, intervals(best.fit, search.blocks, huber=search.r.huber))
     keys, member = [p.key for p in best.fit.params], best.members[0]
     at = {p.key: keys.index(f"{effect}.{p.key}") for p in member.variant.params}
     raw, spread = (
@@ -245,7 +245,7 @@ def jittered(kind: int, sd: float) -> Run:
 def test_jitter_of_a_delay_is_found_and_sized(sd):
     runs = [jittered(k, sd) for k in (0, 1, 3)]
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"command_delay"})
-    best = search.run().best
+    best = search_joint(search).best
     found = joint_answer.estimate_jitter(search, best)
     assert best.ids == ("command_delay",) and best.fit.value("command_delay.delay") == pytest.approx(0.02, abs=0.002)
     if not sd:
@@ -267,5 +267,5 @@ def test_what_only_looks_like_jitter_is_not_reported():
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
-    none = search.without_search().none
+    none = without_search(search).none
     assert none.fit.loss > JUDGE.within**2 and joint_answer.estimate_jitter(search, none) is None

@@ -6,7 +6,7 @@ from types import SimpleNamespace as Plain
 
 import pytest
 
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import overtaken
 
 
 def hypothesis(*ids):
@@ -14,8 +14,8 @@ def hypothesis(*ids):
 
 
 def search(*known):
-    out = Plain(fitted={frozenset(t.ids): t for t in known}, _shrunk=lambda t: "backlash" in t.ids)
-    return lambda current, final: JointSearch._overtaken(out, current, final)
+    out = Plain(fitted={frozenset(t.ids): t for t in known}, shrunk=lambda t: "backlash" in t.ids)
+    return lambda current, final: overtaken(out, current, final)
 
 
 def test_a_rival_takes_the_place_of_the_member_that_it_beats():

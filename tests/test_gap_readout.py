@@ -7,6 +7,7 @@ from test_gap import model, plant_run
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.search.scan import scan_catalogue
 from dexsim.gap.search.search import JointSearch
 
 APART = {"loop_encoder": "motor", "position_encoder": "joint"}
@@ -60,5 +61,5 @@ def test_an_offset_of_the_effort_beyond_what_its_zero_may_be_off_by_is_found(sig
     case = build(model(), runs)[0]
     assert zero > 0.1 * case.scales.tau
     search = JointSearch(case, [0], None, [0])
-    shares = {member.id: share for share, _, member, _ in reversed(search.scan(search.start()))}
+    shares = {member.id: share for share, _, member, _ in reversed(scan_catalogue(search, search.start()))}
     assert shares["current_sensor"] > 0.9

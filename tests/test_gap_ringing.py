@@ -19,7 +19,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search import logged_torque, ringing
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, without_search
 from dexsim.recording.audit_values import repeats
 
 SERVO = {"kp": 4.0, "kd": 0.2, "torque_limit": 2.0}
@@ -40,7 +40,7 @@ def soft() -> JointSearch:
 
 @pytest.mark.slow
 def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
-    nothing = soft.without_search()
+    nothing = without_search(soft)
     rung = ringing.Ringing(soft, nothing.none)
     assert 0.2 < rung.loud.mean() < 0.9  # before the step that begins it the loop is quiet
     found = ringing.answered(soft, nothing)
@@ -53,7 +53,7 @@ def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
 
 def test_nothing_makes_a_joint_ring_that_has_no_loop(soft):
     """What is fed back makes a joint ring: of one whose loop gives hardly any torque nothing is asked."""
-    nothing = soft.without_search()
+    nothing = without_search(soft)
     s = soft.case.scales
     for share, asked in ((0.5, False), (2.0, True)):
         bare = copy.copy(soft)
@@ -74,7 +74,7 @@ def test_play_rings_on_where_it_was_struck():
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs), allowed={"backlash"})
-    nothing = search.without_search()
+    nothing = without_search(search)
     found = ringing.answered(search, nothing)
     at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
     assert found.best.ids == ("backlash",) and at["backlash.gap"] == pytest.approx(0.03, rel=0.25)
@@ -104,7 +104,7 @@ def answer_of(soft: JointSearch, found) -> JointAnswer:
 def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(soft, monkeypatch):
     """No free run keeps step with a true name either: its error neither falls nor surely rises. A name with which it
     does is a hint, and is not handed on."""
-    answer = answer_of(soft, ringing.answered(soft, soft.without_search()))
+    answer = answer_of(soft, ringing.answered(soft, without_search(soft)))
     assert rms(answer.after) > rms(answer.before)
     plain = SimpleNamespace(joint="joint", error_before=1.0, error=1e-9)  # it does not ring, and follows no better
 
@@ -131,7 +131,7 @@ def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0], None, conditions(runs), allowed={"compliance"})
-    nothing = search.without_search()
+    nothing = without_search(search)
     assert nothing.none.fit.loss > 2 and not ringing.Ringing(search, nothing.none).loud.any()
     assert ringing.answered(search, nothing) is nothing
     assert not ringing.shown(search, nothing, [1], None)

@@ -10,7 +10,7 @@ import pytest
 from test_gap_least import Judged, judged
 
 from dexsim.gap import locate
-from dexsim.gap.compute import Deadline, TimeLimit
+from dexsim.gap.compute import TimeLimit
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS
@@ -23,39 +23,34 @@ from dexsim.gap.plant.case import coupled
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.report import files, next_recording
-from dexsim.gap.search import ringing
+from dexsim.gap.search import ringing, scan, search
 from dexsim.gap.search.fit import Fitted
-from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, complexity_price, thin
-from dexsim.gap.search.search import JointSearch, SearchedJoint
+from dexsim.gap.search.hypotheses import JointSearch, Member, complexity_price, thin
+from dexsim.gap.search.search import SearchedJoint
 from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
 
 
-class Made(JointSearch):
-    """A search whose trials say themselves what they lose."""
+def made(**more):
+    """Return a search whose trials say themselves what they lose (`losses_given`)."""
+    mean = lambda t: float(t.loss.mean())  # noqa: E731
+    return SimpleNamespace(blocks=np.arange(40), rng=np.random.default_rng(0), none_loss=np.ones(40), by_law={},
+                           fold_by="time", objective=mean, shrunk=lambda t: False, **more)  # fmt: skip
 
-    def __init__(self):
-        self.blocks, self.rng, self.none_loss, self.by_law = np.arange(40), np.random.default_rng(0), np.ones(40), {}
-        self.fold_by = "time"
-        self.saved, self.fitter = [], SimpleNamespace(perturbed_restarts=lambda params, fit, rng: "restarted")
 
-    def _left(self, trial):
-        return trial.loss
-
-    def _here(self, trial):
-        return float(trial.loss.mean())
-
-    def _shrunk(self, trial):
-        return False
+@pytest.fixture
+def losses_given(monkeypatch):
+    for module in (scan, search):
+        monkeypatch.setattr(module, "cv_loss", lambda search, trial: trial.loss)
 
 
 def trial(loss, members=()):
     return SimpleNamespace(loss=np.broadcast_to(np.asarray(loss, float), (40,)), members=members, ids=("lag",))
 
 
-def test_an_effect_must_remove_a_least_share():
-    search, old = Made(), trial(10.0)
-    assert not search._earns(trial(9.0), old) and search._earns(trial(8.6), old)
+def test_an_effect_must_remove_a_least_share(losses_given):
+    old = trial(10.0)
+    assert not scan.earns(made(), trial(9.0), old) and scan.earns(made(), trial(8.6), old)
 
 
 def test_what_can_imitate_another_effect_must_do_better():
@@ -73,24 +68,25 @@ def row(share, price, effect="lag"):
 
 def test_the_short_list_asks_a_price():
     for price, loss, tried in ((0.15, 1.5, True), (0.25, 1.5, False), (0.25, 1.9, True)):
-        assert bool(Made()._shortlist([row(0.5, price)], 6, loss, ())) is tried, (price, loss)
+        assert bool(scan.shortlisted([row(0.5, price)], 6, loss, ())) is tried, (price, loss)
 
 
 def test_every_kind_of_a_dead_zone_is_tried():
     """Slopes at one say little of another; of other effects a short list holds one or two."""
-    scan = [row(0.9, 0.0), *(row(0.8 - 0.1 * k, 0.0, "deadband") for k in range(3)), row(0.2, 0.0)]
-    ids = [x[2].id for x in Made()._shortlist(scan, 2, 20.0, ())]
+    rows = [row(0.9, 0.0), *(row(0.8 - 0.1 * k, 0.0, "deadband") for k in range(3)), row(0.2, 0.0)]
+    ids = [x[2].id for x in scan.shortlisted(rows, 2, 20.0, ())]
     assert ids == ["lag", "deadband", "deadband", "deadband"] + ["lag"] * (EFFECTS["lag"].kinds - 1)
 
 
-def test_intervals_hold_the_laws_that_do_as_well():
-    search, p = Made(), param("peak", "stribeck_peak", "set", 0.0, 1.0)
+def test_intervals_hold_the_laws_that_do_as_well(losses_given):
+    p = param("peak", "stribeck_peak", "set", 0.0, 1.0)
     fitted = lambda x, loss: SimpleNamespace(  # noqa: E731
         fit=SimpleNamespace(params=[p], x=np.array([x])), loss=np.full(40, loss), ids=("s",)
     )
     best = fitted(0.06, 1.0)
-    search.by_law = {"s": [best, fitted(0.08, 1.04), fitted(0.2, 1.09)]}
-    assert search.law_spread(best).tolist() == [[0.06, 0.08]]
+    given = made()
+    given.by_law = {"s": [best, fitted(0.08, 1.04), fitted(0.2, 1.09)]}
+    assert search.law_spread(given, best).tolist() == [[0.06, 0.08]]
 
 
 def test_intervals_hold_what_no_residual_shows():
@@ -98,96 +94,16 @@ def test_intervals_hold_what_no_residual_shows():
     size = param("peak", "stribeck_peak", "set", 0.0, 10.0)
     belief = replace(param("kp", "kp", "factor", 0.9, 10.9, 1.0), nuisance=True)
     fit = SimpleNamespace(params=[size], x=np.array([2.0]), jacobian=np.ones((5, 1)))
-    made = SimpleNamespace(fit=fit, folds=[], ids=("s",))
-    low, high = Made().widen(made, np.array([[2.0, 2.0]]))[0]
+    of = SimpleNamespace(fit=fit, folds=[], ids=("s",))
+    low, high = search.widened(made(), of, np.array([[2.0, 2.0]]))[0]
     assert (high - low) / 2 == pytest.approx(1.645 * 0.015 * 2.0, rel=1e-6)
     fit = SimpleNamespace(params=[size, belief], x=np.array([2.0, 1.0]), jacobian=np.ones((5, 2)))
-    made = SimpleNamespace(fit=fit, folds=[], ids=("s",))
-    low, high = Made().widen(made, np.array([[2.0, 2.0], [1.0, 1.0]]))[0]
+    of = SimpleNamespace(fit=fit, folds=[], ids=("s",))
+    low, high = search.widened(made(), of, np.array([[2.0, 2.0], [1.0, 1.0]]))[0]
     assert (high - low) / 2 == pytest.approx(1.645 * np.hypot(0.015 * 2.0, 0.025), rel=1e-3)
 
 
-class Selecting(Made):
-    """A selection of effects whose losses are given: what is left out, and where they were fitted, by a hypothesis'
-    effects."""
-
-    def __init__(self, losses, *offered, saved=()):
-        """offered: the scan's effects; saved: (what else of the scan saves in hindsight, effect)."""
-        super().__init__()
-        self.losses, self.offered, self.hindsight = losses, offered, saved
-        self.deadline, self.other_start, self.costs = Deadline(), {}, {}
-        self.case = SimpleNamespace(joint="j", plant=SimpleNamespace(device="cpu"))
-
-    def _left(self, trial):
-        return trial.left_out
-
-    def _here(self, trial):
-        return trial.fit.loss
-
-    def fit(self, members, *_, **__):
-        left, here = self.losses(tuple(m.id for m in members))
-        return Trial(members, SimpleNamespace(loss=here, params=[], x=np.zeros(0)), np.full(40, left))
-
-    def start(self):
-        return self.fit(())
-
-    def scan(self, current):
-        self.saved = [(gain, row(0, 0, e)[2], np.array([0.1])) for gain, e in self.hindsight]
-        return [row(0.5, price, e) for e, price in self.offered if e not in current.ids]
-
-    def draft(self, members, x, like):
-        return members, x, self.fit(members).fit
-
-    def finish(self, members, x, fit, current, quick=False):
-        return self.fit(members)
-
-    def rivals(self, current, pool):
-        return {m.id: ([], 1.0, 0.5) for m in current.members}
-
-    _on = cross = lambda *_: None
-    thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
-    _begun_again = lambda self, current, trials: current  # noqa: E731
-    _approximate = _more_general = lambda self, current: current  # noqa: E731
-    _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
-    _overtaken = _pair = lambda *_: None
-    _price_factor = lambda self, trial: 1.0  # noqa: E731
-    plain = lambda self: None  # noqa: E731
-
-
-@pytest.mark.parametrize("alone, found", [(2.0, ("deadband",)), (49.0, ("lag",))])
-def test_what_looked_like_an_effect_is_let_go_for_it(alone, found):
-    """Beside a dead zone the lag that was taken for it is fitted down to nothing."""
-    losses = {(): 100.0, ("lag",): 50.0, ("deadband", "lag"): 2.0, ("deadband",): alone}
-    search = Selecting(lambda ids: (losses[tuple(sorted(ids))],) * 2, ("lag", 0.0), ("deadband", 0.0))
-    search._shortlist = lambda scan, *_: scan[:1]  # the dead zone is not thought of at first
-    search._nothing_of = lambda m, trial: m.id == "lag" and trial.ids == ("lag", "deadband")
-    search._shrunk = lambda trial: any(search._nothing_of(m, trial) for m in trial.members)
-    assert search.run().best.ids == found
-
-
-def test_what_saves_much_in_hindsight_is_tried_whatever_its_price():
-    for share, found in ((0.025, ()), (0.035, ("lag",))):
-        search = Selecting(lambda ids: (1.0 if ids else 1.5,) * 2, ("viscous_friction", 1.0), saved=[(share, "lag")])
-        assert search.run().best.ids == found, share
-
-
-def test_within_the_noise_an_effect_must_be_clear():
-    for here, found in ((0.9, ()), (0.88, ("lag",))):  # left of the squared error where it was fitted
-        losses = lambda ids, here=here: (0.5, here) if ids else (1.0, 1.0)  # noqa: E731
-        search = Selecting(losses, ("lag", 0.0), saved=[(0.5, "lag")])
-        assert search.run().best.ids == found, here
-
-
-def test_where_two_fits_are_close_fits_of_their_own_do_not_decide():
-    """What follows the fitted stretches better wins once it is fitted without each condition, if that is done."""
-    for close, found in ((0.985, ("lag",)), (0.97, ("viscous_friction",))):
-        losses = {(): (10.0, 10.0), ("lag",): (0.5, 1.0), ("viscous_friction",): (0.55, close)}
-        search = Selecting(lambda ids, losses=losses: losses[ids], ("lag", 0.0), ("viscous_friction", 0.0))
-        search.refold = lambda t: replace(t, left_out=np.full(40, 0.2)) if t.ids == ("viscous_friction",) else t
-        assert search.run().best.ids == found, close
-
-
-class Started(JointHypotheses):
+class Started(JointSearch):
     """The beginning of a search, the residuals without any effect being given."""
 
     def __init__(self, q, torque):
@@ -378,7 +294,8 @@ def test_a_stand_in_is_offered_where_much_is_left():
     for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
         d = SimpleNamespace(joints={"j": {"after": left}}, findings=[], standins=[], notes=[])
         parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
-        search, outcome = SimpleNamespace(polish=lambda t: t), SimpleNamespace(best=None, none=None)
+        search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
+        outcome = SimpleNamespace(best=None, none=None)
         drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
                                  written=SimpleNamespace(plain=lambda joint: False),
@@ -487,7 +404,7 @@ def test_a_motion_that_settles_it_is_planned_alone():
 
 def test_the_short_list_asks_a_promise():
     for share, tried in ((0.035, True), (0.025, False)):
-        assert bool(Made()._shortlist([row(share, 0.0)], 6, 1.5, ())) is tried, share
+        assert bool(scan.shortlisted([row(share, 0.0)], 6, 1.5, ())) is tried, share
 
 
 def test_a_small_change_of_temperature_tells_nothing():

@@ -19,7 +19,8 @@ from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Box, Fitted, Fitter
-from dexsim.gap.search.search import JointSearch, Member, subset
+from dexsim.gap.search.scan import cross_validated, free_run_errors, refolded, saved_by, scan_catalogue
+from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found, subset
 from tests.test_gap import model, plant_run
 
 
@@ -32,10 +33,11 @@ def searched(changes: dict[str, float]) -> JointSearch:
 def test_refold_fits_each_condition_left_out_better_than_one_step_does():
     s = searched({"torque_limit": 0.12})
     none = s.start()
-    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in s.scan(none) if m.id == "torque_limit")
+    listed = scan_catalogue(s, none)
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in listed if m.id == "torque_limit")
     step = s.fit((member,), start, none)
-    s.cross(step)
-    own = s.refold(step)
+    cross_validated(s, step)
+    own = refolded(s, step)
     assert own.refitted and own.left_out is not step.left_out and own.fit is step.fit
     for number, x, y in zip(np.unique(s.fold_of), step.folds, own.folds, strict=True):
         fitter = Fitter(s.case.plant, subset(s.long, s.fold_of != number), s.r)
@@ -49,10 +51,11 @@ def test_conditions_left_out_are_run_free_with_fits_of_their_own():
     s = searched({"torque_limit": 0.12})
     assert s.fold_by == "conditions"
     none = s.start()
-    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in s.scan(none) if m.id == "torque_limit")
+    listed = scan_catalogue(s, none)
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in listed if m.id == "torque_limit")
     trial = s.fit((member,), start, none)
-    before, after = s._free_left(none), s._free_left(trial)
-    assert before.shape == after.shape == (3,) and s._free_left(trial) is after
+    before, after = free_run_errors(s, none), free_run_errors(s, trial)
+    assert before.shape == after.shape == (3,) and free_run_errors(s, trial) is after
     # what limits the torque is the same in each condition, whichever is left out
     assert after.mean() < 0.5 * before.mean() and after.mean() < 3.0
 
@@ -70,7 +73,7 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
     r = 0.8 * d[0] - 0.6 * J[:, 0] + 0.3 * rng.standard_normal(n)
     weight = np.array([30.0 / 0.025**2 * span**2] * 3 + [0.0] * 2)
     owners = [(SimpleNamespace(id=str(i)), np.zeros(1)) for i in range(H)]
-    got = {m.id: g for g, m, _ in JointSearch._saved(None, owners, d @ r, (d * d).sum(1), d @ J, J, r, params, x)}
+    got = {m.id: g for g, m, _ in saved_by(owners, d @ r, (d * d).sum(1), d @ J, J, r, params, x)}
     off = (x - 1.0) / span
 
     def least(column: np.ndarray | None) -> float:
@@ -88,18 +91,16 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
     assert max(got, key=got.get) == "0"
 
 
-def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
+def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted(monkeypatch):
     """before, after: in windows of what was held out; ratio: of a free run over it; gain: where it was fitted and on
     conditions left out."""
 
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, reported: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace(members=())
-        search = SimpleNamespace(
-            case=SimpleNamespace(told=reported),
-            polish=lambda t: t,
-            gain=lambda a, b: gain,
-            in_windows=lambda t, runs, span: before if t is none else after,
-        )
+        monkeypatch.setattr(conclude, "polished", lambda search, t: t)
+        monkeypatch.setattr(conclude, "share_removed", lambda search, a, b: gain)
+        monkeypatch.setattr(conclude, "loss_in_windows", lambda search, t, runs, span: before if t is none else after)
+        search = SimpleNamespace(case=SimpleNamespace(told=reported))
         return conclude._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
@@ -245,7 +246,7 @@ def test_a_search_tells_how_far_it_is():
     reported = []
     s = searched({})
     s.tell = reported.append
-    s.settle(s.run())
+    settle_found(s, search_joint(s))
     assert len(reported) >= 3 and reported == sorted(reported) and 0 < reported[0] and reported[-1] < 1
 
 

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.compute import Deadline
 from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.catalogue import EFFECTS, nested
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run, conditions
-from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.hypotheses import named
-from dexsim.gap.search.search import JointSearch, JointSelection, Member, Trial
+from dexsim.gap.search.search import JointSearch, Member, Trial, search_joint
 
 MODEL = """<mujoco><compiler angle="{angle}"/><option gravity="0 0 0" timestep="0.0005"/><worldbody>
 <body><joint name="a" axis="0 1 0" damping="2e-4" {spring}/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/>
@@ -139,7 +137,7 @@ def driven(seed: int, **columns) -> Run:
 def searched(**columns):
     runs = [driven(seed, **columns) for seed in range(3)]
     case = build(mujoco.MjModel.from_xml_string(model_text()), runs)[0]
-    return JointSearch(case, [0, 1, 2], None, conditions(runs)).run()
+    return search_joint(JointSearch(case, [0, 1, 2], None, conditions(runs)))
 
 
 @pytest.mark.parametrize("stiffness, preload, gone", [(0.0, 0.0, True), (0.0, PRELOAD, False), (0.3, 0.0, False)])
@@ -147,7 +145,7 @@ def test_a_preload_without_stiffness_is_a_spring_still(stiffness, preload, gone)
     case = build(mujoco.MjModel.from_xml_string(model_text()), [driven(0)])[0]
     spring = Member(EFFECTS["joint_spring"], EFFECTS["joint_spring"].variants(case.scales)[0])
     trial = Trial((spring,), SimpleNamespace(params=named(spring), x=np.array([stiffness, preload])))
-    assert object.__new__(JointSelection)._shrunk(trial) == gone
+    assert object.__new__(JointSearch).shrunk(trial) == gone
 
 
 @pytest.mark.slow
@@ -158,33 +156,10 @@ def test_a_spring_is_named_and_sized_where_no_loop_holds_the_joint():
     assert best.fit.value("joint_spring.preload") == pytest.approx(PRELOAD, rel=0.2)
 
 
-def grown(better: bool, left: float = 9.0) -> tuple:
-    """Return (what one effect more beside what pulls alike makes of an answer, which of them was asked): with fits
-    by hand."""
-    search, asked = object.__new__(JointSelection), []
-    trial = lambda ids, loss: SimpleNamespace(ids=ids, members=ids, fit=SimpleNamespace(loss=loss))  # noqa: E731
-    current, fork = trial(("coulomb_friction",), 5.0), trial(("joint_spring",), 6.0)
-    more = trial(("joint_spring", "backlash"), 2.0 if better else 5.5)
-    search.blocks, search.deadline = np.zeros(10), Deadline()
-    search.scan = lambda t: asked.append(t.ids) or []
-    search._shortlist = lambda scan, size, loss, members: ["backlash"]
-    search._drafts = lambda listed, t, pool, price: listed
-    search._finished = lambda drafts, t: [more]
-    search._best = lambda trials, t: trials[0]
-    search._earns = lambda new, old: new.fit.loss < old.fit.loss
-    search._score = lambda t: 10 * t.fit.loss
-    search._left = lambda t: np.full(10, left * t.fit.loss / 6.0)
-    return search._beside_alike([fork], current, 6, {}, {}).ids, asked
-
-
-def test_what_pulls_alike_is_asked_for_beside_another_effect():
-    """A friction that differs by direction and a spring's preload are one torque while a joint moves; which it is may
-    show beside a play only."""
+def test_what_pulls_alike_is_one_torque_while_a_joint_moves():
+    """A friction that differs by direction, and a spring's preload."""
     assert nested("coulomb_friction", "joint_spring") and not nested("coulomb_friction", "coulomb_friction")
     assert not nested("coulomb_friction", "payload")
-    assert grown(better=True) == (("joint_spring", "backlash"), [("joint_spring",)])
-    assert grown(better=False)[0] == ("coulomb_friction",)
-    assert grown(better=True, left=0.5 * SEARCH.unsettled) == (("coulomb_friction",), [])  # little is left
 
 
 UNEVEN, LEVEL = 0.9, 0.01  # of friction by direction, N.m

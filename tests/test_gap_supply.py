@@ -10,6 +10,7 @@ from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import conditions
+from dexsim.gap.search.scan import scan_catalogue, shortlisted
 from dexsim.gap.search.search import JointSearch, Member
 
 SAGS = {"sag_torque": 0.15, "sag_own": 0.3}
@@ -56,7 +57,7 @@ def test_a_supply_that_sags_under_the_drives_own_load_is_found():
     search = JointSearch(case, [0, 1, 2], None, conditions(runs))
     none = search.start()
     speed, all_ = EFFECTS["supply_sag"].variants(case.scales)
-    ranked = [(m.id, m.variant.label) for _, _, m, _ in search.scan(none)]
+    ranked = [(m.id, m.variant.label) for _, _, m, _ in scan_catalogue(search, none)]
     assert ranked[0] == ("supply_sag", all_.label)
     found = search.fit((Member(EFFECTS["supply_sag"], all_),), np.array(all_.starts[2]), none)
     # what the speed limit alone loses does not follow it
@@ -69,11 +70,10 @@ def test_a_supply_that_sags_under_the_drives_own_load_is_found():
 def test_both_kinds_of_sag_are_tried_where_one_is_listed():
     """What a scan's slopes say of a sag where limits are reached ranks its kinds badly."""
     runs, case = sagging_case({})
-    search = JointSearch(case, [0, 1, 2], None, conditions(runs))
     speed, all_ = (Member(EFFECTS["supply_sag"], v) for v in EFFECTS["supply_sag"].variants(case.scales))
     other = Member(EFFECTS["payload"], EFFECTS["payload"].variants(case.scales)[0])
     rows = [(0.5, 0.0, speed, None), (0.4, 0.0, other, None), (0.3, 0.0, all_, None)]
-    assert [row[2] for row in search._shortlist(rows, 1, 10.0, ())] == [speed, all_]
+    assert [row[2] for row in shortlisted(rows, 1, 10.0, ())] == [speed, all_]
 
 
 def test_a_voltage_drives_supply_is_the_servos():

@@ -164,7 +164,8 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     )
     nuisance = {"coulomb_friction@shoulder": 9.0}
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
-    searched = [SearchedJoint(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
+    search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
+    searched = [SearchedJoint(case, search, SimpleNamespace(none=trial, best=trial))]
     (own,) = logged_torque.told(
         given[:1], searched, [], None, [SimpleNamespace(joint="shoulder", sound=False)]
     ).values()

@@ -17,6 +17,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run, conditions
 from dexsim.gap.search.fit import intervals
+from dexsim.gap.search.scan import narrowed
 from dexsim.gap.search.search import JointSearch
 
 RUNS = (0, 1, 3)
@@ -62,7 +63,7 @@ def test_an_unknown_column_is_fitted_with_every_hypothesis_and_handed_on(name, t
     assert value == pytest.approx(true, rel=0.15)
     named = EFFECTS[effect]
     variants = named.variants(search.case.scales)
-    labels = [v.label for v in variants if search._narrow(named, v) is not None]
+    labels = [v.label for v in variants if narrowed(search, named, v) is not None]
     mine = [v.label for v in variants if (name,) == v.params[0].columns]
     assert mine and not set(mine) & set(labels), "what is fitted anyway is not named as well"
     table = ServoTable.from_dict({"joints": {"*": SERVO}})
@@ -77,7 +78,7 @@ def test_a_column_that_says_nothing_alone_is_taken_as_absent_and_said():
     said = conclude.not_fitted([search.case])
     assert len(said) == 2 and all("taken as absent" in x for x in said)
     ripple = EFFECTS["torque_ripple"]
-    narrowed = [search._narrow(ripple, v) for v in ripple.variants(search.case.scales)]
+    narrowed = [narrowed(search, ripple, v) for v in ripple.variants(search.case.scales)]
     assert any(v is not None for v in narrowed), "it is still looked for"
 
 

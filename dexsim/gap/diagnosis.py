@@ -40,7 +40,18 @@ from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
-from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
+from dexsim.gap.search.scan import cv_loss, drags_of
+from dexsim.gap.search.search import (
+    JointSearch,
+    Outcome,
+    SearchedJoint,
+    Trial,
+    plain_of,
+    polished,
+    search_joint,
+    settle_found,
+    without_search,
+)
 from dexsim.gap.touch.diagnosis import Touch
 
 
@@ -361,12 +372,12 @@ class Drives(Steps):
         if len(search.long.window) == 0:
             return search, None
         if self.w.limit.seconds is not None and case.moved:
-            search.plain()  # what all else is held against has its time before anything else
+            plain_of(search)  # what all else is held against has its time before anything else
         if case.moved and case.joint not in self.unknown_controllers:
-            found = ringing.answered(search, search.run())
+            found = ringing.answered(search, search_joint(search))
         else:
-            found = search.without_search()
-        search.settle(found)
+            found = without_search(search)
+        settle_found(search, found)
         search.took = time.monotonic() - begun
         self._left -= 1
         self._judged_ahead(search, found)
@@ -389,7 +400,7 @@ class Drives(Steps):
         case, p, known = search.case, self.parts, self.ahead.get(id(search))
         if known or not case.moved:
             return known.plain if known else None
-        return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
+        return baseline.judged(case, plain_of(search), p.test, p.span_test, search.whole)
 
     def _search_longer(self, answers: Answers) -> None:
         """Joints whose share of the limit was too short, searched once more in what the others did not need of theirs:
@@ -504,7 +515,7 @@ class Drives(Steps):
                 found is not None
                 and old is not None
                 and any(m.effect.couples for m in found.best.members)
-                and search._left(found.best).sum() < (1 - SEARCH.least) * old_search._left(old.best).sum()
+                and cv_loss(search, found.best).sum() < (1 - SEARCH.least) * cv_loss(old_search, old.best).sum()
             ):
                 answers[k] = search, found
                 explained.append(k)
@@ -520,7 +531,7 @@ class Drives(Steps):
         groups = [far[i : i + DRAGGERS] for i in range(0, len(far), DRAGGERS)]
         best, which = SEARCH.least, None
         for group in groups:
-            told = search.drags(found.best, dragged_by(case, group))
+            told = drags_of(search, found.best, dragged_by(case, group))
             for other in group:
                 gain, price = told.get(other.joint, (0.0, 1.0))
                 if gain > best and price * len(groups) <= SEARCH.price:
@@ -629,7 +640,7 @@ class Drives(Steps):
                 continue
             begun = time.monotonic()
             claimed = any(case.joint in f.joints and modelled(f) for f in d.findings)
-            trial = search.polish(outcome.best if claimed else outcome.none)
+            trial = polished(search, outcome.best if claimed else outcome.none)
             found = handed_on.fit_stand_in(
                 case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed
             )
@@ -721,8 +732,8 @@ def _follows_better(old: Outcome | None, search: JointSearch, found: Outcome | N
     if old is None or found is None or not old.best.members:
         return False
     fit = search.fitter.given(old.best.members).fit(old.best.fit.params, x0=old.best.fit.x, iterations=0)
-    before = search._here(Trial(old.best.members, fit))
-    return bool(before < (1 - SEARCH.least) * search._here(found.best))
+    before = search.objective(Trial(old.best.members, fit))
+    return bool(before < (1 - SEARCH.least) * search.objective(found.best))
 
 
 def _unsettled(found: Outcome) -> bool:

@@ -29,7 +29,8 @@ from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.hypotheses import unknown
-from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.search.scan import share_removed
+from dexsim.gap.search.search import JointSearch, Outcome, Trial, loss_in_windows, polished, widened
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -216,7 +217,8 @@ def _write(
     """Return what writes a fitted hypothesis of a joint, with intervals, into the files' content; whole: all of it that
     they have a place for."""
     found = trial is a.best
-    bounds = a.bounds if found else a.search.widen(trial, intervals(trial.fit, a.search.blocks, huber=a.search.r.huber))
+    told = intervals(trial.fit, a.search.blocks, huber=a.search.r.huber)
+    bounds = a.bounds if found else widened(a.search, trial, told)
 
     def write(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
         servo_changes(table, a.case, trial, bounds, joints, whole)
@@ -388,11 +390,12 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     not shown goes beyond it."""
     if search.case.told:
         return ""
-    before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
+    before, after = (loss_in_windows(search, polished(search, t), test, span) for t in (outcome.none, outcome.best))
     if before > SEARCH.enough**2 and after < (1 - SEARCH.plainly) * before:
         return "what was held out is followed better from moment to moment, but not by a free run"
     sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
-    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= SEARCH.plainly
+    gain = share_removed(search, outcome.best, outcome.none)
+    plain = outcome.none.fit.loss > SEARCH.enough**2 and gain >= SEARCH.plainly
     return "what was held out does not show it" if sides_with_neither and plain else ""
 
 

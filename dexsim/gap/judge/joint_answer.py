@@ -23,7 +23,8 @@ from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, Fitter, intervals
-from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
+from dexsim.gap.search.hypotheses import JointSearch, Member, Outcome, Trial, subset
+from dexsim.gap.search.search import law_spread, loss_by_run, polished, widened
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
@@ -55,7 +56,7 @@ class JointAnswer:
 
     def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
-        self.best, self.none = search.polish(outcome.best), search.polish(outcome.none)
+        self.best, self.none = polished(search, outcome.best), polished(search, outcome.none)
         self.whole = replace(case, plant=search.whole)
         self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
         rows = self.rows = self.windows.sample_row
@@ -75,10 +76,10 @@ class JointAnswer:
         self.sensed = np.isfinite(self.torque)
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
-        self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, huber=search.r.huber))
+        self.widest = widened(search, self.best, intervals(self.best.fit, search.blocks, huber=search.r.huber))
         told, laws = (
             stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0),
-            search.law_spread(self.best),
+            law_spread(search, self.best),
         )
         self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
@@ -267,7 +268,7 @@ class JointAnswer:
     def _harmed(self, without_it: Trial) -> str:
         """Return why an effect is a hint only: what it gains in some recordings it loses in others, as what differs
         from run to run does; empty where it helps or does nothing in nearly every draw of the recordings."""
-        lost, mine = (self.search.by_run(t) for t in (without_it, self.best))
+        lost, mine = (loss_by_run(self.search, t) for t in (without_it, self.best))
         runs = np.flatnonzero(lost > 0)
         if len(runs) < 3:
             return ""

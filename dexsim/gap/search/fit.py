@@ -94,6 +94,9 @@ class Fitted:
     loss: float
     iterations: int = 0
 
+    def value(self, key: str) -> float:
+        return float(self.x[[p.key for p in self.params].index(key)])
+
 
 class Fitter:
     """Fits parameter sets of one joint on given windows. passed: whether time is up: a fit then ends where it is."""

@@ -275,9 +275,9 @@ PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves 
 MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
 
-class JointHypotheses:
-    """The recordings of one joint and fits to them. train: run indices; span: part of each run to use; folds [R]:
-    condition of each run."""
+class JointSearch:
+    """The recordings of one joint, fits to them, and what a search of its effects (`search.search_joint`) finds.
+    train: run indices; span: part of each run to use; conditions [R]: of each run."""
 
     def __init__(
         self,
@@ -329,9 +329,20 @@ class JointHypotheses:
             ]
         self.blocks = self._blocks(self.fitter, self.long)
         self.shadow = Shadow(self.fitter, (sigma, case.sigma_torque), self.fold_of)
-        self.by_law: dict[str, list[Trial]] = {}  # by effect: the hypothesis by every law that the effect may have
-        self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
-        self._run_free: dict[int, tuple[Trial, np.ndarray]] = {}  # likewise
+        # what it finds as it goes: losses by block without any effect; the best fit by effects; the first of an
+        # effect's laws, by effect and label; what a scan's guesses save in hindsight, and other starts; what each
+        # effect costs when dropped, by condition; by effect the hypothesis by every law that it may have
+        self.none_loss = np.zeros(0)
+        self.fitted: dict[frozenset[str], Trial] = {}
+        self.first_laws: dict[tuple[str, str], Variant] = {}
+        self.saved: list[tuple[float, Member, np.ndarray]] = []
+        self.other_start: dict[str, np.ndarray] = {}
+        self.costs: dict[str, list[float]] = {}
+        self.by_law: dict[str, list[Trial]] = {}
+        # made once: by the trial's id, which is kept so that it stays its own, its polished fit and errors of free runs
+        self.polished: dict[int, tuple[Trial, Trial]] = {}
+        self.run_free: dict[int, tuple[Trial, np.ndarray]] = {}
+        self.plain: list[tuple[list[Param], np.ndarray] | None] = []
         self.all_nuisances = refitted(case)
         self.nuisances = self.all_nuisances
         believed = [
@@ -346,7 +357,7 @@ class JointHypotheses:
         """What is fitted, whole recordings: made once, with what is known of them."""
         return self.case.plant.windows(None, self.train, span=self.span)
 
-    def _on(self, share: float) -> None:
+    def progressed(self, share: float) -> None:
         """Tells that about this share of the work that was left is done: how many effects there are to look for is not
         known before."""
         self._part += (1 - self._part) * share
@@ -361,7 +372,7 @@ class JointHypotheses:
         _, b = np.unique(b, return_inverse=True)
         return np.concatenate([b, b]) if fitter.use_torque else b
 
-    def _params(self, members: tuple[Member, ...]) -> list[Param]:
+    def params_of(self, members: tuple[Member, ...]) -> list[Param]:
         """Return effects' parameters, then the nuisances that act on no column of theirs."""
         mine = [p for m in members for p in named(m)]
         taken = {c for p in mine for c in p.columns}
@@ -413,7 +424,7 @@ class JointHypotheses:
         """Return the fit, looked for nearby too, where it does not follow the data yet."""
         return fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
 
-    def _simulate(self, fitter: Fitter, plants: np.ndarray, s: np.ndarray | None) -> np.ndarray:
+    def simulate(self, fitter: Fitter, plants: np.ndarray, s: np.ndarray | None) -> np.ndarray:
         q, tau = self.case.plant.simulate(plants, fitter.w)
         return fitter.eliminated(fitter.compare(q, tau, plants), s)
 
@@ -422,7 +433,7 @@ class JointHypotheses:
     ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
         """Return (members, where it began, fit on short windows) of a hypothesis, from `starts` of the members'
         parameters."""
-        params = self._params(members)
+        params = self.params_of(members)
         if like is not None:  # what left a trace in that alone starts from there too, not from what was believed
             taken = {c for p in params for c in p.columns}
             more = [p for p in like.fit.params if p in self.all_nuisances and not taken & set(p.columns)]
@@ -489,15 +500,15 @@ class JointHypotheses:
         members, x0, short = self.draft(members, starts, like)
         return self.finish(members, x0, short, like, quick)
 
-    def _asked(self, effect: Effect) -> bool:
+    def asked(self, effect: Effect) -> bool:
         """Return whether an effect is looked for."""
         return self.allowed is None or effect.id in self.allowed
 
-    def _shrunk(self, trial: Trial) -> bool:
+    def shrunk(self, trial: Trial) -> bool:
         """Return whether an effect was fitted down to the size at which it begins: what it gained is another's."""
-        return any(self._nothing_of(m, trial) for m in trial.members)
+        return any(self.nothing_of(m, trial) for m in trial.members)
 
-    def _nothing_of(self, m: Member, trial: Trial) -> bool:
+    def nothing_of(self, m: Member, trial: Trial) -> bool:
         """Return whether a member of a trial was fitted down to the size at which it begins."""
         at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
         first = m.variant.params[0]
@@ -511,7 +522,7 @@ class JointHypotheses:
             and all(abs(at[f"{m.id}.{p.key}"] - p.start) <= 1e-3 * p.span for p in others)
         )
 
-    def _here(self, trial: Trial) -> float:
+    def objective(self, trial: Trial) -> float:
         """Mean square where it was fitted, with what the beliefs give for it."""
         return trial.fit.loss + disbelief(trial.fit.params, trial.fit.x) / len(self.blocks)
 

@@ -34,6 +34,7 @@ from dexsim.gap.search.inverse_dynamics import (
     sums,
     unphysical,
 )
+from dexsim.gap.search.search import polished
 
 if TYPE_CHECKING:
     Spans = dict[int, tuple[float, float]]  # by run: the part [s from its start] to keep to
@@ -232,7 +233,7 @@ def told(
         if not case.told or case.joint not in by:
             continue
         search = by[case.joint].search
-        trial = search.polish(by[case.joint].outcome.best)
+        trial = polished(search, by[case.joint].outcome.best)
         claimed = {c for m in trial.members for p in m.variant.params for c in p.columns}
         known = [
             n

@@ -27,8 +27,8 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param, expand, neutral_of
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Box
-from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, subset, thin
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, JointSearch, Member, Outcome, Trial, subset, thin
+from dexsim.gap.search.scan import narrowed
 
 APART = (1, 2, 3)  # samples between a reading and those that it is compared with
 SETTLES = 0.25  # s of a window before it is looked at: what was let go at a measured state swings in
@@ -161,7 +161,7 @@ class Ringing:
         own = len(member.variant.params)
         taken = {c for p in member.variant.params for c in p.columns}
         # as in a fit: keys of the effect's own parameters are unique in the hypothesis
-        params = [p for p in search._params((member,)) if not p.nuisance]
+        params = [p for p in search.params_of((member,)) if not p.nuisance]
         params += [p for p in search.all_nuisances if not taken & set(p.columns)]
         box = Box(params)
         low, high = box.low, box.high
@@ -220,13 +220,13 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     if swings.loud.sum() < SEARCH.shaking:
         return found
     before = swings.of(found.best)
-    asked = [e for e in CATALOGUE if e.rings and search._asked(e)]
+    asked = [e for e in CATALOGUE if e.rings and search.asked(e)]
     tries: dict[str, tuple[float, Trial]] = {}
     for effect in asked:
         if effect.id in found.best.ids:
             return found  # it is what was found by the motion itself
         for whole in effect.variants(search.case.scales):
-            variant = None if whole.refines or whole.approximate else search._narrow(effect, whole)
+            variant = None if whole.refines or whole.approximate else narrowed(search, effect, whole)
             for law in [] if variant is None else [variant, *variant.by_law()]:
                 if search.deadline.over():
                     continue

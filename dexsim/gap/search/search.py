@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,547 +18,582 @@ from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, huber_square, slopes_of
-from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
-from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
+from dexsim.gap.search.hypotheses import LONG, MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, named, subset
+from dexsim.gap.search.scan import (
+    BOOTSTRAPS,
+    STRETCH,
+    Scanned,
+    cross_validated,
+    cv_loss,
+    earns,
+    expand_one,
+    gain_by_condition,
+    narrowed,
+    price_factor,
+    priced_loss,
+    refolded,
+    scan_catalogue,
+    share_removed,
+    shortlisted,
+    with_hinted,
+)
 
+Pool = dict[str, tuple[Member, np.ndarray]]
+"""By effect: what may stand in another's place, and where its fit begins."""
+Rivals = dict[str, tuple[list[tuple[str, float]], float, float]]
+"""By member: what else in its place would do with its share of bootstraps, its confidence, its gain."""
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
+LISTED = 6  # effects of a short list
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
 
 
-class JointSelection(JointScan):
-    """The selection of one joint's effects."""
-
-    def run(self, shortlist: int = 6) -> Outcome:
-        """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
-        self.fitted: dict[frozenset, Trial] = {}
-        self.first_laws: dict[tuple[str, str], Variant] = {}  # by effect and the label of one of its laws
-        none = self.start()
-        self.none_loss = self._left(none)
-        self._on(0.1)
-        current = none
-        gains: dict[str, float] = {}
-        price: dict[str, float] = {}
-        scanned: list[tuple[str, float, float]] = []
-        rivals: dict[str, list[tuple[str, float]]] = {}
-        confidence: dict[str, float] = {}
-        per = len(self.blocks)
-        pool: dict[str, tuple[Member, np.ndarray]] = {}
-        level: list[Trial] = []
-        forks: list[Trial] = []
-        for _ in range(SEARCH.most):
-            loss = self._left(current).sum() / per
-            enough = loss < SEARCH.enough**2
-            if (enough and current.members) or self.deadline.over():
-                break
-            scan = self.scan(current)
-            self._on(0.06)
-            if not scanned:
-                scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
-            if not scan:
-                break
-            listed = self._shortlist(scan, shortlist, loss, current.members)
-            if loss < SEARCH.unsettled:
-                listed = self._hinted([] if enough else listed, current.members, SEARCH.apart)
-            if not listed:
-                break
-            drafts = self._drafts(listed, current, pool, price)
-            for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
-                if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
-                    pool[member.id], price[member.id] = (member, start), p
-            trials = self._finished(drafts, current)
-            best = self._best(trials, current)
-            less = self._begun_again(current, trials)
-            if less is not current:
-                if not current.members:
-                    none, self.none_loss = less, self._left(less)
-                    self.fitted.clear()
-                else:
-                    self.fitted[frozenset(less.ids)] = less
-                current = less
-                if not self._earns(
-                    best, current
-                ):  # the fit without it had stopped short: what is missing is looked for anew
-                    continue
-                self.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
-            if enough and self.gain(best, current) < SEARCH.clear:
-                break
-            if not self._earns(best, current):
-                # a pair may be there where neither of its halves is seen alone
-                best = current if enough or self.deadline.over() else self._pair(current, listed[:3]) or current
-                if best is current:
-                    instead = self._in_its_place(trials, current)
-                    if instead is current:
-                        break
-                    current = instead
-                    continue
-            rest, last = best.members[:-1], best.ids[-1]
-            forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
-            current, level = best, trials
-            if self._left(current).sum() / per > SEARCH.unsettled and not self.deadline.over():
-                current = self._by_laws(current)  # before what its law gets wrong is taken for a further effect
-            if len(current.members) > 1 and not self.deadline.over():
-                current, level = self._swap(current, pool, level)
-        current = self._from_plain(self._beside_alike(forks, current, shortlist, pool, price))
-        if not self.deadline.over():
-            current = self._more_general(self._by_laws(self._refine(self._approximate(self._drop(current)))))
-        self._on(0.1)
-        current, final = self._settled(current, pool)
-        for m in current.members:
-            rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
-            price.setdefault(m.id, 0.0)
-        return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
-
-    def _beside_alike(
-        self,
-        forks: Sequence[Trial],
-        current: Trial,
-        shortlist: int,
-        pool: dict[str, tuple[Member, np.ndarray]],
-        price: dict[str, float],
-    ) -> Trial:
-        """Return what one effect more makes of hypotheses with what is the same torque while the joint moves in the
-        place of what was added (`nested`): which of them it is may show beside another effect only. `current` where
-        none lasts better, or little is left."""
-        best = current
-        for fork in forks:
-            loss = self._left(fork).sum() / len(self.blocks)
-            if loss < SEARCH.unsettled or self.deadline.over():
+def search_joint(search: JointSearch) -> Outcome:
+    """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
+    search.fitted, search.first_laws = {}, {}
+    none = search.start()
+    search.none_loss = cv_loss(search, none)
+    search.progressed(0.1)
+    current = none
+    price: dict[str, float] = {}
+    scanned: list[tuple[str, float, float]] = []
+    per = len(search.blocks)
+    pool: Pool = {}
+    forks: list[Trial] = []
+    for _ in range(SEARCH.most):
+        loss = cv_loss(search, current).sum() / per
+        enough = loss < SEARCH.enough**2
+        if (enough and current.members) or search.deadline.over():
+            break
+        scan = scan_catalogue(search, current)
+        search.progressed(0.06)
+        if not scanned:
+            scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
+        if not scan:
+            break
+        listed = shortlisted(scan, LISTED, loss, current.members)
+        if loss < SEARCH.unsettled:
+            listed = with_hinted(search, [] if enough else listed, current.members, SEARCH.apart)
+        if not listed:
+            break
+        drafts = drafts_of(search, listed, current, pool, price)
+        for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
+            if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
+                pool[member.id], price[member.id] = (member, start), p
+        trials = finished_drafts(search, drafts, current)
+        best = best_of(search, trials, current)
+        less = begun_again(search, current, trials)
+        if less is not current:
+            if not current.members:
+                none, search.none_loss = less, cv_loss(search, less)
+                search.fitted.clear()
+            else:
+                search.fitted[frozenset(less.ids)] = less
+            current = less
+            if not earns(
+                search, best, current
+            ):  # the fit without it had stopped short: what is missing is looked for anew
                 continue
-            listed = self._shortlist(self.scan(fork), shortlist, loss, fork.members)
-            if not listed:
+            search.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
+        if enough and share_removed(search, best, current) < SEARCH.clear:
+            break
+        if not earns(search, best, current):
+            # a pair may be there where neither of its halves is seen alone
+            best = current if enough or search.deadline.over() else best_pair(search, current, listed[:3]) or current
+            if best is current:
+                instead = in_its_place(search, trials, current)
+                if instead is current:
+                    break
+                current = instead
                 continue
-            more = self._best(self._finished(self._drafts(listed, fork, pool, price), fork), fork)
-            if self._earns(more, fork) and self._score(more) < self._score(best) and more.fit.loss < best.fit.loss:
-                best = more
-        return best
+        rest, last = best.members[:-1], best.ids[-1]
+        forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
+        current = best
+        if cv_loss(search, current).sum() / per > SEARCH.unsettled and not search.deadline.over():
+            current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
+        if len(current.members) > 1 and not search.deadline.over():
+            current = swapped(search, current, pool)
+    current = from_plain(search, beside_alike(search, forks, current, pool, price))
+    if not search.deadline.over():
+        for move in (dropped, approximated, refined_members, by_laws, more_general):
+            current = move(search, current)
+    search.progressed(0.1)
+    current, final = settled(search, current, pool)
+    rivals, confidence, gains = ({e: x[k] for e, x in final.items()} for k in range(3))
+    for e in final:
+        price.setdefault(e, 0.0)
+    return Outcome(search.case.joint, none, current, rivals, confidence, gains, price, scanned, search.costs)
 
-    def _more_general(self, current: Trial) -> Trial:
-        """Return `current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
-        unknown anyway only that it differs by direction is found, which is a spring without stiffness, and on a joint
-        that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
-        general one leaves."""
-        for member in current.members:
-            more = [e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids]
-            if not more:
+
+def beside_alike(
+    search: JointSearch,
+    forks: Sequence[Trial],
+    current: Trial,
+    pool: Pool,
+    price: dict[str, float],
+) -> Trial:
+    """Return what one effect more makes of hypotheses with what is the same torque while the joint moves in the
+    place of what was added (`nested`): which of them it is may show beside another effect only. `current` where
+    none lasts better, or little is left."""
+    best = current
+    for fork in forks:
+        loss = cv_loss(search, fork).sum() / len(search.blocks)
+        if loss < SEARCH.unsettled or search.deadline.over():
+            continue
+        listed = shortlisted(scan_catalogue(search, fork), LISTED, loss, fork.members)
+        if not listed:
+            continue
+        more = best_of(search, finished_drafts(search, drafts_of(search, listed, fork, pool, price), fork), fork)
+        lasts = earns(search, more, fork) and priced_loss(search, more) < priced_loss(search, best)
+        if lasts and more.fit.loss < best.fit.loss:
+            best = more
+    return best
+
+
+def more_general(search: JointSearch, current: Trial) -> Trial:
+    """Return `current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
+    unknown anyway only that it differs by direction is found, which is a spring without stiffness, and on a joint
+    that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
+    general one leaves."""
+    for member in current.members:
+        more = [e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids]
+        if not more:
+            continue
+        fitted = dict(zip([p.key for p in current.fit.params], current.fit.x, strict=True))
+        columns = {p.columns[0]: float(fitted[f"{member.id}.{p.key}"]) for p in member.variant.params}
+        columns |= {c: float(fitted[c]) for c in EFFECTS[member.id].fitted_anyway if c in fitted}
+        rest = tuple(m for m in current.members if m is not member)
+        for effect in more:
+            starts = effect.begun_from(columns, search.case)
+            if not starts or not search.asked(effect) or search.deadline.over():
                 continue
-            fitted = dict(zip([p.key for p in current.fit.params], current.fit.x, strict=True))
-            columns = {p.columns[0]: float(fitted[f"{member.id}.{p.key}"]) for p in member.variant.params}
-            columns |= {c: float(fitted[c]) for c in EFFECTS[member.id].fitted_anyway if c in fitted}
-            rest = tuple(m for m in current.members if m is not member)
-            for effect in more:
-                starts = effect.begun_from(columns, self.case)
-                if not starts or not self._asked(effect) or self.deadline.over():
-                    continue
-                wider = Member(effect, effect.variants(self.case.scales)[0])
-                if len(columns) == len(member.variant.params) or any(not fits_beside(wider, m) for m in rest):
-                    continue  # its level was found too
-                members = tuple(wider if m is member else m for m in current.members)
-                params = [p for m in members for p in named(m)] + [p for p in current.fit.params if p.nuisance]
-                fits = []
-                for start in starts:  # from what is known to follow, in steps of slopes of its own
-                    fitted |= {p.key: x for p, x in zip(named(wider), start, strict=True)}
-                    x0 = np.array([fitted[p.key] for p in params])
-                    fits.append(self.fitter.given(members).fit(params, x0=x0, iterations=8))
-                new = self.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
-                mine, theirs = (self._left(t).sum() * self._price_factor(t) for t in (current, new))
-                if (1 - SEARCH.least) * theirs < mine and not self._shrunk(new):
-                    self.fitted[frozenset(new.ids)] = new
-                    return new
-        return current
+            wider = Member(effect, effect.variants(search.case.scales)[0])
+            if len(columns) == len(member.variant.params) or any(not fits_beside(wider, m) for m in rest):
+                continue  # its level was found too
+            members = tuple(wider if m is member else m for m in current.members)
+            params = [p for m in members for p in named(m)] + [p for p in current.fit.params if p.nuisance]
+            fits = []
+            for start in starts:  # from what is known to follow, in steps of slopes of its own
+                fitted |= {p.key: x for p, x in zip(named(wider), start, strict=True)}
+                x0 = np.array([fitted[p.key] for p in params])
+                fits.append(search.fitter.given(members).fit(params, x0=x0, iterations=8))
+            new = search.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
+            mine, theirs = (cv_loss(search, t).sum() * price_factor(search, t) for t in (current, new))
+            if (1 - SEARCH.least) * theirs < mine and not search.shrunk(new):
+                search.fitted[frozenset(new.ids)] = new
+                return new
+    return current
 
-    def _drafts(
-        self,
-        listed: Sequence[tuple[float, float, Member, np.ndarray]],
-        current: Trial,
-        pool: dict[str, tuple[Member, np.ndarray]],
-        price: dict[str, float],
-    ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
-        """Return the hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted
-        on short windows: those that follow best, the best first. pool, price: by effect, are filled."""
-        drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
-        followed: dict[str, float] = {}
-        begin = lambda x: np.concatenate([*current.values, x])  # noqa: E731
 
-        def drafted(k: int) -> tuple[tuple[Member, ...], np.ndarray, Fitted] | None:
-            _, _, member, start = listed[k]
-            if k and self.deadline.over():
-                return None
-            tries = [self.draft((*current.members, member), begin(start), current)]
-            if k < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
-                tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
-            return min(tries, key=lambda d: d[2].loss)
+def drafts_of(
+    search: JointSearch,
+    listed: Sequence[tuple[float, float, Member, np.ndarray]],
+    current: Trial,
+    pool: Pool,
+    price: dict[str, float],
+) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
+    """Return the hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted
+    on short windows: those that follow best, the best first. pool, price: by effect, are filled."""
+    drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
+    followed: dict[str, float] = {}
+    begin = lambda x: np.concatenate([*current.values, x])  # noqa: E731
 
-        for (_, p, member, start), draft in zip(listed, map(drafted, range(len(listed))), strict=True):
-            if draft is None:
-                break
-            if member.id not in pool or price.get(member.id, 1.0) > p:
+    def drafted(k: int) -> tuple[tuple[Member, ...], np.ndarray, Fitted] | None:
+        _, _, member, start = listed[k]
+        if k and search.deadline.over():
+            return None
+        tries = [search.draft((*current.members, member), begin(start), current)]
+        if k < 4 and member.id in search.other_start and len(start) == len(search.other_start[member.id]):
+            tries.append(search.draft((*current.members, member), begin(search.other_start[member.id]), current))
+        return min(tries, key=lambda d: d[2].loss)
+
+    for (_, p, member, start), draft in zip(listed, map(drafted, range(len(listed))), strict=True):
+        if draft is None:
+            break
+        if member.id not in pool or price.get(member.id, 1.0) > p:
+            pool[member.id] = (member, start)
+        price[member.id] = p
+        drafts.append(draft)
+        if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
+            if member.id in followed:
                 pool[member.id] = (member, start)
-            price[member.id] = p
-            drafts.append(draft)
-            if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
-                if member.id in followed:
-                    pool[member.id] = (member, start)
-                followed[member.id] = drafts[-1][2].loss
-            self._on(0.03)
-        drafts.sort(key=lambda d: d[2].loss)
-        # how many are looked at: two, and others that may still win when they are fitted on long windows
-        return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
+            followed[member.id] = drafts[-1][2].loss
+        search.progressed(0.03)
+    drafts.sort(key=lambda d: d[2].loss)
+    # how many are looked at: two, and others that may still win when they are fitted on long windows
+    return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
 
-    def _finished(
-        self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
-    ) -> list[Trial]:
-        """Return the drafts fitted on long windows, and judged on what was left out."""
 
-        def finished(k: int) -> Trial | None:
-            return self.finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
+def finished_drafts(
+    search: JointSearch, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
+) -> list[Trial]:
+    """Return the drafts fitted on long windows, and judged on what was left out."""
 
-        each = map(finished, range(len(drafts)))
-        trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
-        least = trials[0].fit.loss
-        # those that may still be the best are looked at closely
-        trials = [
-            self.thorough(t)
-            if not self.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1))
-            else t
-            for k, t in enumerate(trials)
+    def finished(k: int) -> Trial | None:
+        return search.finish(*drafts[k], current) if k == 0 or not search.deadline.over() else None
+
+    each = map(finished, range(len(drafts)))
+    trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
+    least = trials[0].fit.loss
+    # those that may still be the best are looked at closely
+    trials = [
+        search.thorough(t)
+        if not search.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1))
+        else t
+        for k, t in enumerate(trials)
+    ]
+    for trial in trials:
+        search.progressed(0.06)
+        known = search.fitted.get(frozenset(trial.ids))
+        if known is None or trial.fit.loss < known.fit.loss:
+            search.fitted[frozenset(trial.ids)] = trial
+    for trial in trials:
+        cross_validated(search, trial)
+    return trials
+
+
+def best_of(search: JointSearch, trials: Sequence[Trial], current: Trial) -> Trial:
+    """Return the one of the trials that loses least on what was left out; fits of their own decide where what
+    follows best seems to last less, or not to last."""
+    best, close = min(trials, key=partial(priced_loss, search)), min(trials, key=lambda t: t.fit.loss)
+    if close.fit.loss < (1 - SEARCH.tie) * best.fit.loss:
+        two = [refolded(search, t) for t in (best, close)]
+        for t in two:
+            search.fitted[frozenset(t.ids)] = t
+        best = min(two, key=partial(priced_loss, search))
+    if not earns(search, best, current):  # a good fit that seems not to last: is it the fit's, or the step's from it?
+        close = min(trials, key=lambda t: t.fit.loss)
+        if close.fit.loss < (1 - SEARCH.least) * current.fit.loss:
+            best = refolded(search, close)
+            search.fitted[frozenset(best.ids)] = best
+    return best
+
+
+def settled(
+    search: JointSearch, current: Trial, pool: Pool
+) -> tuple[Trial, Rivals]:
+    """Return (the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
+    final = rivals_of(search, current, pool)
+    for _ in range(len(current.members)):
+        better = overtaken(search, current, final)
+        if better is None:
+            break
+        search.fitted[frozenset(current.ids)] = current
+        # what went with the other may not be needed with it
+        current = dropped(search, better) if len(better.members) > 1 else better
+        final = rivals_of(search, current, pool)
+    return current, final
+
+
+def begun_again(search: JointSearch, current: Trial, trials: list[Trial]) -> Trial:
+    """Return the hypothesis fitted again from where those with one effect more ended that follow better: what they
+    refitted, and of that effect what is inside the bounds of a belief. The fit without it may have stopped in a
+    hollow beside; `current` where it had not."""
+    best, params = current, current.fit.params
+    columns = [INDEX[p.columns[0]] for p in params]
+    believed = search.case.plant.base()[0][columns]
+    ahead = [t for t in trials if t.fit.loss < (1 - SEARCH.tie) * current.fit.loss]
+    for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
+        own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
+        at = expand_one(search.case, trial.fit.params, trial.fit.x)[0][columns]
+        x0 = [
+            own.get(p.key, p.start)
+            if not p.nuisance
+            else a / b
+            if p.mode == "factor"
+            else a - b
+            if p.mode == "add"
+            else a
+            for p, a, b in zip(params, at, believed, strict=True)
         ]
-        for trial in trials:
-            self._on(0.06)
-            known = self.fitted.get(frozenset(trial.ids))
-            if known is None or trial.fit.loss < known.fit.loss:
-                self.fitted[frozenset(trial.ids)] = trial
-        for trial in trials:
-            self.cross(trial)
-        return trials
+        fitter = search.fitter.given(current.members)
+        fit = fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit))
+        new = Trial(current.members, fit)
+        if search.objective(new) < (1 - 0.5 * SEARCH.tie) * search.objective(best):
+            new = Trial(current.members, fitter.toward_prior(params, new.fit))
+        if search.objective(new) < (1 - 0.5 * SEARCH.tie) * search.objective(best) and not search.shrunk(new):
+            best = new
+    return best
 
-    def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
-        """Return the one of the trials that loses least on what was left out; fits of their own decide where what
-        follows best seems to last less, or not to last."""
-        best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
-        if close.fit.loss < (1 - SEARCH.tie) * best.fit.loss:
-            two = [self.refold(t) for t in (best, close)]
-            for t in two:
-                self.fitted[frozenset(t.ids)] = t
-            best = min(two, key=self._score)
-        if not self._earns(best, current):  # a good fit that seems not to last: is it the fit's, or the step's from it?
-            close = min(trials, key=lambda t: t.fit.loss)
-            if close.fit.loss < (1 - SEARCH.least) * current.fit.loss:
-                best = self.refold(close)
-                self.fitted[frozenset(best.ids)] = best
-        return best
 
-    def _settled(
-        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
-    ) -> tuple[Trial, dict[str, tuple[list[tuple[str, float]], float, float]]]:
-        """Return (the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
-        final = self.rivals(current, pool)
-        for _ in range(len(current.members)):
-            better = self._overtaken(current, final)
-            if better is None:
-                break
-            self.fitted[frozenset(current.ids)] = current
-            # what went with the other may not be needed with it
-            current = self._drop(better) if len(better.members) > 1 else better
-            final = self.rivals(current, pool)
-        return current, final
+def plain_of(search: JointSearch) -> tuple[list[Param], np.ndarray] | None:
+    """Return the plain model of this joint (`baseline.fitted`), fitted once."""
+    if not search.plain:
+        s = search
+        s.plain.append(baseline.fitted(s.case, s.train, s.span, s.seed, s.deadline.passed))
+    return search.plain[0]
 
-    def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
-        """Return the hypothesis fitted again from where those with one effect more ended that follow better: what they
-        refitted, and of that effect what is inside the bounds of a belief. The fit without it may have stopped in a
-        hollow beside; `current` where it had not."""
-        best, params = current, current.fit.params
-        columns = [INDEX[p.columns[0]] for p in params]
-        believed = self.case.plant.base()[0][columns]
-        ahead = [t for t in trials if t.fit.loss < (1 - SEARCH.tie) * current.fit.loss]
-        for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
-            own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
-            at = expand_one(self.case, trial.fit.params, trial.fit.x)[0][columns]
-            x0 = [
-                own.get(p.key, p.start)
-                if not p.nuisance
-                else a / b
-                if p.mode == "factor"
-                else a - b
-                if p.mode == "add"
-                else a
-                for p, a, b in zip(params, at, believed, strict=True)
-            ]
-            fitter = self.fitter.given(current.members)
-            fit = fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit))
-            new = Trial(current.members, fit)
-            if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best):
-                new = Trial(current.members, fitter.toward_prior(params, new.fit))
-            if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best) and not self._shrunk(new):
-                best = new
-        return best
 
-    def plain(self) -> tuple[list[Param], np.ndarray] | None:
-        """Return the plain model of this joint (`baseline.fitted`), fitted once."""
-        if not hasattr(self, "_plain"):
-            self._plain = baseline.fitted(self.case, self.train, self.span, self.seed, self.deadline.passed)
-        return self._plain
-
-    def _from_plain(self, current: Trial) -> Trial:
-        """Return the effects by which a plain least squares differs from what is believed, all at once and from its
-        figures, where they follow better: of several that are missing together each alone may look like another. Those
-        that do not earn their place are let go. `current` where they do not."""
-        enough = self._left(current).sum() / len(self.blocks) < SEARCH.enough**2
-        if enough or self.deadline.over() or (plain := self.plain()) is None:
-            return current
-        at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
-        members: list[Member] = []
-        starts: list[np.ndarray] = []
-        for effect in CATALOGUE:
-            moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
-            if not moved or not self._asked(effect):
-                continue
-            variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.approximate]
-            variant = self._narrow(effect, variants[0]) if variants else None
-            if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
-                continue
-            values = [
-                _value(p, *at[p.columns[0]], self.case) if p.columns[0] in at else v
-                for p, v in zip(variant.params, variant.starts[0], strict=True)
-            ]
-            members.append(Member(effect, variant))
-            starts.append(np.array(values))
-        if len(members) < 2:
-            return current
-        short = self._short_loss(current)
-        like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
-        draft = self.draft(tuple(members), np.concatenate(starts), like)
-        if draft[2].loss > (1 - SEARCH.least) * short:
-            return current
-        trial = self.thorough(self.finish(*draft, current))
-        if not self._earns(trial, current, further=False):
-            return current
-        return self._drop(trial)
-
-    def _pair(self, current: Trial, listed: Sequence[Scanned]) -> Trial | None:
-        best = None
-        for i, (_, _, m1, s1) in enumerate(listed):
-            for _, _, m2, s2 in listed[i + 1 :]:
-                if m1.id == m2.id or not fits_beside(m1, m2):
-                    continue
-                trial = self.fit(
-                    (*current.members, m1, m2), np.concatenate([*current.values, s1, s2]), current, quick=True
-                )
-                if best is None or trial.fit.loss < best.fit.loss:
-                    best = trial
-        if best is not None and self._earns(best, current):
-            return best
-        return None
-
-    def _short_loss(self, trial: Trial) -> float:
-        """Mean Huber square over short windows."""
-        return _loss(self.scan_fitter, trial)
-
-    def _swap(
-        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]], level: list[Trial]
-    ) -> tuple[Trial, list[Trial]]:
-        """Return each earlier member replaced by others of the pool, while the rest stays."""
-        best = current
-        for i, member in enumerate(current.members[:-1]):
-            rest, kept = current.but(i)
-            for key, (other, start) in list(pool.items()):
-                if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
-                    continue
-                trial = self.fit((*rest, other), np.concatenate([kept, start]), current, quick=True)
-                if (
-                    trial.fit.loss < best.fit.loss
-                    and self._left(trial).sum() < self._left(best).sum()
-                    and not self._shrunk(trial)
-                ):
-                    best = trial
-        return best, level
-
-    def _in_its_place(self, trials: Sequence[Trial], current: Trial) -> Trial:
-        """Return what was added in the place of what was fitted down to nothing beside it, which had only looked like
-        it; `current` where no trial that follows far better has such a member."""
-        for trial in sorted(trials, key=lambda t: t.fit.loss):
-            if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or self.deadline.over():
-                break
-            nothing = [k for k, m in enumerate(trial.members) if self._nothing_of(m, trial)]
-            if not 0 < len(nothing) < len(trial.members) or len(trial.members) - 1 in nothing:
-                continue
-            alone = self.fit(*trial.but(*nothing), trial)
-            lasts = self._left(alone).sum() < (1 - SEARCH.least) * self._left(current).sum()
-            if lasts and not self._shrunk(alone):
-                return alone
+def from_plain(search: JointSearch, current: Trial) -> Trial:
+    """Return the effects by which a plain least squares differs from what is believed, all at once and from its
+    figures, where they follow better: of several that are missing together each alone may look like another. Those
+    that do not earn their place are let go. `current` where they do not."""
+    enough = cv_loss(search, current).sum() / len(search.blocks) < SEARCH.enough**2
+    if enough or search.deadline.over() or (plain := plain_of(search)) is None:
         return current
-
-    def _drop(self, current: Trial) -> Trial:
-        """Return members that no longer earn their place are let go."""
-        changed = True
-        while changed and len(current.members) > 1:
-            changed = False
-            for i in range(len(current.members)):
-                less = self.fit(*current.but(i), current, quick=True)
-                if not self._earns(current, less):
-                    current, changed = less, True
-                    break
+    at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
+    members: list[Member] = []
+    starts: list[np.ndarray] = []
+    for effect in CATALOGUE:
+        moved = [c for c in effect.plain if c in at and c not in search.wide and _differs(*at[c], search.case)]
+        if not moved or not search.asked(effect):
+            continue
+        variants = [v for v in effect.variants(search.case.scales) if not v.refines and not v.approximate]
+        variant = narrowed(search, effect, variants[0]) if variants else None
+        if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
+            continue
+        values = [
+            _value(p, *at[p.columns[0]], search.case) if p.columns[0] in at else v
+            for p, v in zip(variant.params, variant.starts[0], strict=True)
+        ]
+        members.append(Member(effect, variant))
+        starts.append(np.array(values))
+    if len(members) < 2:
         return current
+    short = short_loss(search, current)
+    like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
+    draft = search.draft(tuple(members), np.concatenate(starts), like)
+    if draft[2].loss > (1 - SEARCH.least) * short:
+        return current
+    trial = search.thorough(search.finish(*draft, current))
+    if not earns(search, trial, current, further=False):
+        return current
+    return dropped(search, trial)
 
-    def _refine(self, current: Trial) -> Trial:
-        """Return members with more parameters (an elasticity that hardens), where those earn their place."""
-        for i, member in enumerate(current.members):
-            for whole in member.effect.variants(self.case.scales):
-                variant = self._narrow(member.effect, whole) if whole.refines else None
-                if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
+
+def best_pair(search: JointSearch, current: Trial, listed: Sequence[Scanned]) -> Trial | None:
+    best = None
+    for i, (_, _, m1, s1) in enumerate(listed):
+        for _, _, m2, s2 in listed[i + 1 :]:
+            if m1.id == m2.id or not fits_beside(m1, m2):
+                continue
+            trial = search.fit(
+                (*current.members, m1, m2), np.concatenate([*current.values, s1, s2]), current, quick=True
+            )
+            if best is None or trial.fit.loss < best.fit.loss:
+                best = trial
+    if best is not None and earns(search, best, current):
+        return best
+    return None
+
+
+def short_loss(search: JointSearch, trial: Trial) -> float:
+    """Mean Huber square over short windows."""
+    return _loss(search.scan_fitter, trial)
+
+
+def swapped(search: JointSearch, current: Trial, pool: Pool) -> Trial:
+    """Return each earlier member replaced by others of the pool, while the rest stays."""
+    best = current
+    for i, member in enumerate(current.members[:-1]):
+        rest, kept = current.but(i)
+        for key, (other, start) in list(pool.items()):
+            if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
+                continue
+            trial = search.fit((*rest, other), np.concatenate([kept, start]), current, quick=True)
+            if (
+                trial.fit.loss < best.fit.loss
+                and cv_loss(search, trial).sum() < cv_loss(search, best).sum()
+                and not search.shrunk(trial)
+            ):
+                best = trial
+    return best
+
+
+def in_its_place(search: JointSearch, trials: Sequence[Trial], current: Trial) -> Trial:
+    """Return what was added in the place of what was fitted down to nothing beside it, which had only looked like
+    it; `current` where no trial that follows far better has such a member."""
+    for trial in sorted(trials, key=lambda t: t.fit.loss):
+        if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or search.deadline.over():
+            break
+        nothing = [k for k, m in enumerate(trial.members) if search.nothing_of(m, trial)]
+        if not 0 < len(nothing) < len(trial.members) or len(trial.members) - 1 in nothing:
+            continue
+        alone = search.fit(*trial.but(*nothing), trial)
+        lasts = cv_loss(search, alone).sum() < (1 - SEARCH.least) * cv_loss(search, current).sum()
+        if lasts and not search.shrunk(alone):
+            return alone
+    return current
+
+
+def dropped(search: JointSearch, current: Trial) -> Trial:
+    """Return members that no longer earn their place are let go."""
+    changed = True
+    while changed and len(current.members) > 1:
+        changed = False
+        for i in range(len(current.members)):
+            less = search.fit(*current.but(i), current, quick=True)
+            if not earns(search, current, less):
+                current, changed = less, True
+                break
+    return current
+
+
+def refined_members(search: JointSearch, current: Trial) -> Trial:
+    """Return members with more parameters (an elasticity that hardens), where those earn their place."""
+    for i, member in enumerate(current.members):
+        for whole in member.effect.variants(search.case.scales):
+            variant = narrowed(search, member.effect, whole) if whole.refines else None
+            if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
+                continue
+            values = current.values
+            known = dict(zip([p.key for p in member.variant.params], values[i], strict=True))
+            members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+            extra = {
+                tuple(v for p, v in zip(variant.params, start, strict=True) if p.key not in known): start
+                for start in variant.starts
+            }
+            tries = []
+            for start in extra.values():
+                values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
+                tries.append(search.draft(members, np.concatenate(values), current))
+            more = search.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
+            if earns(search, more, current, further=False) and priced_loss(search, more) < priced_loss(search, current):
+                current = more
+                break
+    return current
+
+
+def approximated(search: JointSearch, current: Trial) -> Trial:
+    """Return the members that are confused with an effect replaced by a law of it that training has less exactly
+    (`Variant.approximate`), where they leave more than noise and that law leaves but `SEARCH.approximate` of what
+    is more.
+
+    Asked too in the place of what is confused with their likes: before that law is tried, which of several
+    imitations follows best (dry friction, or one that falls off with speed) is an accident, and what it lacks
+    seems to be others."""
+    mine, noise = cv_loss(search, current).sum(), float(len(search.blocks))
+    if mine < SEARCH.unsettled * noise:
+        return current
+    best, count = current, range(len(current.members))
+    for effect in CATALOGUE:
+        laws = [v for v in effect.variants(search.case.scales) if v.approximate]
+        if not laws or not search.asked(effect):
+            continue
+        likes = [e.id for e in CATALOGUE if confusable(effect.id, e.id)]
+        near = tuple(k for k in count if not confusable(effect.id, current.members[k].id))
+        far = tuple(k for k in near if not any(confusable(e, current.members[k].id) for e in likes))
+        for rest in dict.fromkeys((near, far)):
+            others, kept = current.but(*(k for k in count if k not in rest))
+            for variant in laws if len(rest) < len(count) else ():
+                if search.deadline.over():
+                    return best
+                member = Member(effect, variant)
+                if any(not fits_beside(member, m) for m in others):
                     continue
-                values = current.values
-                known = dict(zip([p.key for p in member.variant.params], values[i], strict=True))
-                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
-                extra = {
-                    tuple(v for p, v in zip(variant.params, start, strict=True) if p.key not in known): start
+                drafts = [
+                    search.draft((*others, member), np.concatenate([kept, np.array(start)]), current)
                     for start in variant.starts
-                }
-                tries = []
-                for start in extra.values():
-                    values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
-                    tries.append(self.draft(members, np.concatenate(values), current))
-                more = self.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
-                if self._earns(more, current, further=False) and self._score(more) < self._score(current):
-                    current = more
-                    break
-        return current
+                ]
+                trial = search.finish(*min(drafts, key=lambda d: d[2].loss), current)
+                left = cv_loss(search, trial).sum()
+                far_more = left - noise < SEARCH.approximate * (mine - noise)
+                if far_more and left < cv_loss(search, best).sum() and not search.shrunk(trial):
+                    best = trial
+    return best if best is current else dropped(search, best)  # what made up for the imitations may not be needed
 
-    def _approximate(self, current: Trial) -> Trial:
-        """Return the members that are confused with an effect replaced by a law of it that training has less exactly
-        (`Variant.approximate`), where they leave more than noise and that law leaves but `SEARCH.approximate` of what
-        is more.
 
-        Asked too in the place of what is confused with their likes: before that law is tried, which of several
-        imitations follows best (dry friction, or one that falls off with speed) is an accident, and what it lacks
-        seems to be others."""
-        mine, noise = self._left(current).sum(), float(len(self.blocks))
-        if mine < SEARCH.unsettled * noise:
-            return current
-        best, count = current, range(len(current.members))
-        for effect in CATALOGUE:
-            laws = [v for v in effect.variants(self.case.scales) if v.approximate]
-            if not laws or not self._asked(effect):
+def by_laws(search: JointSearch, current: Trial) -> Trial:
+    """Return each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits
+    by the others kept beside it, so that intervals hold what the law is not known to be."""
+    for i, member in enumerate(current.members):
+        tries = [current]
+        for variant in laws_of(search, member):
+            members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+            tries.append(search.fit(members, np.concatenate(current.values), current, quick=True))
+        current = min(tries, key=partial(priced_loss, search))
+        search.by_law[member.id] = tries
+    return current
+
+
+def laws_of(search: JointSearch, member: Member) -> list[Variant]:
+    """Return the other laws of a hypothesis' effect, the first among them where a later one has taken its place."""
+    first = search.first_laws.get((member.id, member.variant.label), member.variant)
+    laws = [first, *first.by_law()]
+    search.first_laws |= {(member.id, v.label): first for v in laws}
+    return [v for v in laws if v.label != member.variant.label]
+
+
+def overtaken(
+    search: JointSearch, current: Trial, final: Rivals
+) -> Trial | None:
+    """Return the hypothesis in which a rival stands in the place of the member that it beats in most bootstraps;
+    None where each holds its own."""
+    ahead = []
+    for k, m in enumerate(current.members):
+        others, share, _ = final[m.id]
+        if others:
+            rival = others[0][0]
+            if rival in EFFECTS[m.id].nests:  # it had its turn (`more_general`)
                 continue
-            likes = [e.id for e in CATALOGUE if confusable(effect.id, e.id)]
-            near = tuple(k for k in count if not confusable(effect.id, current.members[k].id))
-            far = tuple(k for k in near if not any(confusable(e, current.members[k].id) for e in likes))
-            for rest in dict.fromkeys((near, far)):
-                others, kept = current.but(*(k for k in count if k not in rest))
-                for variant in laws if len(rest) < len(count) else ():
-                    if self.deadline.over():
-                        return best
-                    member = Member(effect, variant)
-                    if any(not fits_beside(member, m) for m in others):
-                        continue
-                    drafts = [
-                        self.draft((*others, member), np.concatenate([kept, np.array(start)]), current)
-                        for start in variant.starts
-                    ]
-                    trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
-                    left = self._left(trial).sum()
-                    far_more = left - noise < SEARCH.approximate * (mine - noise)
-                    if far_more and left < self._left(best).sum() and not self._shrunk(trial):
-                        best = trial
-        return best if best is current else self._drop(best)  # what made up for the imitations may not be needed
+            # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
+            like = (
+                sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival))
+                if not confusable(rival, m.id)
+                else 0.0
+            )
+            ahead.append((others[0][1] - share - like, k, rival))
+    for lead, k, rival in sorted(ahead, reverse=True):
+        better = search.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
+        if lead > SEARCH.lead and better is not None and not search.shrunk(better):
+            return better
+    return None
 
-    def _by_laws(self, current: Trial) -> Trial:
-        """Return each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits
-        by the others kept beside it, so that intervals hold what the law is not known to be."""
-        for i, member in enumerate(current.members):
-            tries = [current]
-            for variant in self._laws_of(member):
-                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
-                tries.append(self.fit(members, np.concatenate(current.values), current, quick=True))
-            current = min(tries, key=self._score)
-            self.by_law[member.id] = tries
-        return current
 
-    def _laws_of(self, member: Member) -> list[Variant]:
-        """Return the other laws of a hypothesis' effect, the first among them where a later one has taken its place."""
-        first = self.first_laws.get((member.id, member.variant.label), member.variant)
-        laws = [first, *first.by_law()]
-        self.first_laws |= {(member.id, v.label): first for v in laws}
-        return [v for v in laws if v.label != member.variant.label]
-
-    def _overtaken(
-        self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]
-    ) -> Trial | None:
-        """Return the hypothesis in which a rival stands in the place of the member that it beats in most bootstraps;
-        None where each holds its own."""
-        ahead = []
-        for k, m in enumerate(current.members):
-            others, share, _ = final[m.id]
-            if others:
-                rival = others[0][0]
-                if rival in EFFECTS[m.id].nests:  # it had its turn (`_more_general`)
+def rivals_of(
+    search: JointSearch, current: Trial, pool: Pool
+) -> Rivals:
+    """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
+    out = {}
+    search.costs = {}
+    mine = cv_loss(search, current)
+    short = short_loss(search, current)
+    for i, member in enumerate(current.members):
+        rest, kept = current.but(i)
+        without = search.fit(rest, kept, current, quick=True) if rest else None
+        lost = cv_loss(search, without) if without else search.none_loss
+        search.costs[member.id] = gain_by_condition(search, lost, mine)
+        others: list[Trial] = []
+        for key, (other, start) in pool.items():
+            if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
+                continue
+            known = search.fitted.get(frozenset((key, *(m.id for m in rest))))
+            if known is None and len(others) >= 3 and not confusable(key, member.id):
+                continue
+            if known is None and search.deadline.over():
+                search.unasked |= {member.id} if confusable(key, member.id) else set()
+                continue
+            trial = known
+            if trial is None:
+                draft = search.draft((*rest, other), np.concatenate([kept, start]), current)
+                # one that cannot follow even short stretches is no rival
+                if draft[2].loss > SEARCH.rival * max(short, 1.0):
                     continue
-                # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
-                like = (
-                    sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival))
-                    if not confusable(rival, m.id)
-                    else 0.0
-                )
-                ahead.append((others[0][1] - share - like, k, rival))
-        for lead, k, rival in sorted(ahead, reverse=True):
-            better = self.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
-            if lead > SEARCH.lead and better is not None and not self._shrunk(better):
-                return better
-        return None
+                trial = search.finish(*draft, current, quick=True)
+            search.progressed(0.05)
+            search.fitted[frozenset(trial.ids)] = trial
+            # one that cannot follow even what it was fitted to is no rival
+            if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
+                cross_validated(search, trial)
+                others.append(trial)
+        priced = [cv_loss(search, t) * price_factor(search, t) for t in others]
+        table = np.stack([mine * price_factor(search, current), *priced, lost])
+        drawn = intervals.stretches(table.shape[1], STRETCH, search.rng, BOOTSTRAPS)
+        shares = intervals.wins(table, drawn, SEARCH.apart)
+        rows = [
+            (next(x for x in t.ids if x not in {m.id for m in rest}), float(s))
+            for t, s in zip(others, shares[1:-1], strict=True)
+        ]
+        rows.sort(key=lambda r: -r[1])
+        out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
+    return out
 
-    def rivals(
-        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
-    ) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
-        """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
-        out = {}
-        self.costs: dict[str, list[float]] = {}
-        mine = self._left(current)
-        short = self._short_loss(current)
-        for i, member in enumerate(current.members):
-            rest, kept = current.but(i)
-            without = self.fit(rest, kept, current, quick=True) if rest else None
-            lost = self._left(without) if without else self.none_loss
-            self.costs[member.id] = self._by_condition(lost, mine)
-            others: list[Trial] = []
-            for key, (other, start) in pool.items():
-                if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
-                    continue
-                known = self.fitted.get(frozenset((key, *(m.id for m in rest))))
-                if known is None and len(others) >= 3 and not confusable(key, member.id):
-                    continue
-                if known is None and self.deadline.over():
-                    self.unasked |= {member.id} if confusable(key, member.id) else set()
-                    continue
-                trial = known
-                if trial is None:
-                    draft = self.draft((*rest, other), np.concatenate([kept, start]), current)
-                    # one that cannot follow even short stretches is no rival
-                    if draft[2].loss > SEARCH.rival * max(short, 1.0):
-                        continue
-                    trial = self.finish(*draft, current, quick=True)
-                self._on(0.05)
-                self.fitted[frozenset(trial.ids)] = trial
-                # one that cannot follow even what it was fitted to is no rival
-                if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
-                    self.cross(trial)
-                    others.append(trial)
-            priced = [self._left(t) * self._price_factor(t) for t in others]
-            table = np.stack([mine * self._price_factor(current), *priced, lost])
-            drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
-            shares = intervals.wins(table, drawn, SEARCH.apart)
-            rows = [
-                (next(x for x in t.ids if x not in {m.id for m in rest}), float(s))
-                for t, s in zip(others, shares[1:-1], strict=True)
-            ]
-            rows.sort(key=lambda r: -r[1])
-            out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
-        return out
 
-    def without_search(self) -> Outcome:
-        """No search: the nuisances alone."""
-        self.fitted = {}
-        none = self.start()
-        self.none_loss = self._left(none)
-        return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
+def without_search(search: JointSearch) -> Outcome:
+    """No search: the nuisances alone."""
+    search.fitted = {}
+    none = search.start()
+    search.none_loss = cv_loss(search, none)
+    return Outcome(search.case.joint, none, none, {}, {}, {}, {}, [])
 
 
 def _loss(fitter: Fitter, trial: Trial) -> float:
@@ -586,137 +622,143 @@ FINER = 2  # steps of whole recordings, where an effect was found, in one of the
 PIN = 1e-6  # of room for what is held at a value
 
 
-class JointSearch(JointSelection):
-    """The search on one joint: hypotheses (`JointHypotheses`), their losses on what was left out (`JointLosses`),
-    the scan (`JointScan`), the selection (`JointSelection`), and what was found on whole recordings."""
+def law_spread(search: JointSearch, trial: Trial) -> np.ndarray:
+    """Return [P, 2] lowest and highest value of each parameter over the laws that do about as well: within twice
+    `SEARCH.apart` of the loss on what was left out."""
+    x = trial.fit.x
+    out = np.stack([x, x], 1)
+    at = {p.key: i for i, p in enumerate(trial.fit.params)}
+    for tries in search.by_law.values():
+        least = min(float(cv_loss(search, t).sum()) for t in tries)
+        for t in tries:
+            if t.ids != trial.ids or float(cv_loss(search, t).sum()) > (1 + 2 * SEARCH.apart) * least:
+                continue
+            for p, value in zip(t.fit.params, t.fit.x, strict=True):
+                if not p.nuisance and p.key in at:
+                    out[at[p.key]] = min(out[at[p.key], 0], value), max(out[at[p.key], 1], value)
+    return out
 
-    def law_spread(self, trial: Trial) -> np.ndarray:
-        """Return [P, 2] lowest and highest value of each parameter over the laws that do about as well: within twice
-        `SEARCH.apart` of the loss on what was left out."""
-        x = trial.fit.x
-        out = np.stack([x, x], 1)
-        at = {p.key: i for i, p in enumerate(trial.fit.params)}
-        for tries in self.by_law.values():
-            least = min(float(self._left(t).sum()) for t in tries)
-            for t in tries:
-                if t.ids != trial.ids or float(self._left(t).sum()) > (1 + 2 * SEARCH.apart) * least:
-                    continue
-                for p, value in zip(t.fit.params, t.fit.x, strict=True):
-                    if not p.nuisance and p.key in at:
-                        out[at[p.key]] = min(out[at[p.key], 0], value), max(out[at[p.key], 1], value)
-        return out
 
-    def settle(self, found: Outcome) -> None:
-        """What was found, and nothing, as they are judged: on whole recordings, in shorter steps where an effect was
-        found (where a joint sticks, or rattles in a dead zone, a millisecond leaves errors beyond the noise)."""
-        if found.best.members:
-            if not self.deadline.over():
-                found.best = self._simpler(found.best)
-            self.whole = self.case.plant.refined(FINER)
-        self._on(0.3)
-        self.polish(found.best), self.polish(found.none)  # kept for the judgement
+def settle_found(search: JointSearch, found: Outcome) -> None:
+    """What was found, and nothing, as they are judged: on whole recordings, in shorter steps where an effect was
+    found (where a joint sticks, or rattles in a dead zone, a millisecond leaves errors beyond the noise)."""
+    if found.best.members:
+        if not search.deadline.over():
+            found.best = simpler(search, found.best)
+        search.whole = search.case.plant.refined(FINER)
+    search.progressed(0.3)
+    polished(search, found.best), polished(search, found.none)  # kept for the judgement
 
-    def _simpler(self, trial: Trial) -> Trial:
-        """Return the trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without:
-        slopes stall at such kinks, and what was held out may go beyond what told them."""
-        params = trial.fit.params
-        away = [
-            p.key
-            for p, x in zip(params, trial.fit.x, strict=True)
-            if p.key in MAYBE and abs(x - MAYBE[p.key]) > AWAY * p.span
+
+def simpler(search: JointSearch, trial: Trial) -> Trial:
+    """Return the trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without:
+    slopes stall at such kinks, and what was held out may go beyond what told them."""
+    params = trial.fit.params
+    away = [
+        p.key
+        for p, x in zip(params, trial.fit.x, strict=True)
+        if p.key in MAYBE and abs(x - MAYBE[p.key]) > AWAY * p.span
+    ]
+    best = trial
+    for back in [{k} for k in away] + [set(away)] * (len(away) > 1):
+        pinned = [
+            replace(p, low=MAYBE[p.key] - PIN, high=MAYBE[p.key] + PIN, start=MAYBE[p.key]) if p.key in back else p
+            for p in params
         ]
-        best = trial
-        for back in [{k} for k in away] + [set(away)] * (len(away) > 1):
-            pinned = [
-                replace(p, low=MAYBE[p.key] - PIN, high=MAYBE[p.key] + PIN, start=MAYBE[p.key]) if p.key in back else p
-                for p in params
-            ]
-            new = Trial(trial.members, self.fitter.given(trial.members).fit(pinned, x0=trial.fit.x, iterations=6))
-            if self._here(new) < (1 + 2 * SEARCH.tie) * self._here(trial):  # the more of them go back, the better
-                best = new
-        if best is not trial:
-            self.cross(best)
-        return best
+        new = Trial(trial.members, search.fitter.given(trial.members).fit(pinned, x0=trial.fit.x, iterations=6))
+        # the more of them go back, the better
+        if search.objective(new) < (1 + 2 * SEARCH.tie) * search.objective(trial):
+            best = new
+    if best is not trial:
+        cross_validated(search, best)
+    return best
 
-    def polish(self, trial: Trial) -> Trial:
-        """Return the trial refitted on whole training recordings run free from their first sample, where that follows
-        them better than the windows' fit: state carried over windows is right there. Done once a trial."""
-        if id(trial) not in self._polished:
-            self._polished[id(trial)] = trial, self._polish(trial)
-        return self._polished[id(trial)][1]
 
-    def _polish(self, trial: Trial) -> Trial:
-        if self.deadline.over():
-            return trial
-        plant = self.whole
-        coarse = self.fitted_whole  # in the steps of the windows' fit
-        whole = coarse if plant is self.case.plant else plant.windows(None, self.train, span=self.span)
-        r = Residuals(self.r.sigma_q, self.r.sigma_torque, huber=max(self.r.huber, 3.0))
-        fitter = Fitter(plant, whole, r, self.deadline.passed).given(trial.members)
-        params = trial.fit.params
-        here = fitter.residuals(params, trial.fit.x[None])[0]
-        fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
-        # slopes in the windows' own steps serve for shorter ones
-        windows = Fitter(self.case.plant, coarse, r).given(() if plant is not self.case.plant else trial.members)
-        slopes = slopes_of(windows.fit(params, x0=trial.fit.x, iterations=0))
-        f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
-        # a fit that is no better than rounding, or that long windows speak against, is left as it was
-        if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
-            again = self.fitter.given(trial.members).fit(params, x0=f.x, iterations=0)
-            polished = Trial(trial.members, again, trial.left_out, trial.folds)
-            if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
-                return polished
+def polished(search: JointSearch, trial: Trial) -> Trial:
+    """Return the trial refitted on whole training recordings run free from their first sample, where that follows
+    them better than the windows' fit: state carried over windows is right there. Done once a trial."""
+    if id(trial) not in search.polished:
+        search.polished[id(trial)] = trial, polished_anew(search, trial)
+    return search.polished[id(trial)][1]
+
+
+def polished_anew(search: JointSearch, trial: Trial) -> Trial:
+    if search.deadline.over():
         return trial
+    plant = search.whole
+    coarse = search.fitted_whole  # in the steps of the windows' fit
+    whole = coarse if plant is search.case.plant else plant.windows(None, search.train, span=search.span)
+    r = Residuals(search.r.sigma_q, search.r.sigma_torque, huber=max(search.r.huber, 3.0))
+    fitter = Fitter(plant, whole, r, search.deadline.passed).given(trial.members)
+    params = trial.fit.params
+    here = fitter.residuals(params, trial.fit.x[None])[0]
+    fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
+    # slopes in the windows' own steps serve for shorter ones
+    windows = Fitter(search.case.plant, coarse, r).given(() if plant is not search.case.plant else trial.members)
+    slopes = slopes_of(windows.fit(params, x0=trial.fit.x, iterations=0))
+    f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
+    # a fit that is no better than rounding, or that long windows speak against, is left as it was
+    if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
+        again = search.fitter.given(trial.members).fit(params, x0=f.x, iterations=0)
+        polished = Trial(trial.members, again, trial.left_out, trial.folds)
+        if again.loss < 1.5 * trial.fit.loss and not search.shrunk(polished):
+            return polished
+    return trial
 
-    def by_run(self, trial: Trial) -> np.ndarray:
-        """Return [R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
-        a = huber_square(self.fitter.given(trial.members).evaluate(trial.fit.params, trial.fit.x), self.r.huber)
-        run, count = self.long.run[self.fitter.window], self.case.plant.runs
-        return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
-    def in_windows(self, trial: Trial, runs: Sequence[int], span: dict[int, tuple[float, float]] | None) -> float:
-        """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
-        windows = self.case.plant.windows(LONG, runs, span=span)
-        if not len(windows.window):
-            return np.nan
-        return _loss(Fitter(self.case.plant, windows, self.r), trial)
+def loss_by_run(search: JointSearch, trial: Trial) -> np.ndarray:
+    """Return [R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
+    a = huber_square(search.fitter.given(trial.members).evaluate(trial.fit.params, trial.fit.x), search.r.huber)
+    run, count = search.long.run[search.fitter.window], search.case.plant.runs
+    return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
-    def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
-        """Return intervals that also hold what the residuals do not show, added in squares: the disagreement of the
-        fits without one condition each (a jackknife); the believed figures being off by more than their fit says (half
-        of `BELIEF.tolerance` each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant
-        being no truer."""
-        f = trial.fit
-        x, P = f.x, len(f.x)
-        if P == 0:
-            return bounds
-        box = Box(f.params)
-        low, high, span = box.low, box.high, box.span
-        square = (0.75 * (bounds[:, 1] - bounds[:, 0])) ** 2
-        folds = np.array([g for g in trial.folds if len(g) == P])
-        if len(folds) >= 2:
-            n = len(folds)
-            square += 1.645**2 * (n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0)
-        mine = np.array([not p.nuisance for p in f.params])
-        J = f.jacobian * span
-        A = J.T @ J
-        i, k = np.flatnonzero(mine), np.flatnonzero(~mine)
-        if len(i) and len(k):
-            M = A[np.ix_(i, i)] + 1e-9 * np.trace(A) * np.eye(len(i))
-            answer = np.linalg.solve(M, A[np.ix_(i, k)]) * span[i][:, None] / span[k][None]  # d effect / d nuisance
-            off = np.array(
-                [
-                    0.5 * BELIEF.tolerance * abs(v)
-                    if p.mode == "factor"
-                    else 0.25 * min(p.span, 2 * BELIEF.tolerance * abs(v) + 1e-3 * p.span)
-                    for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)
-                ]
-            )
-            square[i] += ((1.645 * answer * off) ** 2).sum(1)
-        itself = np.array([0.03 if p.key.endswith(("kp_factor", "kd_factor")) else SEARCH.doubt for p in f.params])
-        square += (1.645 * itself * np.abs(x)) ** 2
-        half, laws = np.sqrt(square), self.law_spread(trial)
-        return np.stack([np.maximum(laws[:, 0] - half, low), np.minimum(laws[:, 1] + half, high)], 1)
+
+def loss_in_windows(
+    search: JointSearch, trial: Trial, runs: Sequence[int], span: dict[int, tuple[float, float]] | None
+) -> float:
+    """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
+    windows = search.case.plant.windows(LONG, runs, span=span)
+    if not len(windows.window):
+        return np.nan
+    return _loss(Fitter(search.case.plant, windows, search.r), trial)
+
+
+def widened(search: JointSearch, trial: Trial, bounds: np.ndarray) -> np.ndarray:
+    """Return intervals that also hold what the residuals do not show, added in squares: the disagreement of the
+    fits without one condition each (a jackknife); the believed figures being off by more than their fit says (half
+    of `BELIEF.tolerance` each, the effects' parameters answering); and SEARCH.doubt of the value itself, the plant
+    being no truer."""
+    f = trial.fit
+    x, P = f.x, len(f.x)
+    if P == 0:
+        return bounds
+    box = Box(f.params)
+    low, high, span = box.low, box.high, box.span
+    square = (0.75 * (bounds[:, 1] - bounds[:, 0])) ** 2
+    folds = np.array([g for g in trial.folds if len(g) == P])
+    if len(folds) >= 2:
+        n = len(folds)
+        square += 1.645**2 * (n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0)
+    mine = np.array([not p.nuisance for p in f.params])
+    J = f.jacobian * span
+    A = J.T @ J
+    i, k = np.flatnonzero(mine), np.flatnonzero(~mine)
+    if len(i) and len(k):
+        M = A[np.ix_(i, i)] + 1e-9 * np.trace(A) * np.eye(len(i))
+        answer = np.linalg.solve(M, A[np.ix_(i, k)]) * span[i][:, None] / span[k][None]  # d effect / d nuisance
+        off = np.array(
+            [
+                0.5 * BELIEF.tolerance * abs(v)
+                if p.mode == "factor"
+                else 0.25 * min(p.span, 2 * BELIEF.tolerance * abs(v) + 1e-3 * p.span)
+                for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)
+            ]
+        )
+        square[i] += ((1.645 * answer * off) ** 2).sum(1)
+    itself = np.array([0.03 if p.key.endswith(("kp_factor", "kd_factor")) else SEARCH.doubt for p in f.params])
+    square += (1.645 * itself * np.abs(x)) ** 2
+    half, laws = np.sqrt(square), law_spread(search, trial)
+    return np.stack([np.maximum(laws[:, 0] - half, low), np.minimum(laws[:, 1] + half, high)], 1)
 
 
 @dataclass(frozen=True)
