@@ -137,8 +137,8 @@ def earns_in_windows(search: JointSearch, new: Trial, old: Trial, further: bool)
     a, b = cv_loss(search, old), cv_loss(search, new)
     gain = 1 - b.sum() / a.sum()
     # what was left out may be lost by the step to it alone: what is fitted must be followed better too
-    followed = search.objective(new) <= (1 - 0.5 * SEARCH.least) * search.objective(old)
-    if gain < SEARCH.least or not followed or search.shrunk(new):
+    worse = search.objective(new) > (1 - 0.5 * SEARCH.least) * search.objective(old)
+    if gain < SEARCH.least or worse or search.shrunk(new):
         return False
     if old.members and further:  # what follows must matter beside what was found
         rms = lambda x: np.sqrt(x.sum() / len(search.blocks))  # noqa: E731
