@@ -326,7 +326,7 @@ def drags_of(search: JointSearch, current: Trial, case: Case) -> dict[str, tuple
     asked.case, asked.scan_fitter = case, Fitter(case.plant, search.short, search.r)
     asked.allowed, asked.rng = {e.id for e in CATALOGUE if e.couples}, np.random.default_rng(search.seed)
     out: dict[str, tuple[float, float]] = {}
-    for gain, price, member, _ in asked.scan(current):
+    for gain, price, member, _ in scan_catalogue(asked, current):
         out.setdefault(member.variant.note["from_joint"], (gain, price))
     return out
 
