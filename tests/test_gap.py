@@ -226,7 +226,7 @@ def test_floor_from_repeats_of_the_same_commands():
         r.smooth()
         runs.append(r)
     assert conditions(runs) == [0, 0]
-    value, how = held_out.floor(runs, build(model(), runs))
+    value, how, _ = held_out.floor(runs, build(model(), runs))
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
     runs[1].name = "a"  # two pieces of one recording
     assert held_out.floor(runs, build(model(), runs))[1] != "repeats"
@@ -240,7 +240,7 @@ def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
-    apart = held_out.floors(runs, [case])[0]["joint"]
+    apart = held_out.floor(runs, [case])[2]["joint"]
     thermal = EFFECTS["thermal"].variants(case.scales)[0].params
     assert thermal[0].columns == ("thermal_torque",) and apart > 4 * case.sigma
     assert held_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)

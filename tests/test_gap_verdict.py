@@ -442,7 +442,7 @@ def test_each_motion_has_the_floor_of_its_own_repeats():
             q = cmd + size * np.sqrt(2) * (k - 0.5) * np.ones_like(cmd) + 1e-5 * rng.normal(size=cmd.shape)
             runs.append(Run(f"{name}{k}", ("j",), t, cmd, t, q, table, np.zeros(3)))
     cases = [SimpleNamespace(joint="j", index=0, sigma=1e-4)]
-    pooled, own = held_out.floors(runs, cases)[0]["j"], held_out.by_motion(runs, cases)
+    pooled, own = held_out.floor(runs, cases)[2]["j"], held_out.by_motion(runs, cases)
     assert pooled > 0.06 and [own[i]["j"] for i in range(4)] == pytest.approx([2e-3, 2e-3, 0.19, 0.19], rel=0.02)
     quiet = {"floor": pooled, "before": 0.02, "before_low": 0.02, "after": 0.02, "structured": True, "quiet": True}
     assert held_out.verdict([], **quiet) == "none" and held_out.verdict([], **quiet, loud=True) == "unknown"

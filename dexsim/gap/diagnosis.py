@@ -265,8 +265,7 @@ class Drives(Steps):
         self.fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
         self.parts = held_out.split(w.runs, w.held, group, self.cases)
         w.say(f"held out of the fit: {self.parts.how}")
-        self.noise = Noise(*held_out.floor(w.runs, self.cases), held_out.floors(w.runs, self.cases)[0])
-        self.noise.motions = held_out.by_motion(w.runs, self.cases)
+        self.noise = Noise(*held_out.floor(w.runs, self.cases), held_out.by_motion(w.runs, self.cases))
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
 
     def _within_the_limit(self) -> None:

@@ -104,8 +104,8 @@ def marginals(given: Sequence[Hypothesis], mass: np.ndarray) -> dict[str, float]
     return dict(sorted(out.items(), key=lambda x: -x[1]))
 
 
-def credible(given: Sequence[Hypothesis], mass: np.ndarray, held: float = HELD) -> list[tuple[str, ...]]:
-    """Return the smallest set of effects' sets that holds so much of the mass."""
+def credible(given: Sequence[Hypothesis], mass: np.ndarray) -> list[tuple[str, ...]]:
+    """Return the smallest set of effects' sets that holds `HELD` of the mass."""
     by: dict[tuple[str, ...], float] = {}
     for h, m in zip(given, mass, strict=True):
         key = tuple(sorted(h.effects))
@@ -114,7 +114,7 @@ def credible(given: Sequence[Hypothesis], mass: np.ndarray, held: float = HELD) 
     for key, m in sorted(by.items(), key=lambda x: -x[1]):
         out.append(key)
         sum_ += m
-        if sum_ >= held:
+        if sum_ >= HELD:
             break
     return out
 

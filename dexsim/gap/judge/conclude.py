@@ -34,7 +34,7 @@ from dexsim.gap.search.search import JointSearch, Outcome, Trial, loss_in_window
 from dexsim.recording.mechanism import Mechanism
 
 
-@dataclass
+@dataclass(frozen=True)
 class Noise:
     """The noise floor of the position error: over all joints [rad or m], where it comes from (repeats, split or
     quantum), of each joint, and by run and joint where that motion was repeated; lowered: the joints whose floor is

@@ -3,8 +3,9 @@ effect explains."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -430,29 +431,22 @@ def _held_out(
     span_test: dict[int, tuple[float, float]] | None,
 ) -> tuple[float, float]:
     """Return held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
-    plant = case.plant
-    windows = plant.windows(None, test, span=span_test)
+    windows = case.plant.windows(None, test, span=span_test)
     fixed = [f for m in trial.members for f in m.variant.fixed]
-    measured = plant.q[windows.sample_row]
+    measured = case.plant.q[windows.sample_row]
     out = []
-    kept = plant.series
-    try:
-        for k in (0.0, 1.0):
-            series = kept.copy()
-            q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
-            series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
-            plant.set_series(series)
-            simulated, _ = free_run(case, trial.fit.params, trial.fit.x, windows, fixed)
-            out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
-    finally:
-        plant.set_series(kept)
+    for k in (0.0, 1.0):
+        plant, series = copy.copy(case.plant), case.plant.series.copy()
+        q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
+        series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
+        plant.set_series(series)
+        simulated, _ = free_run(replace(case, plant=plant), trial.fit.params, trial.fit.x, windows, fixed)
+        out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
     return out[0], out[1]
 
 
 def write_stand_in(table: ServoTable, found: list[StandIn], path: Path) -> None:
     """The fitted servo with the stand-ins' columns and their intervals, as a file that training loads."""
-    import copy
-
     out = copy.deepcopy(table)
     for s in found:
         for name, value, low, high in zip(STAND_IN_COLUMNS, s.value, s.low, s.high, strict=True):

@@ -219,28 +219,24 @@ def _near(cases: Sequence[Case], names: Collection[str]) -> dict[str, np.ndarray
 DRAWS = 400  # of a bootstrap
 
 
-def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
-    """Return (noise floor of the position error, how): from repeats of the same commands, else from split samples, else
-    from the encoder's quantum. Root mean square over joints."""
-    each, how = floors(runs, cases)
-    if how == "repeats":
-        return float(np.sqrt(np.mean([each[c.joint] ** 2 for c in cases]))), how
-    split = float(np.sqrt(np.mean([c.sigma**2 for c in cases])))
-    quantum = float(np.sqrt(np.mean([c.quantum**2 for c in cases]))) / np.sqrt(12)
-    return split, "quantum" if split <= 1.02 * quantum else "split"
-
-
-def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
-    """Return (noise floor of each joint's position error, how): from repeats where there are any, never below the noise
-    of its samples.
+def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str, dict[str, float]]:
+    """Return (noise floor of the position error, root mean square over joints; how; that of each joint): from repeats
+    of the same commands, never below the noise of samples, else from split samples, else from the encoder's quantum.
 
     Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can
     explain."""
+    mean = lambda x: float(np.sqrt(np.mean([y**2 for y in x])))  # noqa: E731
     pairs = repeats(runs)
-    if not any(len(_common(a, b)) for a, b in pairs):
-        return {c.joint: c.sigma for c in cases}, "split"
-    apart = {c.joint: _apart([((a, a.t, a.q[:, c.index]), (b, b.t, b.q[:, c.index])) for a, b in pairs]) for c in cases}
-    return {c.joint: max(apart[c.joint], c.sigma) for c in cases}, "repeats"
+    if any(len(_common(a, b)) for a, b in pairs):
+        each = {c.joint: max(_apart(_positions(pairs, c)), c.sigma) for c in cases}
+        return mean([each[c.joint] for c in cases]), "repeats", each
+    split, quantum = mean([c.sigma for c in cases]), mean([c.quantum for c in cases]) / np.sqrt(12)
+    return split, "quantum" if split <= 1.02 * quantum else "split", {c.joint: c.sigma for c in cases}
+
+
+def _positions(pairs: Sequence[tuple[Run, Run]], case: Case) -> list[tuple[_Left, _Left]]:
+    """Return a joint's positions in pairs of runs."""
+    return [((a, a.t, a.q[:, case.index]), (b, b.t, b.q[:, case.index])) for a, b in pairs]
 
 
 def repeats(runs: list[Run]) -> list[tuple[Run, Run]]:
@@ -255,10 +251,7 @@ def by_motion(runs: list[Run], cases: list[Case]) -> dict[int, dict[str, float]]
     for i, run in enumerate(runs):
         mine = [p for p in pairs if run is p[0] or run is p[1]]
         if mine:
-            each = {
-                c.joint: [((a, a.t, a.q[:, c.index]), (b, b.t, b.q[:, c.index])) for a, b in mine] for c in cases
-            }
-            out[i] = {c.joint: max(_apart(each[c.joint]), c.sigma) for c in cases}
+            out[i] = {c.joint: max(_apart(_positions(mine, c)), c.sigma) for c in cases}
     return out
 
 
@@ -303,13 +296,13 @@ def _apart(pairs: Sequence[tuple[_Left, _Left]]) -> float:
 
 
 def rms_interval(
-    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = BLOCK
+    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0
 ) -> tuple[float, float, float]:
     """Return (rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all
     joints."""
     sums, counts = [], []
     for s, t in zip(squares, times, strict=True):
-        b = ((t - t[0]) / block).astype(int) if len(t) else np.zeros(0, int)
+        b = ((t - t[0]) / BLOCK).astype(int) if len(t) else np.zeros(0, int)
         if len(b):
             sums.append(np.bincount(b, s))
             counts.append(np.bincount(b))
@@ -397,25 +390,23 @@ def verdict(
     return "partly_explained" if (before - after) / max(before - floor, 1e-12) >= JUDGE.removed else "unknown"
 
 
-def gain_interval(
-    without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = BLOCK
-) -> tuple[float, float]:
+def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray) -> tuple[float, float]:
     """Return 90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both
     at times [n] s on what was held out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the
     whole error: draws without the few moments in which a limit acts show nothing, not a loss. (0, 0) without
     samples."""
     if not len(without):
         return 0.0, 0.0
-    b = _blocks(times, block)
+    b = _blocks(times)
     a, c = np.bincount(b, without), np.bincount(b, with_it)
-    index = intervals.stretches(len(a), STRETCH, seed, DRAWS)
+    index = intervals.stretches(len(a), STRETCH, 0, DRAWS)
     share = (a - c)[index].sum(1) / max(float(a.sum()), 1e-300)
     return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))
 
 
-def _blocks(times: np.ndarray, block: float) -> np.ndarray:
-    """Number of the block of `block` s in which each of times [n] s lies; those without any are not counted."""
-    _, out = np.unique(((times - times.min()) / block).astype(int), return_inverse=True)
+def _blocks(times: np.ndarray) -> np.ndarray:
+    """Number of the half second in which each of times [n] s lies; those without any are not counted."""
+    _, out = np.unique(((times - times.min()) / BLOCK).astype(int), return_inverse=True)
     return out
 
 
@@ -427,7 +418,7 @@ def telling(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, noise: 
     `JUDGE.part`), are left out, as long as they are few (`JUDGE.most_left_out`)."""
     if not len(without):
         return np.ones(0, bool)
-    b = _blocks(times, BLOCK)
+    b = _blocks(times)
     count = np.bincount(b)
     a, c = np.bincount(b, without) / count, np.bincount(b, with_it) / count
     mute = (np.minimum(a, c) > (JUDGE.far * noise) ** 2) & (np.abs(a - c) <= 0.5 * JUDGE.part * a)

@@ -24,6 +24,7 @@ from dexsim.gap.plant.mechanics import JointConstants
 # than there are; one of a scan has more, and takes a quarter longer in blocks of 32
 BLOCK = 64
 PROFILED = [INDEX[name] for name in PROFILE]
+WARM = 0.15  # s before a window in which the recorded motion is held
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 # guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
@@ -88,11 +89,11 @@ class Known:
     """What was simulated before: a search asks for the same guess where one fit ends and the next begins, where a step
     is damped more, where a fit is judged.
 
-    Answers (positions [n], torques [n]) by all that they depend on, as bytes; of more than `room` bytes those go
+    Answers (positions [n], torques [n]) by all that they depend on, as bytes; of more than `KNOWN` bytes those go
     that were not asked for the longest."""
 
-    def __init__(self, room: int = KNOWN):
-        self._room, self._rows = room, OrderedDict[bytes, tuple[np.ndarray, np.ndarray]]()
+    def __init__(self) -> None:
+        self._rows = OrderedDict[bytes, tuple[np.ndarray, np.ndarray]]()
 
     def clear(self) -> None:
         """Forgets all."""
@@ -112,7 +113,7 @@ class Known:
             if made is not None:
                 rows |= {keys[k]: row for k, row in zip(sorted(new.values()), zip(*made, strict=True), strict=True)}
             q, torque = (np.stack([rows[key][i] for key in keys]) for i in (0, 1))
-        most = self._room // max(16 * q.shape[1], 1)
+        most = KNOWN // max(16 * q.shape[1], 1)
         last = range(max(len(keys) - most, 0), len(keys))
         kept = [k for k in last if keys[k] not in rows]
         copies: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
@@ -286,13 +287,11 @@ class JointPlant:
         self,
         length: float | None,
         runs: Sequence[int] | None = None,
-        warm: float = 0.15,
-        stride: float | None = None,
         span: dict[int, tuple[float, float]] | None = None,
         every_run: bool = False,
         between: bool = False,
     ) -> Windows:
-        """Return windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
+        """Return windows of `length` s (None: whole runs), each after `WARM` s in which the recorded motion is held.
 
         span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint;
         between: also samples between its readings.
@@ -309,13 +308,13 @@ class JointPlant:
             size = (stop - begin) if length is None else min(length, stop - begin)
             if size <= 0:
                 continue
-            count = max(int((stop - begin) / (stride or size) + 1e-6), 1)
-            if length is not None and stride is None:
+            count = max(int((stop - begin) / size + 1e-6), 1)
+            if length is not None:
                 size = (stop - begin) / count  # no remainder is lost
             for i in range(count):
-                a = begin + i * (stride or size)
+                a = begin + i * size
                 b = a + size
-                w = min(warm, a) if length is not None else 0.0
+                w = min(WARM, a) if length is not None else 0.0
                 lo, hi = np.searchsorted(t - t[0], [a - 1e-9, b - 1e-9])
                 if i == count - 1 and b >= stop - 1e-6:
                     hi = int(np.searchsorted(t - t[0], b + 1e-9))

@@ -54,13 +54,13 @@ class Case:
     told: bool = False
 
 
-def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int], join: float = 0.03) -> list[dict]:
+def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]) -> list[dict]:
     """Stretches of time in which `active` [n] bool holds, by recording, short gaps joined; the longest 400."""
     out: list[dict] = []
     for r in use:
         rows = case.plant.rows(r)
         t, on = case.plant.t[rows], active[rows]
-        merged = spans(t, on, join)
+        merged = spans(t, on, 0.03)
         out += [{"recording": runs[r].name, "start": round(float(a), 4), "end": round(float(b), 4)} for a, b in merged]
     out.sort(key=lambda w: w["start"] - w["end"])
     out = out[:400]

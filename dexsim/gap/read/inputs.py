@@ -404,14 +404,12 @@ def parted(recordings: Any, held_out: Any) -> tuple[list[Path], list[Path] | Non
     return fitted, list(dict.fromkeys(held))
 
 
-def self_touch(
-    runs: list[Run], model: mujoco.MjModel, rate: float = 25.0, depth: float = 3e-4
-) -> dict[str, list[tuple[float, float]]]:
+def self_touch(runs: list[Run], model: mujoco.MjModel) -> dict[str, list[tuple[float, float]]]:
     """By recording, the stretches [s] in which links of the model press on one another along the measured motion.
 
-    A pair that touches nearly always overlaps by design and says nothing. depth [m]: less is left to the geometry's
-    accuracy.
+    A pair that touches nearly always overlaps by design and says nothing.
     """
+    rate, depth = 25.0, 3e-4  # Hz; m: less is left to the geometry's accuracy
     data = mujoco.MjData(model)
     seen: list[tuple[str, float, set[tuple[int, int]]]] = []
     for run in runs:

@@ -287,7 +287,6 @@ class JointSearch:
         conditions: list[int],
         seed: int = 0,
         allowed: set[str] | None = None,
-        long: float = LONG,
         tell: Callable[[float], None] | None = None,
         deadline: Deadline | None = None,
     ):
@@ -300,7 +299,7 @@ class JointSearch:
         self.tell, self._part = tell or (lambda _: None), 0.0
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
-        self.long = plant.windows(long, train, span=span)
+        self.long = plant.windows(LONG, train, span=span)
         self.short, self.long = thin(self.short, case, SCAN_BUDGET), thin(self.long, case, BUDGET)
         self.short_slopes: dict[str, np.ndarray] = {}
         sigma = case.sigma

@@ -12,6 +12,7 @@ held out only judges them.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -105,6 +106,7 @@ def low_pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
 def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: Motion) -> Body:
     """Return of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the
     model has them."""
+    model = copy.copy(model)
     data = mujoco.MjData(model)
     ids = [model.joint(name).id for name in joints]
     at, dof = np.array([model.jnt_qposadr[i] for i in ids]), np.array([model.jnt_dofadr[i] for i in ids])
@@ -114,20 +116,16 @@ def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: M
     rows = np.unique(np.r_[np.arange(0, len(m.t), every), len(m.t) - 1])
     rest, diag = np.empty((2, len(rows), len(ids)))
     axis, arm = np.empty((2, len(rows), len(ids), 3))
-    kept = np.array(model.opt.gravity), model.opt.disableflags
     model.opt.gravity[:] = gravity
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     full = np.zeros((model.nv, model.nv))
-    try:
-        for k, i in enumerate(rows):
-            data.qpos[at], data.qvel[dof], data.qacc[dof] = m.q[i], m.v[i], m.a[i]
-            mujoco.mj_inverse(model, data)
-            mujoco.mj_fullM(model, data, full)
-            diag[k] = full[dof, dof]
-            rest[k] = data.qfrc_inverse[dof] - diag[k] * m.a[i]
-            axis[k], arm[k] = data.xaxis[ids], data.subtree_com[bodies] - data.xanchor[ids]
-    finally:
-        model.opt.gravity[:], model.opt.disableflags = kept
+    for k, i in enumerate(rows):
+        data.qpos[at], data.qvel[dof], data.qacc[dof] = m.q[i], m.v[i], m.a[i]
+        mujoco.mj_inverse(model, data)
+        mujoco.mj_fullM(model, data, full)
+        diag[k] = full[dof, dof]
+        rest[k] = data.qfrc_inverse[dof] - diag[k] * m.a[i]
+        axis[k], arm[k] = data.xaxis[ids], data.subtree_com[bodies] - data.xanchor[ids]
     mass, turned = model.body_subtreemass[bodies], np.cross(axis, arm)
     pull = -mass * np.where(slide, axis @ gravity, turned @ gravity)
     across = np.where(slide, 0.0, -mass * (np.cross(axis, turned) @ gravity))
