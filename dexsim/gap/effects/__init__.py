@@ -250,8 +250,9 @@ class Effect:
         return np.ones_like(case.regimes["speed"])
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        """Return parameters by the keys of `diagnosis.json`, with 90 % intervals."""
-        raise NotImplementedError
+        """Return parameters by the keys of `diagnosis.json`, with 90 % intervals: those that are fitted."""
+        slide = fit.case.scales.slide
+        return {p.key: fit.entry(p.key, p.unit_on(slide)) for p in fit.variant.params}
 
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
         """Return what it adds to the torque per unit of its coefficient, as columns [m] of what inverse dynamics

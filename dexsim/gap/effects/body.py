@@ -42,9 +42,6 @@ class Inertia(Effect):
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return case.regimes["acceleration"]
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"armature": fit.entry("armature", "kg" if fit.case.scales.slide else "kg.m2")}
-
     def said(self, finding: Finding, believed: dict[str, float]) -> str:
         return self.words.replace(
             "more (or less)", "more" if finding.parameters["armature"]["value"] > 0 else "less"
@@ -279,10 +276,7 @@ class JointSpring(Effect):
         return np.abs(values["stiffness"] * case.regimes["position"] + values["preload"])
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        out = {
-            "stiffness": fit.entry("stiffness", f"{fit.force}/{fit.length}"),
-            "preload": fit.entry("preload", fit.force),
-        }
+        out = super().parameters(fit)
         k, at = fit.value["stiffness"], fit.value["preload"]
         if fit.interval["stiffness"][0] > 0:
             ends = [-p / c for c in fit.interval["stiffness"] for p in fit.interval["preload"]]
@@ -326,6 +320,3 @@ class ExternalForce(Effect):
 
     def unseen(self, s: Scales) -> str:
         return "" if s.effort else "no motor torque is recorded, without which a push is not told from a missing law"
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"torque": fit.entry("torque", fit.force)}

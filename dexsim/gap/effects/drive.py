@@ -49,9 +49,6 @@ class TorqueLimit(Effect):
         s = case.scales
         return lost(s, case.regimes, values.get("torque", s.demand), s.nominal["no_load_speed"])
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"torque": fit.entry("torque", fit.force)}
-
     def said(self, finding: Finding, believed: dict[str, float]) -> str:
         limit = finding.parameters.get("torque", {"value": 0.0})["value"]
         more = limit > believed.get("torque_limit", np.inf)
@@ -107,9 +104,6 @@ class TorqueSpeedLimit(Effect):
         s = case.scales
         return lost(s, case.regimes, s.nominal["torque_limit"], values.get("no_load_speed", s.peak_speed))
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"no_load_speed": fit.entry("no_load_speed", f"{fit.length}/s")}
-
 
 class BrakingLimit(Effect):
     """A torque limit that falls otherwise with speed while the drive brakes than while it drives.
@@ -144,9 +138,6 @@ class BrakingLimit(Effect):
         limits = m["_asked"], m["_speed"], s.nominal["torque_limit"], s.nominal["no_load_speed"], False
         a, b = (torque_along(*limits, braking_slope=x) for x in (s.nominal["braking_slope"], values["slope"]))
         return np.abs(a - b)
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"slope": fit.entry("slope", "1")}
 
 
 class SupplySag(Effect):
@@ -325,9 +316,6 @@ class GainMismatch(Effect):
         more = (values.get("kp_factor", 1.0) - 1) * believed["kp"] * m["_error"]
         return np.abs(more - (values.get("kd_factor", 1.0) - 1) * believed["kd"] * m["_speed"])
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {k: fit.entry(k, "1") for k in fit.value}
-
 
 class ControllerTerm(Effect):
     """A term of the drive's loop that the believed law lacks: feed-forward of speed or acceleration, an integral.
@@ -411,6 +399,3 @@ class Deadband(Effect):
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return (case.regimes["position error"] < values.get("width", 0.0)).astype(float)
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"width": fit.entry("width", fit.length)}

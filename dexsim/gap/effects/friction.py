@@ -162,9 +162,6 @@ class StribeckFriction(Effect):
         near = np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2))
         return near * ((v > 0.2 * (JUDGE.slides * s.speed)) | (np.abs(m["_torque"]) > 0))
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"peak": fit.entry("peak", fit.force), "v_s": fit.entry("v_s", f"{fit.length}/s")}
-
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
         top = float(np.abs(own.v).max())
         return {f"{self.by_torque} (v_s {k * top:.3g})": partial(_falling, speed=k * top) for k in SPEEDS}
@@ -219,9 +216,6 @@ class LoadFriction(Effect):
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return np.abs(case.regimes["_load"]) * (case.regimes["speed"] > JUDGE.slides * case.scales.speed).astype(float)
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}
 
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
         return {self.by_torque: lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))} if own.loaded else {}
@@ -281,9 +275,6 @@ class Presliding(Effect):
         gone = np.cumsum(way)
         since = gone - np.maximum.accumulate(np.where(turned, gone, 0.0))
         return np.exp(-since / max(values.get("distance", give(case.scales)), 1e-12))
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"distance": fit.entry("distance", fit.length)}
 
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
         ways = (k * own.span for k in DISTANCES)

@@ -37,9 +37,6 @@ class CommandDelay(Effect):
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return np.abs(case.regimes["_command_rate"])
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"delay": fit.entry("delay", "s")}
-
 
 class Lag(Effect):
     """A lag of the drive's torque, of first order or of second, or of the speed that its loop measures."""
@@ -82,9 +79,6 @@ class Lag(Effect):
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         m = case.regimes
         return np.abs(m["_torque_rate"]) if note.get("of", "drive") == "drive" else m["acceleration"]
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"time_constant": fit.entry("time_constant", "s")}
 
     def torque_columns(self, own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
         return {self.by_torque: lambda d: d.rise}
@@ -130,10 +124,6 @@ class SetpointProfile(Effect):
         behind = np.abs(m["_error"])
         return behind * (m["speed"] > 0.7 * values["speed"]) if "speed" in values else behind
 
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        units = {"speed": f"{fit.length}/s", "acceleration": f"{fit.length}/s2"}
-        return {key: fit.entry(key, unit) for key, unit in units.items() if key in fit.value}
-
 
 class PositionOffset(Effect):
     """An encoder's zero error."""
@@ -158,9 +148,6 @@ class PositionOffset(Effect):
 
     def unseen(self, s: Scales) -> str:
         return "" if self.variants(s) else "gravity hardly acts on the joint, so its zero leaves no trace"
-
-    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"offset": fit.entry("offset", fit.length)}
 
     def of_pose(self, values: dict[str, float], case: Case) -> bool:
         return True

@@ -210,6 +210,10 @@ class Param:
     def span(self) -> float:
         return self.high - self.low
 
+    def unit_on(self, slide: bool) -> str:
+        """Return its unit on a joint that turns, or slides."""
+        return self.unit.replace("N.m", "N").replace("rad", "m").replace("kg.m2", "kg") if slide else self.unit
+
     def apply(self, params: np.ndarray, x: np.ndarray, base: np.ndarray) -> None:
         """Writes x [H] into params [H, R, C], base [R, C] being what is believed."""
         for name in self.columns:
