@@ -64,7 +64,7 @@ def test_what_left_a_trace_beside_one_effect_begins_there_beside_a_further_one()
     brake = next(p for p in s.all_nuisances if p.key == "braking_slope")
     s.nuisances = [p for p in s.all_nuisances if p.key in ("kp", "inertia")]
     of = {effect.id: Member(effect, effect.variants(s.case.scales)[0]) for effect in CATALOGUE if effect.id in BRAKES}
-    params = s._params((of["torque_limit"],)) + [brake]
+    params = s.params_of((of["torque_limit"],)) + [brake]
     x = np.array([p.start for p in params], float)
     x[-1] = -0.7
     like = Trial((of["torque_limit"],), s.fitter.fit(params, x0=x, iterations=0))
