@@ -191,7 +191,6 @@ def build(
     only: set[str] | None = None,
 ) -> list[Case]:
     """Return one case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
-    joints = runs[0].joints
     voltage = runs[0].servo.drive == "voltage"
     m = moved(model, runs, lambda j, plant: plant, device, dt, only)
     torques = []
@@ -201,15 +200,7 @@ def build(
         each = zip(row, cmd.T, run.q.T, run.vs.T, strict=True)
         torques.append(np.stack([demand(p, voltage, c, q, v) for p, c, q, v in each], 1))
     wanted = list(m.used)
-
-    def case(k: int) -> Case:
-        j = wanted[k]
-        inertia = _inertia(m.mech, j)
-        return _case(
-            joints[j], j, m.used[j], m.constants[j], runs, m.rows, torques, m.mech, m.others[j], inertia, voltage
-        )
-
-    return compute.each(len(wanted), case)
+    return compute.each(len(wanted), lambda k: _case(runs, m, wanted[k], torques))
 
 
 def moved(
@@ -317,19 +308,11 @@ def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
     return float(np.median([np.median(x) for x in by.values()]))
 
 
-def _case(
-    joint: str,
-    j: int,
-    plant: JointPlant,
-    constants: JointConstants,
-    runs: Sequence[Run],
-    rows: Sequence[np.ndarray],
-    torques: Sequence[np.ndarray],
-    mech: Sequence[tuple[np.ndarray, np.ndarray]],
-    others: Sequence[int],
-    inertia: float,
-    voltage: bool,
-) -> Case:
+def _case(runs: Sequence[Run], m: Motion, j: int, torques: Sequence[np.ndarray]) -> Case:
+    """Return joint j's case. torques [S, J]: what the drives' laws give along each run."""
+    table, joint, voltage = runs[0].servo, runs[0].joints[j], runs[0].servo.drive == "voltage"
+    plant, constants, rows, mech, others = m.used[j], m.constants[j], m.rows, m.mech, m.others[j]
+    inertia, (ranges, unknown) = _inertia(mech, j), _open_figures(table, joint)
     cat = lambda get: np.concatenate([get(i) for i in range(len(runs))])  # noqa: E731
     t = plant.t
     q, v, a = (cat(lambda i, n=n: getattr(runs[i], n)[:, j]) for n in ("qs", "vs", "as_"))
@@ -384,7 +367,7 @@ def _case(
         voltage=voltage,
         effort=effort_noise > 0,
         saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
-        unknown=_open_figures(runs[0].servo, joint)[1],
+        unknown=unknown,
         base_friction=constants.friction,
         base_damping=constants.damping,
         armature=constants.armature,
@@ -392,11 +375,9 @@ def _case(
         own_inertia=float(np.median(series("own_inertia"))),
         leaf_mass=constants.leaf_mass,
         own_mass=constants.own_mass,
-        velocity_loop=runs[0].servo.loop == "velocity",
+        velocity_loop=table.loop == "velocity",
         apart=plant.loop == "motor" and plant.position == "joint",
     )
-    table = runs[0].servo
-    ranges, unknown = _open_figures(table, joint)
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
     regimes |= {"_gravity": gravity} | _drags_of(runs, others)
     regimes |= {"_error": cmd - plant.q, "_speed": v} | _rates(runs, torques, j)
