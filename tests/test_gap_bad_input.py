@@ -13,7 +13,7 @@ from dexsim.gap import command, demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude
-from dexsim.gap.judge.joint_answer import Kept
+from dexsim.gap.judge.held_out import Split
 from dexsim.gap.read import channels
 from dexsim.recording import read, write
 
@@ -318,7 +318,7 @@ def test_links_that_touch_each_other_are_cut_out():
 def test_what_is_wrong_in_a_recording_that_is_left_out_doubts_nothing_elsewhere():
     """A joint that is stuck in one of several recordings, which is left out: whole where it has no other joint."""
     stuck = lambda *names: Finding("", 0.9, "", ["joint"], when=[{"recording": n} for n in names])  # noqa: E731
-    kept = lambda **runs: Kept(  # noqa: E731
+    kept = lambda **runs: Split(  # noqa: E731
         [SimpleNamespace(name=n, left_out=frozenset(x)) for n, x in runs.items()], [0], [1], None, None
     )
     assert conclude._elsewhere(stuck("b"), kept(a=(), c=()))

@@ -14,7 +14,8 @@ from test_gap_torque_route import arm, run
 
 from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude, confidence
-from dexsim.gap.judge.joint_answer import JointAnswer, Kept, rms
+from dexsim.gap.judge.held_out import Split
+from dexsim.gap.judge.joint_answer import JointAnswer, rms
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
 from dexsim.gap.rules import SEARCH
@@ -97,7 +98,7 @@ def test_a_name_that_makes_a_joint_ring_as_it_does_is_as_sure_as_that():
 
 
 def answer_of(soft: JointSearch, found) -> JointAnswer:
-    return JointAnswer(soft.case, soft, found, Kept([None] * 3, [0, 1], [2], None, None))
+    return JointAnswer(soft.case, soft, found, Split([None] * 3, [0, 1], [2]))
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ from dexsim.gap.inquiry import (
 )
 from dexsim.gap.judge import conclude, full_model, handed_on, held_out
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
-from dexsim.gap.judge.joint_answer import JointAnswer, Kept
+from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
 from dexsim.gap.plant.columns import DRAGGERS
 from dexsim.gap.read import Run, conditions, inputs, stage_tests
@@ -181,12 +181,6 @@ class Drives(Steps):
         self.ahead: dict[int, JudgedAhead] = {}
         # judge
         self.plains: list[baseline.Baseline] = []
-
-    @property
-    def kept(self) -> Kept:
-        """What every joint is judged by."""
-        p = self.parts
-        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test, p.apart, p.proven)
 
     # -- read
     # ------------------------------------------------------------------------------------------------------------------
@@ -392,7 +386,7 @@ class Drives(Steps):
     def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
         """Return a joint on what was held out."""
         known = self.ahead.get(id(search))
-        return known.answer if known else JointAnswer.of(search.case, search, found, self.kept)
+        return known.answer if known else JointAnswer.of(search.case, search, found, self.parts)
 
     def _plain(self, search: JointSearch) -> baseline.Baseline | None:
         """Return what a plain model of a joint leaves of what was held out."""
@@ -602,7 +596,7 @@ class Drives(Steps):
             d,
             w.settings,
             self.answers,
-            self.kept,
+            self.parts,
             self.noise,
             p.how,
             w.channel,

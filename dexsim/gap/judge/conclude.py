@@ -23,7 +23,7 @@ from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
 from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
-from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, Kept, nuisances, rms
+from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
@@ -61,7 +61,7 @@ def into_diagnosis(
     d: Diagnosis,
     s: Settings,
     answers: Sequence[JointAnswer],
-    kept: Kept,
+    kept: held_out.Split,
     noise: Noise,
     how: str,
     channel: list[Finding],
@@ -308,7 +308,7 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
 
 def _judged(
     answers: Sequence[JointAnswer],
-    kept: Kept,
+    kept: held_out.Split,
     refuted: set[str],
     how: str,
     seed: int,
@@ -345,7 +345,7 @@ def _judged(
     return Judged(position(all_of_it, how), effort, None, structured, quiet, _loud(answers, kept, noise), shown)
 
 
-def _loud(answers: Sequence[JointAnswer], kept: Kept, noise: Noise) -> tuple[str, ...]:
+def _loud(answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise) -> tuple[str, ...]:
     """Return the recordings held out, joint by joint, that are surely missed by more than their own repeats differ
     by, in words."""
     said = []
@@ -415,7 +415,7 @@ def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> li
     return [replace(f, confidence=round(e.confidence, 3)) for f, e in zip(findings, mine, strict=True)]
 
 
-def _elsewhere(channel: Finding, kept: Kept) -> bool:
+def _elsewhere(channel: Finding, kept: held_out.Split) -> bool:
     """Return whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or
     with all of it: that casts no doubt on what the other recordings tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}

@@ -28,15 +28,17 @@ from dexsim.gap.rules import JUDGE, SEARCH
 
 @dataclass
 class Split:
-    """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
+    """What every joint is judged by: all runs; train, test: indices of those that are fitted and held out; span_train,
+    span_test: the parts of them [s], None for whole runs; how: in words;
     not_judged: regimes that only what is held out visits; apart: by joint the measured rows [n] bool in and near
     them; proven: whether what is found is tried on what was not fitted."""
 
+    runs: list[Run]
     train: list[int]
     test: list[int]
-    span_train: dict[int, tuple[float, float]] | None
-    span_test: dict[int, tuple[float, float]] | None
-    how: str
+    span_train: dict[int, tuple[float, float]] | None = None
+    span_test: dict[int, tuple[float, float]] | None = None
+    how: str = ""
     not_judged: list[str] = field(default_factory=list)
     apart: dict[str, np.ndarray] = field(default_factory=dict)
     proven: bool = True
@@ -87,7 +89,7 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
     names, time = visits(runs, cases)
     if held:
         train = [i for i in range(len(runs)) if i not in held]
-        out = Split(train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held))
+        out = Split(runs, train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held))
         out.not_judged = _alone(names, time, held, train)
         out.apart = _near(cases, out.not_judged)
         return out
@@ -99,15 +101,15 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
         if not any(_goes_on(r, cut[i]) for i, r in enumerate(runs)):
             whole = {i: (0.0, r.duration) for i, r in enumerate(runs)}
             how = f"{NOTHING}, for all stands still in {how}; what is found is doubted until a motion is recorded twice"
-            return Split(every, every, whole, whole, how, proven=False)
-        return Split(every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every},
-                     how)  # fmt: skip
+            return Split(runs, every, every, whole, whole, how, proven=False)
+        begins, ends = {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every}
+        return Split(runs, every, every, begins, ends, how)
     test = [i for i in range(len(runs)) if group[i] == chosen]
     train = [i for i in range(len(runs)) if i not in test]
     how = "one condition, " + ", ".join(runs[i].name for i in test)
     ends = _ends(runs, train, test, time, regimes(cases), cases[0].plant)
     alone = _alone(names, time, test, train)
-    out = Split(train, test, None, None, how, alone, _near(cases, alone))
+    out = Split(runs, train, test, None, None, how, alone, _near(cases, alone))
     if ends:
         whole = {i: (0.0, runs[i].duration + 1.0) for i in (*train, *test)}
         out.span_train = whole | {i: (0.0, at) for i, at in ends.items()}

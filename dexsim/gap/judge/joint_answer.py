@@ -4,7 +4,7 @@ its residual lives, how much a delay varies."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -31,20 +31,6 @@ from dexsim.recording.mechanism import Mechanism
 MUTE = "moments of what was held out are followed neither with it nor without; the others alone speak for it"
 
 
-@dataclass
-class Kept:
-    """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept
-    out; apart, proven: `held_out.Split`."""
-
-    runs: list[Run]
-    train: list[int]
-    test: list[int]
-    span_train: dict[int, tuple[float, float]] | None
-    span_test: dict[int, tuple[float, float]] | None
-    apart: dict[str, np.ndarray] = field(default_factory=dict)
-    proven: bool = True
-
-
 class JointAnswer:
     """A searched joint on what was held out.
 
@@ -54,7 +40,7 @@ class JointAnswer:
     by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance:
     refitted beliefs; found, evidence: see `judge`; spots, depends_on: see `locate`."""
 
-    def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
+    def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: held_out.Split):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
         self.best, self.none = polished(search, outcome.best), polished(search, outcome.none)
         self.whole = replace(case, plant=search.whole)
@@ -133,7 +119,7 @@ class JointAnswer:
         return out
 
     @classmethod
-    def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: Kept) -> JointAnswer:
+    def of(cls, case: Case, search: JointSearch, outcome: Outcome, kept: held_out.Split) -> JointAnswer:
         """Return the answer without those of several effects on the joint that what was held out refutes, the one that
         harms most first. `outcome` stays as it is: others may still be searched by it, and must not learn of what was
         kept out."""
