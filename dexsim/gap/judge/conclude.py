@@ -63,7 +63,6 @@ def into_diagnosis(
     answers: Sequence[JointAnswer],
     kept: held_out.Split,
     noise: Noise,
-    how: str,
     channel: list[Finding],
     plains: Sequence[baseline.Baseline],
     written: Written,
@@ -71,9 +70,9 @@ def into_diagnosis(
 ) -> None:
     """The joints into a diagnosis that is empty but for its notes and its mechanism.
 
-    answers: of each joint, judged and located; how: what was held out, in words; channel: findings about signals, of
-    all joints; plains: the plain model of each joint; written: what is written of each; refused: of `candidates`. (One
-    long list of steps: each needs what those before it found.)
+    answers: of each joint, judged and located; channel: findings about signals, of all joints; plains: the plain model
+    of each joint; written: what is written of each; refused: of `candidates`. (One long list of steps: each needs what
+    those before it found.)
     """
     data, notes, m = d.data, d.notes, d.mechanism
     assert m is not None  # that of the answers
@@ -135,7 +134,7 @@ def into_diagnosis(
     # that says nothing of what is wrong with the reading of the effort alone
     findings = [f if EFFECTS[f.effect].effort_only else held_out.unneeded(f, quiet) for f in findings]
     d.findings = sorted(channel, key=lambda f: -f.confidence) + findings
-    d.judged = _judged(answers, kept, refuted, how, s.seed, len(quiet) == len(answers), noise)
+    d.judged = _judged(answers, kept, refuted, s.seed, len(quiet) == len(answers), noise)
     notes += d.judged.loud
 
 
@@ -310,13 +309,13 @@ def _judged(
     answers: Sequence[JointAnswer],
     kept: held_out.Split,
     refuted: set[str],
-    how: str,
     seed: int,
     quiet: bool,
     noise: Noise,
 ) -> Judged:
     """Return errors over all joints on what was held out."""
-    slide, names = all(x.case.constants.slide for x in answers), [kept.runs[i].name for i in kept.test]
+    slide, how = all(x.case.constants.slide for x in answers), kept.how
+    names = [kept.runs[i].name for i in kept.test]
 
     def position(on: Sequence[np.ndarray], how: str) -> dict[str, Any]:
         times = [x.t[k] for x, k in zip(answers, on, strict=True)]
