@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -17,6 +18,7 @@ from dexsim.console import jobs
 from dexsim.errors import UserError
 from dexsim.system import lives
 
+ROOT = Path(__file__).resolve().parents[1]
 STUB = """import os, pathlib, sys, time
 out = pathlib.Path(next(a for a in sys.argv if a.startswith("out="))[4:])
 out.mkdir(exist_ok=True)
@@ -138,3 +140,9 @@ def test_slurm_runs_them(tmp_path):
             jobs.run(work[:1], jobs.Engine("slurm", slurm={"partitoin": "all"}))
         with pytest.raises(UserError, match="on=slurm: sbatch refuses"):
             jobs.run(work[:1], jobs.Engine("slurm", slurm={"partition": "none"}))
+        here = ["--wait", "--nodes=1", "--gpus-per-node=0", "--cpus-per-task=1", f"--output={tmp_path / 'said.txt'}"]
+        given = ["task=grasp", "device=cpu", "worlds=2", "iterations=1", "final_episodes=0", "out=recipe"]
+        env = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+        subprocess.run(["sbatch", *here, ROOT / "recipes/slurm.sbatch", *given], cwd=tmp_path, timeout=300,
+                       env=os.environ | env | {"GPUS_PER_NODE": "1"})  # fmt: skip
+        assert (tmp_path / "recipe" / "policy.pt").is_file(), (tmp_path / "said.txt").read_text()

@@ -224,6 +224,19 @@ def test_the_release_workflow_runs_what_is_tested_here():
 
 
 @pytest.mark.slow
+def test_the_recipe_of_a_rented_machine_trains(tmp_path):
+    """Its last part, with what SkyPilot would set on one machine of one process."""
+    recipe = yaml.safe_load((ROOT / "recipes/skypilot.yaml").read_text())
+    (tmp_path / "dexsim-env").symlink_to(sys.prefix)
+    sets = {"NODE_IPS": "127.0.0.1", "NUM_NODES": "1", "NUM_GPUS_PER_NODE": "1", "TASK_ID": "test"}
+    env = {f"SKYPILOT_{k}": v for k, v in sets.items()} | {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    env["SETTINGS"] = "task=grasp device=cpu worlds=2 iterations=1 final_episodes=0"
+    done = subprocess.run(["bash", "-euc", recipe["run"]], cwd=tmp_path, env=os.environ | env, capture_output=True,
+                          text=True, timeout=300)  # fmt: skip
+    assert done.returncode == 0 and (tmp_path / "run" / "policy.pt").is_file(), done.stdout + done.stderr
+
+
+@pytest.mark.slow
 def test_what_is_uploaded(tmp_path):
     """`python -m build` of what git tracks, `twine check`, and less than 8 MB."""
     source = tmp_path / "source"
