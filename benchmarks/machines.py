@@ -150,7 +150,7 @@ def measure(nodes: Nodes, each: int, settings: Sequence[str], devices: Sequence[
     started = [
         nodes.start(k, each, settings, devices[k * each: (k + 1) * each]) for k in range(nodes.count)
     ]
-    while any(p.poll() is None for p in started) and time.perf_counter() < end:
+    while {None} <= {p.poll() for p in started} <= {None, 0} and time.perf_counter() < end:
         time.sleep(0.2)
         if not first[0] and (done := len(progress(run))) >= FIRST:
             first = done, nodes.sent()
