@@ -61,7 +61,7 @@ def key_pressed() -> bool:
     if sys.platform == "win32":  # its select knows sockets only
         import msvcrt
 
-        return bool(msvcrt.kbhit() and msvcrt.getwch())  # type: ignore[attr-defined]  # not of Linux
+        return bool(msvcrt.kbhit() and msvcrt.getwch())
     return bool(select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline())
 
 
