@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -140,9 +142,15 @@ def test_slurm_runs_them(tmp_path):
             jobs.run(work[:1], jobs.Engine("slurm", slurm={"partitoin": "all"}))
         with pytest.raises(UserError, match="on=slurm: sbatch refuses"):
             jobs.run(work[:1], jobs.Engine("slurm", slurm={"partition": "none"}))
-        here = ["--wait", "--nodes=1", "--gpus-per-node=0", "--cpus-per-task=1", f"--output={tmp_path / 'said.txt'}"]
-        given = ["task=grasp", "device=cpu", "worlds=2", "iterations=1", "final_episodes=0", "out=recipe"]
-        env = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-        subprocess.run(["sbatch", *here, ROOT / "recipes/slurm.sbatch", *given], cwd=tmp_path, timeout=300,
-                       env=os.environ | env | {"GPUS_PER_NODE": "1"})  # fmt: skip
-        assert (tmp_path / "recipe" / "policy.pt").is_file(), (tmp_path / "said.txt").read_text()
+        torchrun = tmp_path / "bin" / "torchrun"  # says what it was asked, and where
+        torchrun.parent.mkdir()
+        torchrun.write_text('#!/bin/sh\necho "$SLURM_CPUS_PER_TASK $@"\n')
+        torchrun.chmod(0o755)
+        here = ["--wait", "--time=5", "--nodes=1", "--gpus-per-node=0", "--cpus-per-task=1", "--output=said.txt"]
+        env = os.environ | {"PATH": f"{torchrun.parent}:{os.environ['PATH']}", "GPUS_PER_NODE": "3"}
+        batch = ["sbatch", *here, ROOT / "recipes/slurm.sbatch", "task=grasp"]
+        subprocess.run(batch, cwd=tmp_path, timeout=90, env=env)
+        said = (tmp_path / "said.txt").read_text()
+        endpoint = rf"--rdzv_endpoint={socket.gethostname().split('.')[0]}:29\d\d\d --rdzv_id=\d+"
+        whole = rf"1 --nnodes=1 --nproc_per_node=3 --rdzv_backend=c10d {endpoint} -m dexsim train task=grasp\n"
+        assert re.fullmatch(whole, said), said
