@@ -79,6 +79,18 @@ def test_what_friction_carries_at_rest_and_noise_are_no_push():
     assert logged_torque.find_pushes(model, [loud], [0]) == []
 
 
+def test_a_joint_that_rests_between_counts_or_is_not_asked_about_is_pushed_by_nobody(monkeypatch):
+    model, rng = arm(), np.random.default_rng(4)
+    r = run(model, 0)
+    slow = lambda n: rng.standard_normal(len(r.t) // n + 1).repeat(n)[: len(r.t)]  # noqa: E731
+    r.torque[:, 1] = slow(20)
+    assert logged_torque.find_pushes(model, [r], [0], asked=["shoulder"]) == []
+    r.q[:, 1] = 0.4 + 0.0015 * (slow(40) > 0)  # its encoder says one of two counts
+    assert logged_torque.find_pushes(model, [r], [0]) == []
+    monkeypatch.setattr(logged_torque, "TRAVEL", 0.0)
+    assert [p.joint for p in logged_torque.find_pushes(model, [r], [0])] == ["elbow"]
+
+
 def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     model = arm()
     r = run(model, 0)

@@ -229,7 +229,7 @@ class Drives(Steps):
         """The runs without the stretches in which something outside pushes."""
         w = self.w
         fitted = [i for i in range(len(w.runs)) if i not in w.held]
-        self.pushes = logged_torque.find_pushes(self.mj_model, w.runs, fitted, w.settings.seed)
+        self.pushes = logged_torque.find_pushes(self.mj_model, w.runs, fitted, w.settings.seed, w.settings.joints)
         w.runs, w.held = logged_torque.without_pushes(self.pushes, w.runs, w.held, w.notes)
         w.clock.lap("forces from outside")
 

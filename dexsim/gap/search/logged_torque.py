@@ -341,6 +341,7 @@ def findings(
 
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
 AROUND = 0.2  # s over which it is measured how much a joint shakes, and how hard it is pushed
+TRAVEL = 0.02  # of its range: a joint that moves by less rests, between counts of its encoder
 CREST = 0.8  # of the largest push: what is as strong is its crest
 DRAWS = 200  # of a bootstrap
 
@@ -381,15 +382,20 @@ class Push:
         return Finding(ExternalForce.id, confidence, said, [self.joint], when=when, parameters={"torque": size})
 
 
-def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:
+def find_pushes(
+    model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0, asked: Sequence[str] | None = None
+) -> list[Push]:
     """Return of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; []
-    where no torque was logged."""
+    where no torque was logged. asked: joints (default all). One that rests tells of no inertia, gravity or friction."""
     out: list[Push] = []
     motions: dict[int, Stretch] = {}
     rng = np.random.default_rng(seed)
     for j, joint in enumerate(runs[0].joints):
+        if asked is not None and joint not in asked:
+            continue
+        wide = float(np.ptp(model.joint(joint).range)) or 1.0
         use = [r for r in range(len(runs)) if readable(runs[r], j)]
-        own = [r for r in use if r in fitted]
+        own = [r for r in use if r in fitted and np.ptp(runs[r].q[:, j]) > TRAVEL * wide]
         if not own:
             continue
         cutoff = min(min(inverse_dynamics.highest(runs[r].t) for r in use), 20.0)
