@@ -10,7 +10,7 @@ import pytest
 import torch
 from worlds import grasp_env
 
-from benchmarks import tools
+from benchmarks import machines, tools
 from benchmarks.learning import Bare
 from benchmarks.tape import Tape
 from dexsim.errors import UserError
@@ -102,3 +102,11 @@ def test_numbers_and_settings_are_split():
     with pytest.raises(UserError, match="worlds=8,x"):
         tools.numbers("8,x", "worlds")
     assert tools.split(["a=1", "b=2", "c"], {"a": "0"}) == ({"a": "1"}, ["b=2", "c"])
+
+
+def test_what_a_cable_costs_by_hand():
+    """125 MB need 0.1 s at 10 Gbit/s: 1.6 s an iteration after one node's 1.5 s, 1.85 s after 1.75 s of a free cable."""
+    one, free = {"collect_s": 1.0, "learn_s": 0.5}, {"collect_s": 1.0, "learn_s": 0.75}
+    found = machines.computed(one, free | {"bytes_sent": [1.25e8, 1e8], "steps": 3000}, 10.0)
+    assert found["wire_s"] == pytest.approx(0.1) and found["seconds"] == pytest.approx([1.6, 1.85])
+    assert found["rate"] == pytest.approx([3000 / 1.6, 3000 / 1.85])
