@@ -105,7 +105,7 @@ def test_numbers_and_settings_are_split():
 
 
 def test_what_a_cable_costs_by_hand():
-    """125 MB need 0.1 s at 10 Gbit/s: 1.6 s an iteration after one node's 1.5 s, 1.85 s after 1.75 s of a free cable."""
+    """125 MB need 0.1 s at 10 Gbit/s: 1.6 s an iteration after one node's 1.5 s, 1.85 s after a free cable's 1.75."""
     one, free = {"collect_s": 1.0, "learn_s": 0.5}, {"collect_s": 1.0, "learn_s": 0.75}
     found = machines.computed(one, free | {"bytes_sent": [1.25e8, 1e8], "steps": 3000}, 10.0)
     assert found["wire_s"] == pytest.approx(0.1) and found["seconds"] == pytest.approx([1.6, 1.85])
