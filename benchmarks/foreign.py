@@ -39,7 +39,7 @@ SETTINGS = {
 
 
 def generate(plant: Path, wanted: Sequence[tuple[int, Sequence[int]]], out: Path, jobs: int) -> None:
-    """Cases into out/cases and out/truth: of each seed all (an empty list) or these numbers."""
+    """Write cases to out/cases and out/truth: of each seed all (an empty list) or these numbers."""
     with tempfile.TemporaryDirectory() as scratch:
         code = Path(scratch) / "plant"
         shutil.copytree(plant, code, ignore=shutil.ignore_patterns("cases", "truth", "results"))
@@ -70,8 +70,8 @@ def _generate(code: Path, seed: int, only: Sequence[int], out: Path, jobs: int) 
 
 
 def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
-    """One case as a user would run it: without the recordings that the scorer keeps, from files that tell nothing of
-    the case."""
+    """Diagnose one case as a user would run it: without the recordings that the scorer keeps, from files that tell
+    nothing of the case."""
     if (out / "run.json").is_file():
         return
     out.mkdir(parents=True, exist_ok=True)

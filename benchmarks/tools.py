@@ -62,8 +62,8 @@ def numbers(text: str, name: str) -> list[int]:
 def run(work: Sequence[jobs.Job], engine: jobs.Engine) -> None:
     """Run the jobs that have not ended well before. Raises UserError for one that fails now, when all have ended."""
     notes = {job: json.loads(job.note.read_text("utf-8")) for job in work if job.note.is_file()}
-    left = [job for job in work if job not in notes or notes[job]["done"] < len(job.commands)]
-    for job, status in zip(left, jobs.run(left, engine) if left else (), strict=True):
+    waiting = [job for job in work if job not in notes or notes[job]["done"] < len(job.commands)]
+    for job, status in zip(waiting, jobs.run(waiting, engine) if waiting else (), strict=True):
         if status:
             raise UserError(f"{job.folder.name} ended with status {status}: see {job.note.with_suffix('.txt')}")
 
@@ -92,7 +92,7 @@ def load() -> float | None:
 
 
 def wait(device: str) -> None:
-    """Until the device has done all that was asked of it."""
+    """Wait until the device has done all that was asked of it."""
     if device.startswith("cuda"):
         torch.cuda.synchronize(device)
 

@@ -222,7 +222,7 @@ def test_a_second_run_changes_nothing(claw, tmp_path):
     before = {p.relative_to(hand): p.read_bytes() for p in hand.rglob("*") if p.is_file() and p.name != ".import.json"}
     result = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
     after = {p.relative_to(hand): p.read_bytes() for p in hand.rglob("*") if p.is_file() and p.name != ".import.json"}
-    assert before == after and result.corrected == [] and result.kept == []
+    assert before == after and result.corrected == [] and result.carried == []
 
 
 def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, one_start, tmp_path):
@@ -254,7 +254,7 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, one_start, 
     for place in ("palm.position", "fingers.middle.tip.normal"):
         assert place not in now["guessed"]
     assert "palm.normal" in now["guessed"] and "poses.cupped" in now["guessed"]
-    assert sorted(result.kept) == ["notes.txt", "servo.yaml"] and "palm.position" in result.corrected
+    assert sorted(result.carried) == ["notes.txt", "servo.yaml"] and "palm.position" in result.corrected
     assert (hand / "servo.yaml").read_text().endswith("# measured\n") and (hand / "notes.txt").read_text() == "mine"
     assert (hand / "check.png").read_bytes() == b"a picture"
     again = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)

@@ -138,7 +138,7 @@ def test_nohup_is_left_alone():
         with Stop() as stop:
             stop.gently = True
             os.kill(os.getpid(), signal.SIGHUP)
-            assert not stop.asked() and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            assert not stop.requested() and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
 

@@ -136,13 +136,13 @@ def test_signals_that_are_there(monkeypatch):
     with Stop() as stop:
         stop.gently = True
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.asked() and stop.status == 143
+        assert stop.requested() and stop.status == 143
     monkeypatch.setattr(signal, "SIGBREAK", hangup, raising=False)  # Windows: the window is closed
     with Stop() as stop:
         stop.gently = True
         monkeypatch.setattr("dexsim.console.stop.without_terminal", lambda: None)
         os.kill(os.getpid(), hangup)
-        assert stop.asked() and stop.status == 128 + hangup
+        assert stop.requested() and stop.status == 128 + hangup
 
 
 @pytest.mark.slow

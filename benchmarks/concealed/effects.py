@@ -62,7 +62,7 @@ def _late(L, n, o):
 
 
 def _logged(x):
-    """As a log of 100 Hz tells it: commands come, and torque follows them, in steps of 10 ms."""
+    """Return a signal as a log of 100 Hz tells it: commands come, and torque follows them, in steps of 10 ms."""
     return np.convolve(x, np.ones(10) / 10, "same")
 
 

@@ -423,7 +423,7 @@ def _also(kind: Kind, d: rigs.Drawn, j: int, source: int) -> list[str]:
 
 
 def _logs(run: dict, command: np.ndarray, j: int, source: int) -> list[dict[str, np.ndarray]]:
-    """For each recording to fit, what is true of a joint in every millisecond [M]: the plant's outputs at it, its
+    """Return for each recording to fit what is true of a joint in every millisecond [M]: the plant's outputs at it, its
     command, the angle of the joint that it may hang on, the others' torque."""
     out = []
     for k in range(len(RECORDINGS) - HELD):

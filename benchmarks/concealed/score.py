@@ -312,7 +312,7 @@ def table(results: list[dict]) -> dict[str, dict]:
 
 
 def by_effect(results: list[dict]) -> list[tuple[str, str]]:
-    """For each effect: right of all at each tier, and what it was taken for."""
+    """Count for each effect: right of all at each tier, and what it was taken for."""
     out = []
     for effect in sorted({r["hidden"][0][0] for r in results if "right" in r}):
         mine = [r for r in results if "right" in r and r["hidden"][0][0] == effect]

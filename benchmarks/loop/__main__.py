@@ -282,7 +282,7 @@ def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
 
 
 def _share(r: dict) -> str:
-    """With its interval; of one seed there is none."""
+    """Write a share with its interval; of one seed there is none."""
     return f"{r['value']:.2f} " + (f"({r['low']:.2f} to {r['high']:.2f})" if r["seeds"] > 1 else "(one seed)")
 
 

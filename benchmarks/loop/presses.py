@@ -198,7 +198,7 @@ def _onset(model, u: float, v: float) -> float:
 
 
 def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target: Path) -> None:
-    """One recording: readings as the bus delivers them, the load cell, the slides' positions."""
+    """Write one recording: readings as the bus delivers them, the load cell, the slides' positions."""
     from dexsim.recording import write
     from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
 

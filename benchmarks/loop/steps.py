@@ -35,7 +35,7 @@ SETTLED, MARGIN, LEAST = 0.05, 0.02, 0.6
 
 
 def start(given: dict[str, str]) -> None:
-    """A checkpoint to resume from, out of one that holds a policy only: its actor, a fresh critic and optimizer,
+    """Make a checkpoint to resume from, out of one that holds a policy only: its actor, a fresh critic and optimizer,
     nothing counted."""
     import torch
 
@@ -60,9 +60,9 @@ def start(given: dict[str, str]) -> None:
 
 
 def record(given: dict[str, str]) -> None:
-    """Recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late and lost
-    as there. As fast as the policies' own runs there were (own=a.mcap,b.mcap), since a limit that no motion meets is
-    not found."""
+    """Make recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late
+    and lost as there. As fast as the policies' own runs there were (own=a.mcap,b.mcap), since a limit that no motion
+    meets is not found."""
     from dexsim.recording import read
     from dexsim.recording.excitation import Limits, plan
     from dexsim.recording.mechanism import mechanism

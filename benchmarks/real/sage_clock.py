@@ -42,7 +42,7 @@ class _Joint:
 
 
 def late(data: Path) -> dict[str, float]:
-    """By motion: the difference of log-likelihoods in favour of commands logged a period late; above `SURE` they
+    """Return by motion the difference of log-likelihoods in favour of commands logged a period late; above `SURE` they
     are."""
     files = sorted(data.glob("*.npz"))
     if not files:

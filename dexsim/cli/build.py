@@ -53,5 +53,5 @@ def close(env: Any) -> None:
 
 
 def print_tables(env: Any) -> None:
-    """Observation, action, reward, termination and randomization tables."""
+    """Print observation, action, reward, termination and randomization tables."""
     print("\n" + describe_env(env.describe()) + "\n", flush=True)

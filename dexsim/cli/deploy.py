@@ -213,7 +213,7 @@ def _run(loops: Sequence[Any]) -> None:
 
 
 def _each(works: Sequence[Any]) -> None:
-    """Do all; what the first that fails raises comes after the last."""
+    """Call all; what the first that fails raises comes after the last."""
     with contextlib.ExitStack() as stack:
         for work in reversed(works):
             stack.callback(work)
@@ -244,7 +244,7 @@ class _Stop:
 
 
 def _ending(report: Any, recorder: Any, name: str = "hand") -> None:
-    """What the run was, on standard output."""
+    """Print what the run was."""
     if report.not_relaxed:
         print(f"\nDANGER   the {name} could not be relaxed ({report.not_relaxed}): cut its power", flush=True)
     hand = f"the {name} may still drive" if report.not_relaxed else f"the {name} is relaxed"

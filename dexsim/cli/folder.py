@@ -86,8 +86,8 @@ class ProgressFile:
         if earlier is not None and earlier.is_file():  # a resumed run's past
             whole = earlier.read_text("utf-8").splitlines(keepends=True)
             whole = [line for line in whole if line.endswith("\n")]  # power may have failed within the last one
-            kept = (row for row in csv.DictReader(whole) if int(row["iteration"]) <= until)
-            rows = [{k: v for k, v in row.items() if v} for row in kept]
+            earlier_rows = (row for row in csv.DictReader(whole) if int(row["iteration"]) <= until)
+            rows = [{k: v for k, v in row.items() if v} for row in earlier_rows]
             self._names = list(dict.fromkeys(k for row in rows for k in row))
             self._write(rows)
 

@@ -41,8 +41,8 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     if play["view_while"] is not None:
         threading.Thread(target=_end_with, args=(int(play["view_while"]), view), daemon=True).start()
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
-    asked = f"/?token={view.token}" if view.token else ""
-    print(f"view     http://{name}:{view.port}{asked}   (Ctrl-C ends)", flush=True)
+    query = f"/?token={view.token}" if view.token else ""
+    print(f"view     http://{name}:{view.port}{query}   (Ctrl-C ends)", flush=True)
     if host == "127.0.0.1":
         print(
             f"         from another machine: ssh -L {view.port}:localhost:{view.port} THIS_MACHINE,"
@@ -50,7 +50,7 @@ def run(start: Start, env: Any, policy: Policy) -> int:
             flush=True,
         )
     if play["view_open"]:
-        webbrowser.open(f"http://{name}:{view.port}{asked}")
+        webbrowser.open(f"http://{name}:{view.port}{query}")
     try:
         view.run(play["view_seconds"])
     except KeyboardInterrupt:

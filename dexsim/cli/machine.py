@@ -15,25 +15,25 @@ from dexsim.version import VERSION
 PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 
 
-def device(asked: str | None) -> str:
-    """Return  "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not
+def device(setting: str | None) -> str:
+    """Return "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not
     here."""
     count = cuda_devices()
-    if asked is None:
+    if setting is None:
         return "cuda:0" if count else "cpu"
-    name, _, index = str(asked).partition(":")
+    name, _, index = str(setting).partition(":")
     if name == "cpu" and not index:
         return "cpu"
     if name == "cuda" and (not index or index.isdecimal()):
         if not count:
             raise UserError(
-                f"device={asked}: torch {torch.__version__} sees no CUDA device here; use device=cpu"
+                f"device={setting}: torch {torch.__version__} sees no CUDA device here; use device=cpu"
                 " (or check nvidia-smi and that torch is a CUDA build)"
             )
         if int(index or 0) >= count:
-            raise UserError(f"device={asked}: this machine has {count} CUDA device(s), cuda:0 to cuda:{count - 1}")
+            raise UserError(f"device={setting}: this machine has {count} CUDA device(s), cuda:0 to cuda:{count - 1}")
         return f"cuda:{int(index or 0)}"
-    raise UserError(f"device={asked}: must be cpu, cuda or cuda:<number>")
+    raise UserError(f"device={setting}: must be cpu, cuda or cuda:<number>")
 
 
 def cuda_devices() -> int:
@@ -42,9 +42,9 @@ def cuda_devices() -> int:
 
 
 def set_threads(where: str) -> None:
-    """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread
-    pool of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds
-    took 150 to 480 ms with two, 37 to 75 with one: lab/results/speed.md)."""
+    """Use one torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a
+    thread pool of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of
+    256 worlds took 150 to 480 ms with two, 37 to 75 with one: lab/results/speed.md)."""
     if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
 

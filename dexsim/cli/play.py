@@ -58,8 +58,8 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         try:
             replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
         except KeyboardInterrupt:
-            kept = "; what was recorded until now is kept" if recorder is not None else ""
-            print(f"\nbroken off{kept}", flush=True)
+            saved = "; what was recorded until now is kept" if recorder is not None else ""
+            print(f"\nbroken off{saved}", flush=True)
         else:
             stop.status = 0
         finally:

@@ -60,7 +60,8 @@ def main(argv: Sequence[str]) -> int:
     counts = {"states": 0, "commands": 0}
 
     def array(x: Any, names: Sequence[str]) -> np.ndarray | None:
-        """In the order of the first message's joints; None where a field is empty or a joint is missing."""
+        """Return values in the order of the first message's joints; None where a field is empty or a joint is
+        missing."""
         if x is None or len(x) != len(names) or any(j not in names for j in joints):
             return None
         return np.asarray(x, float)[[list(names).index(j) for j in joints]]

@@ -223,7 +223,7 @@ def _device(cfg: DictConfig) -> str:
 
 
 def _rank_device(cfg: DictConfig) -> str:
-    """As `_device`, for one of the processes that torchrun may have started."""
+    """Return the device as `_device` does, for one of the processes that torchrun may have started."""
     from dexsim.cli import machine
     from dexsim.learning.ranks import Ranks
 

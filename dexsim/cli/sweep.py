@@ -88,7 +88,7 @@ def _cuda() -> list[str]:
 
 
 def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Callable[[Any], None]) -> None:
-    """Hydra's own entry, with our settings file; its one-line refusals become UserError."""
+    """Run Hydra's own entry with our settings file; its one-line refusals become UserError."""
     from hydra._internal.utils import _run_hydra, get_args_parser
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -114,10 +114,10 @@ def _collect(folder: Path) -> tuple[list[tuple], bool]:
     failed."""
     rows, failed = [], False
     notes = sorted(folder.glob("jobs/*.json"), key=lambda p: int(p.stem))
-    told = [json.loads(note.read_text("utf-8")) for note in notes]
-    typed = [[x for x in note["commands"][0][1:] if not x.startswith("out=")] for note in told]
-    common = set.intersection(*map(set, typed)) if len(told) > 1 else set()
-    for note, job, own in zip(notes, told, typed):
+    jobs_run = [json.loads(note.read_text("utf-8")) for note in notes]
+    typed = [[x for x in note["commands"][0][1:] if not x.startswith("out=")] for note in jobs_run]
+    common = set.intersection(*map(set, typed)) if len(jobs_run) > 1 else set()
+    for note, job, own in zip(notes, jobs_run, typed):
         progress: list[dict[str, str]] = []
         if (run := folder / note.stem / "progress.csv").exists():
             with open(run, newline="", encoding="utf-8") as file:

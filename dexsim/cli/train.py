@@ -73,7 +73,7 @@ def _run(
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
-    stop.asked()  # Ctrl-C while compiling: nothing to save
+    stop.requested()  # Ctrl-C while compiling: nothing to save
     runner = Runner(env, cfg, machine.versions(), ranks, start.typed)
     if start.data is not None:
         runner.restore(start.data, str(start.source))
@@ -88,7 +88,7 @@ def _run(
     log = Log(runner, where, start, watch) if ranks.leader else None
     stop.gently = True
     try:
-        finished = runner.learn(cfg["iterations"], log.iteration if log else lambda row: None, stop.asked)
+        finished = runner.learn(cfg["iterations"], log.iteration if log else lambda row: None, stop.requested)
     except checkpoint.SaveError:
         raise
     except UserError as error:

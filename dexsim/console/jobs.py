@@ -104,9 +104,9 @@ def run(jobs: Sequence[Job], engine: Engine) -> list[int]:
                 if isinstance(error, UserError):
                     raise error
                 status[k] = LOST if error is not None else future.result()
-                left = (time.perf_counter() - began) / ended * (len(jobs) - ended)
+                remaining = (time.perf_counter() - began) / ended * (len(jobs) - ended)
                 said = f"lost ({_line(error)})" if error is not None else f"status {status[k]}" if status[k] else "done"
-                more = f", about {duration(left)} left" if ended < len(jobs) else ""
+                more = f", about {duration(remaining)} left" if ended < len(jobs) else ""
                 print(f"  {jobs[k].folder.name}: {said}; {ended} of {len(jobs)}{more}", flush=True)
     return status
 

@@ -23,7 +23,7 @@ def name(job: str) -> str:
 
 
 def typed() -> str:
-    """This process's command line as the user typed it."""
+    """Return this process's command line as the user typed it."""
     given = sys.argv[1:]
     head = name(given[0]) if given and not _by_door() else f"python {Path(sys.argv[0]).name}"
     return " ".join([head, *map(shlex.quote, given if _by_door() else given[1:])])

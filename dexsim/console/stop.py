@@ -24,7 +24,7 @@ class Stop:
 
     def __init__(self, several: bool = False) -> None:
         self.gently, self.status = False, 130
-        self._asked, self._several, self._last = False, several, -math.inf
+        self._requested, self._several, self._last = False, several, -math.inf
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stop:
@@ -46,14 +46,14 @@ class Stop:
         self.status = 128 + number
         if system.terminal_gone(number):
             without_terminal()
-        if not self.gently or self._asked:
+        if not self.gently or self._requested:
             raise KeyboardInterrupt
-        self._asked = True
+        self._requested = True
         print("\nstopping and saving (Ctrl-C again: stop at once, without saving)", flush=True)
 
-    def asked(self) -> bool:
+    def requested(self) -> bool:
         """Return whether someone asked to stop."""
-        return self._asked
+        return self._requested
 
 
 def without_terminal() -> None:

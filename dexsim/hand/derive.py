@@ -71,7 +71,7 @@ def derived(spec: mujoco.MjSpec, mirror: bool, scale: float) -> mujoco.MjSpec:
 
 
 def _plain(item: Any, kind: str) -> None:
-    """Its orientation as a quaternion: the other notations of MJCF are not rewritten."""
+    """Return its orientation as a quaternion: the other notations of MJCF are not rewritten."""
     if item.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         raise UserError(
             f"hand_mirror, hand_scale: {kind} '{item.name}' is turned by euler, axisangle, xyaxes or zaxis;"

@@ -242,7 +242,7 @@ def _poses(file: HandFile, limits: np.ndarray, where: str) -> None:
 
 
 def _reduced(hand: Hand) -> tuple[object, tuple[str, bool, float]]:
-    """To another process a hand goes as its folder: MuJoCo's models being edited cannot be pickled."""
+    """Return a hand as another process gets it, as its folder: MuJoCo's models being edited cannot be pickled."""
     return load_hand, (str(hand.folder), hand.mirror, hand.scale)
 
 

@@ -158,8 +158,8 @@ def _tips(spec: mujoco.MjSpec, file: HandFile, where: str) -> list[tuple[str, ..
 
 
 def _collide(spec: mujoco.MjSpec, tips: set[str]) -> None:
-    """Bits and contact settings. A model whose bits are dexsim's already is left as it is, all of it; of another, its
-    bits are about the hand itself: they move up by two, and every geom that collides meets objects too."""
+    """Set bits and contact settings. A model whose bits are dexsim's already is left as it is, all of it; of another,
+    its bits are about the hand itself: they move up by two, and every geom that collides meets objects too."""
     colliding = [g for g in spec.geoms if g.contype or g.conaffinity]
     ours = any(g.contype & HAND_BIT and g.conaffinity & OBJECT_BIT for g in colliding)
     if ours and not any(g.contype & OBJECT_BIT or g.conaffinity & HAND_BIT for g in colliding):

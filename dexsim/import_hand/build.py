@@ -69,8 +69,8 @@ def build(
         while b != tree.palm:
             owner.setdefault(b, k)
             b = int(m.body_parentid[b])
-    kept = _subtree(m, tree.palm)
-    for b in kept:
+    bodies = _subtree(m, tree.palm)
+    for b in bodies:
         if b != tree.palm and b not in owner:
             parent = int(m.body_parentid[b])
             owner[b] = owner.get(parent, -1)
@@ -137,7 +137,7 @@ def build(
                 f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'
                 f' rgba="{_colour(m, g)}"/>'
             )
-        for child in kept:
+        for child in bodies:
             if m.body_parentid[child] == b:
                 emit(child, depth + 1)
         lines.append(f"{pad}</body>")
@@ -175,7 +175,7 @@ def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> str:
 def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]) -> tuple[list[str], str, str]:
     """Return lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
     names = {m.joint(j).name for j in tree.every}
-    drums, tendons, ties, kept = [], [], [], set()
+    drums, tendons, ties, driven = [], [], [], set()
     for pull in pulls:
         at = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in pull.arms.items())
         drum = _t(f"{DRIVE}{pull.name}")
@@ -194,7 +194,7 @@ def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]
         arms = {j: c for j, c in arms.items() if j in names}
         if not arms:
             continue
-        kept.add(t)
+        driven.add(t)
         along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in arms.items())
         own = "".join(f' {key}="{_n(value)}"' for key, value in (
             ("stiffness", m.tendon_stiffness[t]), ("damping", m.tendon_damping[t]),
@@ -211,8 +211,8 @@ def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]
             if m.joint(pair[0]).name not in names:
                 continue
         else:
-            what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k in kept]
-            if pair[0] not in kept:
+            what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k in driven]
+            if pair[0] not in driven:
                 continue
         both = " ".join(f'{what}{n}="{_t(x)}"' for n, x in enumerate(of, 1))
         ties.append(f'    <{what} {both} polycoef="{_n(m.eq_data[e, :5])}" solref="{TIE}"/>')

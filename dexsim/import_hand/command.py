@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     )  # fmt: skip
     if result.corrected:
         print(f"kept     your corrections: {', '.join(result.corrected)}")
-    for name in result.kept:
+    for name in result.carried:
         print(f"kept     {name}, which you changed or added (delete it to have it written anew)")
     print(
         f"\n{out}/hand.yaml holds {len(result.hand['guessed'])} guesses. Look at {out}/picture.png, correct hand.yaml,"

@@ -33,9 +33,9 @@ def claim(folder: Path) -> dict[str, Any] | None:
 
 
 @contextmanager
-def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterator[Path]:
+def staged(folder: Path, note: dict[str, Any] | None, carried: list[str]) -> Iterator[Path]:
     """Yield a folder beside `folder`, which it replaces when the block ends. Files of the old one that the importer did
-    not write, or that a person changed since, are carried over and named in `kept` (hand.yaml, whose corrections are
+    not write, or that a person changed since, are carried over and named in `carried` (hand.yaml, whose corrections are
     kept field by field, excepted). Where the block raises, `folder` stays as it was."""
     folders.make(folder.parent, "out=")
     stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.writing-", dir=folder.parent))
@@ -43,7 +43,7 @@ def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterat
     try:
         yield stage
         if note is not None:
-            _carry(folder, stage, note["files"], kept)
+            _carry(folder, stage, note["files"], carried)
         if folder.exists():
             aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old-", dir=folder.parent))
             os.rename(folder, aside / "was")
@@ -63,18 +63,18 @@ def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterat
         shutil.rmtree(stage, ignore_errors=True)
 
 
-def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
+def _carry(old: Path, new: Path, sums: dict[str, str], carried: list[str]) -> None:
     for path in sorted(p for p in old.rglob("*") if p.is_file() and not p.is_symlink()):
         name = path.relative_to(old).as_posix()
         if name in (HAND, corrections.NOTE):
             continue
-        shown = name == outputs.WRITTEN or (name in SHOWN and outputs.ours(old, name))
-        if not shown and name in sums and sha(path) == sums[name]:
+        drawn = name == outputs.WRITTEN or (name in SHOWN and outputs.ours(old, name))
+        if not drawn and name in sums and sha(path) == sums[name]:
             continue
         (new / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, new / name)
-        if not shown:
-            kept.append(name)
+        if not drawn:
+            carried.append(name)
 
 
 def write_note(folder: Path, hand: dict[str, Any], said: list[str]) -> None:

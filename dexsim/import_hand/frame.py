@@ -197,12 +197,12 @@ def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: 
     best = far()
     for _ in range(2):
         for j in flexion[1:]:
-            kept = q[j]
+            best_angle = q[j]
             for angle in np.linspace(m.jnt_range[j, 0], m.jnt_range[j, 1], 41):
                 q[j] = angle
                 if (reach := far()) > best + 1e-6:
-                    best, kept = reach, angle
-            q[j] = kept
+                    best, best_angle = reach, angle
+            q[j] = best_angle
     return q[flexion].copy(), best
 
 
@@ -238,8 +238,8 @@ def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
         others = [n for n in range(len(motions)) if n != k]
         pointing = 1 - unit(tips - roots)[k] @ unit(unit(tips - roots)[others].mean(0))
         closing = 1 - normals[k] @ unit(normals[others].mean(0))
-        apart = np.linalg.norm(roots[k] - roots[others].mean(0)) / spread
-        score.append(pointing + closing + 0.5 * apart)
+        separation = np.linalg.norm(roots[k] - roots[others].mean(0)) / spread
+        score.append(pointing + closing + 0.5 * separation)
     return [int(np.argmax(score))]
 
 

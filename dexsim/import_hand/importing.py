@@ -65,13 +65,13 @@ class Settings:
 
 @dataclass
 class Result:
-    """folder; hand: content of hand.yaml; lines: what was found, for a person; kept: files a person changed; corrected:
-    places whose values a person gave."""
+    """folder; hand: content of hand.yaml; lines: what was found, for a person; carried: files a person changed;
+    corrected: places whose values a person gave."""
 
     folder: Path
     hand: dict[str, Any]
     lines: list[str]
-    kept: list[str]
+    carried: list[str]
     corrected: list[str]
 
 
@@ -112,8 +112,8 @@ def import_hand(
     for text in robot.coupled:
         tell(f"coupled: {text}" if settings.coupled == "keep" else
              f"taken apart: {text}: each of these joints has a motor of its own here")  # fmt: skip
-    if found.left:
-        tell(f"fixed: {', '.join(found.left)} (before the palm '{m.body(found.palm).name}')")
+    if found.before_palm:
+        tell(f"fixed: {', '.join(found.before_palm)} (before the palm '{m.body(found.palm).name}')")
 
     undriven = [m.joint(j).name for j in found.joints if m.joint(j).name not in robot.drives.moved]
     if robot.drives.moved and undriven and settings.coupled == "keep":
@@ -146,10 +146,10 @@ def import_hand(
     ):  # fmt: skip
         if missing:
             values = sorted({guess[j] for j in missing})
-            shown = f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
+            values_text = f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
             first = ", ".join(missing[:4]) + (" ..." if len(missing) > 4 else "")
             tell(f"missing: {what} of {len(missing)} joints ({first}):"
-                 f" guessed {shown} {unit}; say {what}=NUMBER, or correct joints in hand.yaml")  # fmt: skip
+                 f" guessed {values_text} {unit}; say {what}=NUMBER, or correct joints in hand.yaml")  # fmt: skip
     if known.guessed_armature:
         tell(
             f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2"
@@ -169,12 +169,12 @@ def import_hand(
     made = shapes.make(m, found, motions, palm)
     name = settings.name or _word(fixes.pick("name", robot.name))
     text = f"{name}: written by dexsim import-hand from {model.name}"
-    apart = poses.near_the_palm(m, found)
-    own = build.build(name, m, found, made, known, apart, text, pulls)
+    exclusions = poses.near_the_palm(m, found)
+    own = build.build(name, m, found, made, known, exclusions, text, pulls)
     search = _search(own, m, found, motions, thumbs, palm, pulls, reach)
     drawn = poses.always_overlapping(search)
     if drawn:
-        own = build.build(name, m, found, made, known, apart + drawn, text, pulls)
+        own = build.build(name, m, found, made, known, exclusions + drawn, text, pulls)
         search = _search(own, m, found, motions, thumbs, palm, pulls, reach)
     never, meet = poses.meetings(search)
     tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
@@ -182,7 +182,7 @@ def import_hand(
 
     order = [str(j) for j in fixes.pick(corrections.ORDER, _driven(m, found, pulls))]
     closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
-    own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text, pulls)
+    own = build.build(name, m, found, made, known, sorted(set(exclusions + drawn + never)), text, pulls)
 
     pads = _pads(m, motions, made, settings, where, tell)
     hand = _hand(
@@ -193,8 +193,8 @@ def import_hand(
         hand["sensed"] = sensed
     hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
     hand["source"] = {"file": model.name, "written by": "dexsim import-hand"}
-    kept: list[str] = []
-    with folder.staged(out, note, kept) as stage:
+    carried: list[str] = []
+    with folder.staged(out, note, carried) as stage:
         own.write(stage)
         for finger, pad in pads.items():
             (stage / f"taxels_{finger}.csv").write_text(pad.csv(), encoding="ascii")
@@ -220,7 +220,7 @@ def import_hand(
         if picture:
             _picture(loaded, stage, tell)
         folder.write_note(stage, hand, sorted(fixes.used - {corrections.ORDER}))
-    return Result(out, hand, lines, kept, sorted(fixes.used))
+    return Result(out, hand, lines, carried, sorted(fixes.used))
 
 
 def _driven(m: mujoco.MjModel, found: tree.Tree, pulls: Sequence[Pull]) -> list[str]:

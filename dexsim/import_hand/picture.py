@@ -162,11 +162,11 @@ def _tips(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.Mj
 
 
 def _joints(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData) -> None:
-    """Joint names beside the picture, each with a line to its joint."""
+    """Write joint names beside the picture, each with a line to its joint."""
     at = shot.project(np.array([d.xanchor[model.joint(j).id] for j in hand.joints]))
     width, height = shot.size
-    left = at[:, 0] < np.median(at[:, 0])
-    for side, x, align in ((left, 4, "left"), (~left, width - 4, "right")):
+    on_left = at[:, 0] < np.median(at[:, 0])
+    for side, x, align in ((on_left, 4, "left"), (~on_left, width - 4, "right")):
         order = np.flatnonzero(side)[np.argsort(at[side, 1])]
         for slot, k in enumerate(order):
             y = height * (slot + 0.7) / (len(order) + 0.4)

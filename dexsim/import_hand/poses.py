@@ -238,14 +238,14 @@ def meetings(s: Search, count: int = 1500, seed: int = 0) -> tuple[list[tuple[st
             if depth > 0.002:
                 touched[a, b] = touched.get((a, b), 0) + 1
     every = set()
-    apart = {(int(e) >> 16, int(e) & 0xFFFF) for e in m.exclude_signature}
+    excluded = {(int(e) >> 16, int(e) & 0xFFFF) for e in m.exclude_signature}
     bodies = [b for b in range(1, m.nbody) if any(m.geom_contype[g] for g in range(m.ngeom) if m.geom_bodyid[g] == b)]
     for i, one in enumerate(bodies):
         for other in bodies[i + 1 :]:
-            if _can_meet(m, one, other) and not {(one, other), (other, one)} & apart:
+            if _can_meet(m, one, other) and not {(one, other), (other, one)} & excluded:
                 every.add((m.body(one).name, m.body(other).name))
-    kept = {p for p, n in touched.items() if n >= max(2, count // 500)}
-    return sorted(every - kept), len(kept & every)
+    frequent = {p for p, n in touched.items() if n >= max(2, count // 500)}
+    return sorted(every - frequent), len(frequent & every)
 
 
 def _can_meet(m: mujoco.MjModel, a: int, b: int) -> bool:

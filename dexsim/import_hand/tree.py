@@ -34,12 +34,12 @@ class Finger:
 
 @dataclass
 class Tree:
-    """palm: id of the body that all fingers hang on; fingers; left: names of joints before the palm (a wrist, an
+    """palm: id of the body that all fingers hang on; fingers; before_palm: names of joints before the palm (a wrist, an
     arm), which are fixed; passive: ids of the fingers' joints that follow others."""
 
     palm: int
     fingers: list[Finger]
-    left: list[str]
+    before_palm: list[str]
     passive: set[int] = field(default_factory=set)
 
     @property
@@ -89,8 +89,8 @@ def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:
             )
         fingers.append(Finger("", joints, tip, _tip_geoms(m, tip)))
     _name(m, fingers)
-    left = [m.joint(j).name for b in below[root] for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])]
-    return Tree(root, fingers, left)
+    before = [m.joint(j).name for j in range(m.njnt) if m.jnt_bodyid[j] in below[root]]
+    return Tree(root, fingers, before)
 
 
 def _path(m: mujoco.MjModel, body: int) -> list[int]:

@@ -57,18 +57,18 @@ class Ranks:
         self._lifeline: Lifeline | None = None
         self._store: Any = None
 
-    def device(self, asked: str | None, cuda_devices: int) -> str | None:
+    def device(self, setting: str | None, cuda_devices: int) -> str | None:
         """Return the device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do
         not suffice.
 
         Args:
-            asked: the setting ``device``. cuda_devices: how many this machine has.
+            setting: of ``device``. cuda_devices: how many this machine has.
         """
-        if self.size == 1 or asked == "cpu" or (asked is None and not cuda_devices):
-            return asked
-        if asked not in (None, "cuda"):
+        if self.size == 1 or setting == "cpu" or (setting is None and not cuda_devices):
+            return setting
+        if setting not in (None, "cuda"):
             raise UserError(
-                f"device={asked}: under torchrun each process takes the GPU of its own number; leave device= away"
+                f"device={setting}: under torchrun each process takes the GPU of its own number; leave device= away"
                 " (CUDA_VISIBLE_DEVICES chooses which)"
             )
         if self.here > cuda_devices:

@@ -13,7 +13,6 @@ from mujoco_warp._src.types import vec5
 from dexsim.sim.engine import ContactPair, geoms_of
 
 # Sums are fixed-point integers: integer atomics commute, so results do not depend on the order of threads.
-_SCALE = 65536.0  # 1.5e-5 N resolution, +-32 kN range
 
 
 def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair]) -> np.ndarray:
