@@ -122,6 +122,26 @@ def test_what_begins_in_the_middle_of_a_motion_goes_on_as_it_did(profile):
     assert np.sqrt(np.mean(right**2)) < 2e-3 and np.sqrt(np.mean(slow**2)) > 0.1
 
 
+def test_a_step_that_a_recording_begins_with_acts_after_its_delay():
+    """What was sent before is not known: a search's plant holds the joint where it rests until the step acts, as a
+    replay does; it is not in force from the begin on."""
+    believed = ServoTable.from_dict({"joints": {"*": test_gap.SERVO | {"delay": 0.05, "profile_speed": 3.0}}})
+    m, t = test_gap.mechanism_of(believed), np.arange(0, 1.5, 0.01)
+    sent = Series(t, np.full((len(t), 1), 0.7), COMMANDS, t.copy())
+    whole = drive(m, sent, ["joint"], 1.5, np.zeros(1), timestep=5e-4)
+    made = recorded(whole, m, sent, ["joint"])
+    q = whole.position[::10]
+    run = Run("a", ("joint",), t, sent.value, whole.t[::10], q, believed, np.array([0, 0, -9.81]))
+    run.smooth()
+    case = build(test_gap.model(), [run])[0]
+    windows = case.plant.windows(None)
+    plant, seen = case.plant.simulate(case.plant.base()[None], windows)[0][0], case.plant.q[windows.sample_row]
+    assert np.abs(q[whole.t[::10] < 0.05]).max() < 1e-3 and q[-1] > 0.6
+    assert np.abs(plant - seen).max() < 2e-3
+    again = replay(made, m)
+    assert np.abs(again.position[:, 0] - np.interp(again.t, whole.t, whole.position[:, 0])).max() < 1e-3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("changes", "seed"), [({"profile_speed": 1.6}, 0), (BOTH, 1)])
 def test_a_planted_profile_is_named_and_sized(changes, seed):

@@ -106,7 +106,7 @@ class Variant:
     label: str = ""
     fixed: tuple[tuple[str, float], ...] = ()
     note: dict = field(default_factory=dict)
-    refines: bool = False  # adds parameters to the first variant: tried only where that one was found
+    refines: bool = False  # adds parameters to a variant before it: tried only where that one was found
     approximate: bool = False  # the servo table has it less exactly: tried only where what stands in for it leaves much
     complexity_price: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
     laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)

@@ -112,11 +112,11 @@ class SetpointProfile(Effect):
         # from rest to the peak speed in 0.3 ms to 2 s
         bend = param("acceleration", "profile_acceleration", "set", 0.5 * peak, 3000 * peak, steep, "rad/s2")
         speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.012, 0.05, 0.2, 0.7)
-        both = tuple((x * peak, x * peak / t) for x in (0.8, 1.0, 1.3) for t in rises)
+        both = tuple((x * peak, peak / t) for x, t in zip((1.0, 0.8, 1.3, 1.0), rises, strict=True))
         return [
             Variant((speed,), tuple((x * peak,) for x in speeds), "speed"),
             Variant((bend,), tuple((peak / t,) for t in rises), "acceleration"),
-            Variant((speed, bend), both, "speed and acceleration"),
+            Variant((speed, bend), both, "speed and acceleration", refines=True),
         ]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:

@@ -25,6 +25,7 @@ from dexsim.recording.mechanism import QUICK
 from dexsim.recording.smooth import local_polynomial
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
+STEPPED = 0.25  # of how far a joint goes: a first target farther from where it rests is a step
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples: numerics of the parts of a recording that may ring by itself
 FEWEST_OF_ALL = 2 * FEWEST_SAMPLES  # of a whole recording, of whose differences a moment or a correlation is taken
@@ -248,8 +249,7 @@ def moved(
                 nominal_row(believed[i], rotor),
                 mech[i][0],
                 mech[i][1][j],
-                run.cmd_t,
-                run.cmd[:, j],
+                *_sent(run, j),
                 run.t,
                 run.q[:, j],
                 effort,
@@ -262,6 +262,16 @@ def moved(
 
     used = dict(zip(wanted, compute.each(len(wanted), one), strict=True))
     return Motion(mech, constants, rows, others, used)
+
+
+def _sent(run: Run, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [K] s and values [K] of a joint's targets. Where the first is a step away from a joint that rests,
+    what was sent before is not known: it is where the joint is, as a replay takes it, until that one acts."""
+    t, targets, (_, q) = run.cmd_t, run.cmd[:, j], run.readings(j)
+    way = np.ptp(q)
+    if t[0] < run.t[0] or abs(targets[0] - q[0]) < STEPPED * way or np.abs(q[:3] - q[0]).max() > 0.01 * way:
+        return t, targets
+    return np.r_[t[0] - 1.0, t], np.r_[q[0], targets]
 
 
 def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:

@@ -144,6 +144,8 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
         if run.read is None and not between.all():
             stale |= between
         if stale.any() and (~stale).sum() >= 20:
+            # where it rested until its first reading, it is known from the begin on, as a replay takes it
+            stale[0] &= not np.array_equal(run.q[0], run.q[np.argmin(stale)], equal_nan=True)
             _keep(run, ~stale)
     return list(found.values()), out, blind
 

@@ -114,7 +114,8 @@ def search_joint(search: JointSearch) -> Outcome:
             current = swapped(search, current, pool)
     current = from_plain(search, beside_alike(search, forks, current, pool, price))
     if not search.deadline.over():
-        for move in (dropped, approximated, refined_members, by_laws, more_general):
+        # a further effect may have imitated what a refinement adds
+        for move in (dropped, approximated, refined_members, dropped, by_laws, more_general):
             current = move(search, current)
     search.progressed(0.1)
     current, final = settled(search, current, pool)
@@ -447,7 +448,15 @@ def refined_members(search: JointSearch, current: Trial) -> Trial:
                 values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
                 tries.append(search.draft(members, np.concatenate(values), current))
             more = search.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
-            if earns(search, more, current, further=False) and priced_loss(search, more) < priced_loss(search, current):
+            if more.fit.loss < current.fit.loss:  # is it what was added, or the fit that goes on from there?
+                values[i] = np.array([more.fit.value(f"{member.id}.{p.key}") for p in member.variant.params])
+                again = search.fit(current.members, np.concatenate(values), more, quick=True)
+                current = again if again.fit.loss < current.fit.loss else current
+            better = earns(search, more, current, further=False)
+            if not better and more.fit.loss < (1 - SEARCH.least) * current.fit.loss:  # as of `best_of`
+                more = refolded(search, more)
+                better = earns(search, more, current, further=False)
+            if better and priced_loss(search, more) < priced_loss(search, current):
                 current = more
                 break
     return current
