@@ -7,6 +7,7 @@ import pytest
 
 from dexsim import guard
 from dexsim.errors import UserError
+from dexsim.gap.audit import main as audited
 from dexsim.recording import read, write
 from dexsim.recording.columns import _role
 from dexsim.recording.convert import convert
@@ -359,6 +360,17 @@ def test_a_unit_is_guessed_only_where_rad_is_not_possible(tmp_path):
     square = np.where(np.sin(5 * T) > 0, 1.0, -1.0)
     path = csv(tmp_path / "e.csv", {"time": T, "command.elbow": square, "position.elbow": np.roll(square, 3)})
     assert not [f for f in read(path, limits=LIMITS).findings if f.kind == "unit"]
+
+
+def test_recordings_that_are_guessed_apart_are_said(tmp_path, capsys):
+    """Percent that reaches its ends in one recording only, and elsewhere looks like degrees."""
+    paths = []
+    for name, size in (("a.csv", 50.0), ("b.csv", 20.0)):
+        u = 50 + size * np.sin(4 * T)
+        paths.append(str(csv(tmp_path / name, {"time": T, "command.elbow": u, "position.elbow": np.roll(u, 3)})))
+    audited(paths)
+    said = capsys.readouterr().out
+    assert "by its values taken for percent here, for deg in b.csv" in said and "State units.position=" in said
 
 
 def test_a_column_may_say_that_it_is_along_its_range(tmp_path):

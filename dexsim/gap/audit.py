@@ -120,6 +120,12 @@ def findings(recordings: Sequence[Recording], m: Mechanism) -> tuple[list[Run], 
             topic = (f.topics or [""])[0]
             out[name].append(Finding(kind, topic, when[0]["start"], len(when), text, severity, joint, when[-1]["end"]))
     for joint in dict.fromkeys(j for r in runs for j in r.joints):
+        taken = {r.guessed[joint]: r.path.name for r in reversed(recordings) if joint in r.guessed}
+        for r in recordings if len(taken) > 1 else ():
+            if (mine := r.guessed.get(joint, "")) in taken:
+                rest = ", ".join(f"for {unit} in {name}" for unit, name in taken.items() if unit != mine)
+                text = f"{joint}: by its values taken for {mine} here, {rest}: one machine? State units.position="
+                out[r.path.name].append(Finding("unit", "", float("nan"), len(recordings), text, "warning", joint))
         for name, kind, text in agreement.contradictions(runs, joint):
             if not any(f.kind == kind and f.joint == joint for f in out[name]):
                 out[name].append(Finding(kind, STATES, 0.0, 1, text, "warning", joint))
@@ -397,7 +403,8 @@ def main(argv: Sequence[str]) -> int:
 
 def _new(more: Sequence[Finding], known: Sequence[Finding]) -> list[Finding]:
     """Return findings of which the reader's audit does not say the like already."""
-    there = {(f.kind, f.joint) for f in known if f.severity == "error"} | {(f.kind, "") for f in known if not f.joint}
+    there = {(f.kind, f.joint) for f in known if f.severity == "error"}
+    there |= {(f.kind, "") for f in known if not f.joint and (f.topic or f.kind != "unit")}  # no guess of a unit
     return [f for f in more if (f.kind, f.joint) not in there and (f.kind, "") not in there]
 
 

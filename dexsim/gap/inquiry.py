@@ -313,6 +313,12 @@ def to_runs(w: Inquiry) -> None:
         for f in r.findings
         if f.kind == "joint_names" and "left out" in f.text
     ]
+    guesses: dict[str, list[str]] = {}
+    for r in readable:
+        for f in r.findings:
+            if f.kind == "unit" and f.severity == "warning" and not f.topic:  # `Units.guess`, not the audit's
+                guesses.setdefault(f.text, []).append(r.path.name)
+    w.notes[:0] = [f"{', '.join(names)}: {text}" for text, names in guesses.items()]
     w.notes[:0] = [
         f"{r.path.name}: {f.text}; left out"
         for r in readable

@@ -568,6 +568,7 @@ class _Reading:
         }
         own = {j: self.ranges[n] for j, n in theirs.items() if n in self.ranges and free("position", j)}
         guessed = units.guess(both, own)
+        r.guessed = {j: guessed[j].text if j in guessed else "rad" for j in both}
         for k, joint in enumerate(r.joints):
             for quantity, series in parts.items():
                 if series is None or not len(series) or (quantity, theirs[joint]) in self.si:

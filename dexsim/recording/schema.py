@@ -230,7 +230,8 @@ class Recording:
     Effort is as recorded: `effort_sign` is not applied (`signed_effort` does).
     breaks: stretches [s] over which host time cannot be trusted: what came after is of another time.
     meta: every key of `KEYS`, defaults filled in. start_ns: host time of t = 0. findings: of reading and audit. hand:
-    the one whose joints these are, where that is known.
+    the one whose joints these are, where that is known. guessed: by joint whose unit of position is not stated, what it
+    was taken for (`Units.guess`).
     """
 
     path: Path
@@ -251,6 +252,7 @@ class Recording:
     config: str | None = None  # the resolved config attached to it, YAML
     breaks: list[tuple[float, float]] = field(default_factory=list)
     hand: Hand | None = None
+    guessed: dict[str, str] = field(default_factory=dict)
 
     @property
     def duration(self) -> float:
