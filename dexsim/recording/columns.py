@@ -440,7 +440,8 @@ def _unit(column: str) -> tuple[str, str]:
     match = re.search(r"^(.*[^_\s.])[_\s.]([A-Za-z]+(?:/s|_s)?)$", column)
     if match and match.group(2).lower() in known - {"1", "c", "a", "n", "m", "v", "s"}:
         return match.group(1), match.group(2).lower()
-    if match and match.group(2) in ("A", "N", "V", "s", "C", "m") and _known(match.group(1)):
+    letter = match and match.group(2) in ("A", "N", "V", "s", "C", "m") and column[match.end(1)] != "."  # a joint's
+    if match and letter and _known(match.group(1)):
         return match.group(1), match.group(2).lower()
     # current_mA.elbow
     match = re.search(r"^(.*[A-Za-z])[_\s]?[_\s(\[]([A-Za-z.]+(?:/s|_s)?)[)\]]?([./:\[(].+)$", column)
