@@ -43,9 +43,13 @@ class Comparison:
     notes: list[str] = field(default_factory=list)
 
     def position_rmse(self) -> np.ndarray:
-        """Return [J] rad."""
+        """Return [J] rad, over the readings of each joint; samples that repeat an old one do not count."""
+        from dexsim.gap.read.channels import own_readings
+
+        own = [own_readings(self.t, x) for x in self.position.T]
+        position = np.where(np.stack(own, 1), self.position, np.nan) if len(self.t) else self.position
         return (
-            np.sqrt(np.nanmean((self.position - self.position_simulated) ** 2, axis=0))
+            np.sqrt(np.nanmean((position - self.position_simulated) ** 2, axis=0))
             if len(self.t)
             else np.full(len(self.joints), np.nan)
         )

@@ -107,11 +107,11 @@ class SetpointProfile(Effect):
 
     def variants(self, s: Scales) -> list[Variant]:
         peak = s.peak_speed
-        fast, steep = min(s.nominal["profile_speed"], 30 * peak), min(s.nominal["profile_acceleration"], 3000 * peak)
+        fast, steep = min(s.nominal["profile_speed"], 30 * peak), min(s.nominal["profile_acceleration"], 400 * peak)
         speed = param("speed", "profile_speed", "set", 0.2 * peak, 30 * peak, fast, "rad/s")
-        # from rest to the peak speed in 0.3 ms to 2 s
-        bend = param("acceleration", "profile_acceleration", "set", 0.5 * peak, 3000 * peak, steep, "rad/s2")
-        speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.012, 0.05, 0.2, 0.7)
+        # from rest to the peak speed in 2.5 ms to 2 s
+        bend = param("acceleration", "profile_acceleration", "set", 0.5 * peak, 400 * peak, steep, "rad/s2")
+        speeds, rises = (0.5, 0.7, 0.85, 1.0, 1.2, 1.6), (0.012, 0.04, 0.1, 0.7)
         both = tuple((x * peak, peak / t) for x, t in zip((1.0, 0.8, 1.3, 1.0), rises, strict=True))
         return [
             Variant((speed,), tuple((x * peak,) for x in speeds), "speed"),

@@ -27,6 +27,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.read import Run
+from dexsim.gap.read.channels import own_readings
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.hand.couplings import Couplings
 from dexsim.recording.mechanism import (
@@ -663,8 +664,10 @@ def _start(r: Recording, start: float) -> float:
 
 def _missed(r: Recording, joint: str, t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return [2] sum of squares and number of what a free run q [T] at t [T] s misses of a joint's readings."""
-    state = r.states.position.between(t[0] - 1e-9, t[-1] + 1e-9)
-    d = state.value[:, r.joints.index(joint)] - np.interp(state.t, t, q)
+    state = r.states.position
+    seen = np.asarray(state.value[:, r.joints.index(joint)], float)
+    on = own_readings(state.t, seen) & (state.t >= t[0] - 1e-9) & (state.t <= t[-1] + 1e-9)
+    d = seen[on] - np.interp(state.t[on], t, q)
     return np.array([np.nansum(d**2), np.isfinite(d).sum()]) if np.isfinite(q).all() else np.array([np.inf, 1.0])
 
 

@@ -705,6 +705,15 @@ def between_readings(t: np.ndarray, q: np.ndarray, period: float) -> np.ndarray:
     return old
 
 
+def own_readings(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return [S] bool: finite samples, of an encoder that is read more seldom than it is logged the new ones."""
+    own = np.isfinite(q)
+    period = rhythm(t[own], q[own]) if own.sum() > 2 else 0.0
+    if period > 0:
+        own[own] = ~between_readings(t[own], q[own], period)
+    return own
+
+
 def _beat(t: np.ndarray, period: float, within: float) -> tuple[float, complex]:
     """Return (period within a share of the given one with which times t are most in step, mean of their turns round
     it)."""
