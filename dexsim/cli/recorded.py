@@ -105,6 +105,7 @@ def _object(own: dict[str, str]) -> Any:
 def run(play: dict[str, Any]) -> int:
     """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and
     video.mp4."""
+    from dexsim.gap.read.channels import own_readings
     from dexsim.recording import audit, compare, led_object, mechanism
     from dexsim.recording.reader import read
     from dexsim.recording.writer import write
@@ -149,6 +150,7 @@ def run(play: dict[str, Any]) -> int:
     follow = led_object.JOINT if placed != "none" else None
     result = mechanism.replay(recording, m, timestep, pairs, follow, hold, start, play["end"])
     c = compare.compare(recording, result, m, forces=led)
+    c.own = np.stack([own_readings(c.t, x) for x in c.position.T], 1) if len(c.t) else None
     position, effort = c.position_rmse(), c.effort_rmse()
     held = mechanism.held_joints(m, c.joints) if hold == "recorded" else []
     rows = [
@@ -156,7 +158,7 @@ def run(play: dict[str, Any]) -> int:
         for j, p, e in zip(c.joints, position, effort, strict=True)
     ]
     free = [k for k, j in enumerate(c.joints) if j not in held]
-    together = math.sqrt(float(np.nanmean((c.position - c.position_simulated)[:, free] ** 2))) if free else math.nan
+    together = math.sqrt(float(np.nanmean(c.missed[:, free] ** 2))) if free else math.nan
     if len(free) > 1:
         rows.append((f"all {len(free)} that run free", f"{1e3 * together:.2f}", ""))
     print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")

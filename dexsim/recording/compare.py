@@ -24,7 +24,8 @@ class Comparison:
 
     effort is in N.m: a recorded current is divided by the A per N.m that is known (`effort_scale` [J]) or, where
     none is (`fitted` [J] bool), by the one that fits best here. finger_force, finger_force_simulated: (t, [T, F]) or
-    None; force_unit: N or count; fingers: their names, none where the model is no hand.
+    None; force_unit: N or count; fingers: their names, none where the model is no hand. own [T, J] bool:
+    positions that count, which do not repeat an old reading (None: all).
     """
 
     joints: tuple[str, ...]
@@ -41,15 +42,18 @@ class Comparison:
     force_unit: str = "N"
     fingers: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
+    own: np.ndarray | None = None
+
+    @property
+    def missed(self) -> np.ndarray:
+        """Position less its simulation [T, J] rad; NaN where nothing counts."""
+        off = self.position - self.position_simulated
+        return off if self.own is None else np.where(self.own, off, np.nan)
 
     def position_rmse(self) -> np.ndarray:
-        """Return [J] rad, over the readings of each joint; samples that repeat an old one do not count."""
-        from dexsim.gap.read.channels import own_readings
-
-        own = [own_readings(self.t, x) for x in self.position.T]
-        position = np.where(np.stack(own, 1), self.position, np.nan) if len(self.t) else self.position
+        """Return [J] rad."""
         return (
-            np.sqrt(np.nanmean((position - self.position_simulated) ** 2, axis=0))
+            np.sqrt(np.nanmean(self.missed**2, axis=0))
             if len(self.t)
             else np.full(len(self.joints), np.nan)
         )
