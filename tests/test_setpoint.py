@@ -161,7 +161,7 @@ REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata" / "rh56" / "i
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="the recording of an RH56 finger is not here")
 def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
-    """An Inspire RH56's finger goes 492 counts at a steady 2070 a second: 3.04 rad/s, and no delay nor a weak drive.
+    """An Inspire RH56's finger goes 492 counts at a steady 2070 a second, 44 ms after its command: 3.04 rad/s.
     Its position is new every 20 ms, and of its one motion nothing can be held out: the name is doubted, and so said."""
     (tmp_path / "finger.xml").write_text(FINGER)
     (tmp_path / "finger.yaml").write_text("joints: {'*': {kp: 3.0, kd: 0.05, torque_limit: 0.6}}")
@@ -174,6 +174,10 @@ def test_the_speed_of_a_real_finger_is_its_firmwares(tmp_path):
     assert found["parameters"]["speed"]["value"] == pytest.approx(3.04, rel=0.1)
     assert d.data["verdict"] == "partly_explained" and "nothing that moves could be held out" in d.sentence
     assert d.data["held_out"]["after"] < 0.1 * d.data["held_out"]["before"]
+    # its dead time is beside its speed, and the files replayed miss what is reported
+    late = next(f for f in d.data["findings"] if f["effect"] == "command_delay")
+    assert late["parameters"]["delay"]["value"] == pytest.approx(0.0445, abs=0.005)
+    assert d.data["held_out"]["replayed"]["error"] == pytest.approx(d.data["held_out"]["after"], rel=0.1)
 
 
 def drive_in_training(servo):
