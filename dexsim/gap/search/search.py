@@ -114,8 +114,7 @@ def search_joint(search: JointSearch) -> Outcome:
             current = swapped(search, current, pool)
     current = from_plain(search, beside_alike(search, forks, current, pool, price))
     if not search.deadline.over():
-        # a further effect may have imitated what a refinement adds
-        for move in (dropped, approximated, refined_members, dropped, by_laws, more_general):
+        for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
     search.progressed(0.1)
     current, final = settled(search, current, pool)
@@ -430,7 +429,9 @@ def dropped(search: JointSearch, current: Trial) -> Trial:
 
 
 def refined_members(search: JointSearch, current: Trial) -> Trial:
-    """Return members with more parameters (an elasticity that hardens), where those earn their place."""
+    """Return members with more parameters (an elasticity that hardens), where those earn their place, without what had
+    only imitated that."""
+    found = False
     for i, member in enumerate(current.members):
         for whole in member.effect.variants(search.case.scales):
             variant = narrowed(search, member.effect, whole) if whole.refines else None
@@ -457,9 +458,9 @@ def refined_members(search: JointSearch, current: Trial) -> Trial:
                 more = refolded(search, more)
                 better = earns(search, more, current, further=False)
             if better and priced_loss(search, more) < priced_loss(search, current):
-                current = more
+                current, found = more, True
                 break
-    return current
+    return dropped(search, current) if found else current
 
 
 def approximated(search: JointSearch, current: Trial) -> Trial:
