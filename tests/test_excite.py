@@ -258,6 +258,14 @@ def test_a_servo_that_cannot_move_safely_is_refused():
         excitation.plan(m, kinds=("holds",))
 
 
+def test_motions_begin_higher_where_a_soft_drive_lets_a_link_sink_onto_a_limit():
+    m = rig(-1.0, 0.0)
+    m.spec.option.gravity = [-9.81, 0, 0]
+    made = excitation.plan(m, kinds=("triangles",))
+    sinks = 9.81 * 0.1 * 0.1 / 2.0  # rad: weight over gain
+    assert made.home[0] < -0.05 - 0.9 * sinks and made.peaks.excess < excitation.PASSED and not made.left_out
+
+
 def test_links_that_no_drive_carries_are_said_at_once(monkeypatch):
     m = rig()
     m.spec.option.gravity = [9.81, 0, 0]
