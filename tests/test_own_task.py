@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -313,6 +314,11 @@ def test_wrong_shapes_name_their_term():
         def joint_position(self):
             return self.q.sum()
 
+    class Typo(Flat):
+        settings = {"episod_s": 3.0}
+
+    with pytest.raises(UserError, match="task.episod_s: nothing reads this setting"):
+        stepped(made(Typo, worlds=1))
     with pytest.raises(UserError, match=r"reward one: has shape \[2, 1\], must be \[2\]"):
         stepped(made(Column, worlds=2))
     with pytest.raises(UserError, match=r"termination over: gives torch.bool \[2, 12\]"):
@@ -410,6 +416,21 @@ def test_a_scene_without_an_object():
     stepped(env, 3, 0.5)
     env.check()
     assert float(env.tip_force.sum()) == 0.0 and env.keep_worlds()
+
+    class Lost(Alone):
+        aim = memory(3)
+
+        @reward
+        def near(self):
+            return self.object_pose[:, 2]
+
+    with pytest.raises(UserError, match="reward near: reads object_pose, but the task's scene has none"):
+        made(Lost, worlds=1)
+    with pytest.raises(UserError, match=r"memory aim: cannot take \[2, 2\], it is declared as \[1, 3\]"):
+        Lost.aim.allocate(alone := SimpleNamespace(num_envs=1, device="cpu"))
+        Lost.aim.__set__(alone, torch.zeros(2, 2))
+    with pytest.raises(UserError, match="must take self and mask"):
+        event()(lambda self: None)
 
 
 @pytest.mark.parametrize("how", [Hinge(range=(-1.0, 2.0)), Slide(range=(-0.05, 0.05)), Screw(pitch=0.01)])

@@ -38,13 +38,13 @@ LABELS = {"property", "cached_property", "fixture", "setter", *"observe reward d
 """Decorators of methods whose docstring names a thing."""
 VERBS = set(
     """
-    abort accept accumulate act add adjust advance aggregate aim align allocate allow answer append apply arrange
+    abort accept accumulate act adapt add adjust advance aggregate aim align allocate allow answer append apply arrange
     ascend ask assemble assert assign attach average await bake balance begin bend bind blend blur bound break bring
     broadcast bucket build bundle cache call capture carry cast catch centre change check choose circle claim clamp
     classify clean clear climb clip close coerce collect colour combine command compare compensate compile complain
     complete compose compress compute concatenate condition confirm connect construct continue convert copy correct
     count couple cover create crop cross cut cycle damp decide declare decode default define delay delete derive
-    descend describe detach detect determine diagnose differ differentiate discard dispatch display dispose divide
+    descend describe detach detect determine diagnose differ differentiate discard dispatch display dispose divide do
     double download drag draw drive drop dry dump echo embed empty encode end enforce ensure enter enumerate equal
     escape estimate evaluate exceed exchange exclude execute exit expand expect explain export expose express extend
     extract fail fake feed fetch fill filter find finish fire fit fix flag flatten flip flush fold follow force
@@ -56,17 +56,17 @@ VERBS = set(
     normalize note notice notify number observe offer open order orient own pack pad paint parse part pass paste
     patch pay perform persist pick pin pipe place plan play plot point poll predict prefer prepare press prevent
     price print probe produce profile project promise propose protect prove prune publish pull push put quantise
-    quantize quiet quote raise randomize rank reach read realise reap rebuild receive reckon record redo reduce
-    refer refine refit refresh refuse regenerate register reject relax release reload remap remember remove rename
+    quantize queue quiet quote raise randomize rank reach read realise reap rebuild receive reckon record redo reduce
+    refer refine refit refresh refuse regenerate register reject relax release reload remap remember remove rename renew
     render repeat replace replay report request require resample reserve reset resize resolve respond rest restore
     restrict resume retry return reuse reverse rewrite rig rotate round route run sample save say scale scan scatter
-    schedule score search see seed select send separate serve set settle shadow shape share shift shorten show
+    schedule score search see seed select send sense separate serve set settle shadow shape share shift shorten show
     shrink shuffle sign simulate sink size skip sleep slice slide smooth snap solve sort sound spawn specify split
     spread squeeze stack stamp stand start state stay steer step stick stop store stream stretch strike strip study
     subtract suggest sum summarise summarize supply survive swap sweep switch synchronise synchronize tabulate tag
     take taper tear tell test tick time toggle touch trace track train transform translate trigger trim try tune
     turn type undo unfold unload unlock unpack unroll untie unwrap update upgrade use validate vary view visit wait
-    walk warm warn warp wear weigh widen wire work wrap write yield zero
+    walk warm warn warp watch wear weigh widen wire work wrap write yield zero
     """.split()
 )
 

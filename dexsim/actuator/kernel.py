@@ -269,8 +269,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                 r.inertia = wp.max(r.inertia, wp.static(real(LEAST_ROTOR)) * d.inertia[w, j])
                 r.on_loop = d.loop_motor[j] != 0
             d.state[w, j, x0 + ROTOR] = r.q
-            left = wp.max(d.base_armature[w, j] - r.inertia, -real(BORROWED) * d.inertia[w, j])
-            d.dof_armature[w, d.dof[j]] = left
+            armature = wp.max(d.base_armature[w, j] - r.inertia, -real(BORROWED) * d.inertia[w, j])
+            d.dof_armature[w, d.dof[j]] = armature
         return r
 
     @wp.func
@@ -289,28 +289,28 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         s.q += error[0] + error[1]
         s.scale += error[2]
         s.rate = s.scale * turning
-        heard, kept = hears(d.params[w, j], turning, memory, fresh, dt)
+        heard, carry = hears(d.params[w, j], turning, memory, fresh, dt)
         s.v = s.scale * heard[0]
         s.v_end = s.scale * heard[1]
         s.share = heard[2]
-        return s, kept
+        return s, carry
 
     @wp.func
     def remaining(dt: real, fresh: bool, last: real, memory: Memory, d: Drives, w: int, j: int):
         """Return (what the supply and the temperature leave of the motor, memory); last: its torque of the step
         before."""
         m = Motor()
-        left, kept = motor(d.params[w, j], d.params[w, j, WARMTH], last, wp.static(voltage), memory, fresh, dt)
-        m.tau0 = left[0]
-        m.no_load = left[1]
-        m.efficiency = left[2]
-        m.friction = left[3]
+        limits, carry = motor(d.params[w, j], d.params[w, j, WARMTH], last, wp.static(voltage), memory, fresh, dt)
+        m.tau0 = limits[0]
+        m.no_load = limits[1]
+        m.efficiency = limits[2]
+        m.friction = limits[3]
         others = real(0.0)
         if wp.static(sag):
             others = d.given[w] - wp.abs(d.torque[w, j])
-        supply, kept = leaves(d.params[w, j], d.params[w, j, SUPPLY], others, kept, fresh, dt)
+        supply, carry = leaves(d.params[w, j], d.params[w, j, SUPPLY], others, carry, fresh, dt)
         m.supply = supply
-        return m, kept
+        return m, carry
 
     @wp.func
     def control(
@@ -328,15 +328,15 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     ):
         """Return ((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the
         limits, at which its integral waits."""
-        waits, kept = late(d.params[w, j], d.time[w], memory, fresh, dt)
+        waits, carry = late(d.params[w, j], d.time[w], memory, fresh, dt)
         end = d.time[w] - waits + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
         if wp.static(rare):
             other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
             away = d.qpos[w, d.dof_q[other]] - d.home[w, other]
-            shift, kept = drags(d.params[w, j], away, kept, fresh, dt)
+            shift, carry = drags(d.params[w, j], away, carry, fresh, dt)
             target += shift
-        off, kept = lost(d.params[w, j], target, target - s.q, kept, fresh, dt)
+        off, carry = lost(d.params[w, j], target, target - s.q, carry, fresh, dt)
         u = pd(
             target - s.q,
             off,
@@ -351,7 +351,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             s.share,
         )
         if wp.static(not controller):
-            return wp.vector(u[0], u[1], u[2]), kept
+            return wp.vector(u[0], u[1], u[2]), carry
         wish = target_rates(d.state, w, j, queue, end - dt, dt)
         feed = feed_forward(d.params[w, j, FEED_SPEED], d.params[w, j, FEED_ACCELERATION], wish[0], wish[1])
         gain = d.params[w, j, INTEGRAL_GAIN]
@@ -360,7 +360,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             integral = d.state[w, j, x0 + INTEGRAL]
             integral = wind(integral, dt * gain * u[3], u[0] + feed + integral, lower, upper)
         d.state[w, j, x0 + INTEGRAL] = integral
-        return other_terms(u, feed, integral, gain, s.rate, s.scale, dt), kept
+        return other_terms(u, feed, integral, gain, s.rate, s.scale, dt), carry
 
     @wp.func
     def drive_voltage(u: vec3, v: real, m: Motor):
@@ -425,11 +425,11 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     ):
         """Return (the motor's torque after its lag, memory); writes what the current shows."""
         t = Torque()
-        kept = memory
+        carry = memory
         if wp.static(voltage):
             duty, then = control(dt, queue, x0, fresh, s, memory, real(1.0), real(1.0), d, w, j)
             t = drive_voltage(duty, r.v, m)
-            kept = then
+            carry = then
         else:
             x = wp.abs(r.v) / (m.no_load * m.supply)
             steep = real(1.0)
@@ -440,7 +440,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
             if r.two:
                 inertia = r.inertia
             u, then = control(dt, queue, x0, fresh, s, memory, limits[0], limits[1], d, w, j)
-            kept = then
+            carry = then
             t = drive_torque(dt, u, r.v, x, limits[0], limits[1], steep, inertia, m)
         if d.state[w, j, ENABLED] == real(0.0):
             t.now = real(0.0)
@@ -456,7 +456,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         t.end = m.efficiency * t.end
         t.slope = m.efficiency * (share * t.slope)
         t.on_drive = m.efficiency * share * t.on_drive
-        return t, kept
+        return t, carry
 
     @wp.func
     def resist(
@@ -471,13 +471,13 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         outside = real(0.0)
         if wp.static(load):
             outside = d.outside[w, d.dof[j]]
-        level, kept = dry(
+        level, carry = dry(
             d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, last, outside, wp.static(load), factor, memory, fresh, dt
         )
         f.level = d.base_frictionloss[w, j] + level[0]
         f.level += level[1] + level[2] + level[3]
         f.own = f.level - d.base_frictionloss[w, j]
-        how, kept = acts(d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, kept, fresh, dt)
+        how, carry = acts(d.params[w, j], d.qpos[w, d.dof_q[j]], r.v, carry, fresh, dt)
         f.uneven = how[0]
         if wp.static(presliding):  # a torque, taken up at the step's begin, and its line in the speed at the step's end
             f.give = how[1]
@@ -492,7 +492,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
                     sliding = f.own
                 f.taken = sliding * taken
                 f.viscous += sliding * dt / f.give * preslide_slope(taken, turned)
-        return f, kept
+        return f, carry
 
     @wp.func
     def couple(dt: real, t: Torque, f: Friction, r: Rotor, stiffness: real, d: Drives, w: int, j: int):
@@ -567,12 +567,12 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         for k in range(wp.static(len(remembered))):
             memory[wp.static(remembered[k])] = d.state[w, j, x0 + wp.static(remembered[k])]
         r = locate(dt, x0, fresh, d, w, j)
-        m, left = remaining(dt, fresh, last, memory, d, w, j)
-        s, heard = sense(dt, fresh, r, left, d, w, j)
-        t, asked = ask(dt, queue, x0, fresh, s, heard, r, m, d, w, j)
+        m, after_motor = remaining(dt, fresh, last, memory, d, w, j)
+        s, heard = sense(dt, fresh, r, after_motor, d, w, j)
+        t, after_asking = ask(dt, queue, x0, fresh, s, heard, r, m, d, w, j)
 
         # Ripple and its like; what of it brakes, or pulls like a spring, is taken at the end of the step.
-        beside, added = parasitic(d.params[w, j], q, r.v, asked, fresh, dt)
+        beside, added = parasitic(d.params[w, j], q, r.v, after_asking, fresh, dt)
         t.end += beside[0]
         stiffness = wp.max(real(0.0), -beside[1])
         t.end -= stiffness * dt * v
@@ -594,9 +594,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         damping += spring * dt
 
         # Dry friction: an interval of torques [-level (1 + a/2), +level (1 - a/2)], as a symmetric one and a constant.
-        f, kept = resist(dt, x0, fresh, last, r, m.friction, added, d, w, j)
+        f, carry = resist(dt, x0, fresh, last, r, m.friction, added, d, w, j)
         for k in range(wp.static(len(remembered))):
-            d.state[w, j, x0 + wp.static(remembered[k])] = kept[wp.static(remembered[k])]
+            d.state[w, j, x0 + wp.static(remembered[k])] = carry[wp.static(remembered[k])]
         if wp.static(play):
             d.state[w, j, x0 + LINE_A] = real(0.0)
             d.state[w, j, x0 + LINE_B] = real(1.0)

@@ -238,9 +238,7 @@ def warm_motor(features: frozenset[str] = frozenset()) -> Any:
     hands on take the motor from these two."""
 
     @wp.func
-    def motor(
-        of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any
-    ):
+    def motor(of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any):
         """Return ((stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction), memory) of a
         drive `warmth` [degC] above the temperature that its figures hold at (`warmed`); torque: what it gave in the
         step before [N.m].
@@ -283,7 +281,7 @@ def supply_left(features: frozenset[str] = frozenset()) -> Any:
     from the supply to what is left here, and in `reference.supply_left`; it needs the feature `sag`."""
 
     @wp.func
-    def left(of: wp.array(dtype=Any), supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
+    def remaining(of: wp.array(dtype=Any), supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
         """(supply over nominal, memory), where it would be `supply` without load and the other motors give |torque| of
         `others` [N.m] together."""
         there = supply
@@ -291,7 +289,7 @@ def supply_left(features: frozenset[str] = frozenset()) -> Any:
             there = sagging(there, of[SAG], others)
         return there, memory
 
-    return left
+    return remaining
 
 
 LEAST_ROTOR = 0.03  # of a joint's inertia: what each of rotor and link has at least of it
@@ -491,16 +489,16 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
             exponent = of[STRIBECK_EXPONENT]
         if of[STRIBECK_PEAK] > type(q)(0.0) or carries:
             power = stribeck_power(v / of[STRIBECK_SPEED], exponent)
-            left = type(q)(0.0)
+            fades = type(q)(0.0)
             if power < type(q)(gone) or carries:
-                left = wp.exp(-power)
+                fades = wp.exp(-power)
             if power < type(q)(gone):
-                fading = warm * of[STRIBECK_PEAK] * left
+                fading = warm * of[STRIBECK_PEAK] * fades
             if carries:
                 loaded = gear_friction(motor, outside, share, warm * of[LOAD_OUTSIDE])
                 by_both = gear_friction(motor, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
                 by_both += opposed_square(motor, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
-                loaded_fading = warm * left * by_both
+                loaded_fading = warm * fades * by_both
         return wp.vector(steady, fading, loaded, loaded_fading), memory
 
     return friction
@@ -655,8 +653,8 @@ def stand_in(constant: Any, by_position: Any, by_speed: Any, by_square: Any, q: 
 
 @wp.func
 def profiled(at: Any, speed: Any, target: Any, most: Any, acceleration: Any, dt: Any):
-    """(setpoint [rad], its speed [rad/s]) after a step of dt [s] from `at` towards the target [rad]: at most at the
-    speed `most` [rad/s], which changes by at most acceleration [rad/s2] * dt and comes to rest at the target.
+    """Return (setpoint [rad], its speed [rad/s]) after a step of dt [s] from `at` towards the target [rad]: at most at
+    the speed `most` [rad/s], which changes by at most acceleration [rad/s2] * dt and comes to rest at the target.
 
     A trapezoid in discrete time: in k steps of a deceleration a the setpoint goes a dt^2 k (k + 1) / 2, so that the
     fastest from which it stops within |d| is a dt (sqrt(1/4 + 2 |d| / (a dt^2)) - 1/2). Ours."""
@@ -696,7 +694,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
         slope = type(e)(0.0)
         acts = type(e)(2.0)
         kind = type(e)(0.0)
-        left = e
+        error = e
         if wp.static("profile" in features):
             if of[PROFILE_SPEED] < type(e)(1.0e8) or of[PROFILE_ACCELERATION] < type(e)(1.0e8):
                 now = wp.vector(target - e, type(e)(0.0))
@@ -714,13 +712,13 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
                 if of[PROFILE_ACCELERATION] >= type(e)(1.0e8):  # over the step, as of a target
                     mean -= type(e)(0.5) * now[1] * wp.abs(now[1]) * dt / of[PROFILE_SPEED]  # type: ignore[index]
                 lost += target - mean
-                left = e - lost
+                error = e - lost
         if wp.static("rare" in features):
             kind = of[DEADBAND_KIND]
         width = of[DEADBAND]
         if kind > type(e)(1.5):
-            lost += wp.clamp(left, -width, width)
-        if wp.abs(left) < width:
+            lost += wp.clamp(error, -width, width)
+        if wp.abs(error) < width:
             acts = type(e)(0.0)
             if kind > type(e)(0.5):
                 acts = type(e)(1.0)
@@ -730,19 +728,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
 
 
 @wp.func
-def pd(
-    e: Any,
-    lost: Any,
-    v: Any,
-    v_end: Any,
-    rate: Any,
-    scale: Any,
-    kp: Any,
-    kd: Any,
-    dt: Any,
-    age: Any,
-    share: Any,
-):
+def pd(e: Any, lost: Any, v: Any, v_end: Any, rate: Any, scale: Any, kp: Any, kd: Any, dt: Any, age: Any, share: Any):
     """Return (now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a
     step of dt [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained
     until then [N.m.s/rad].
@@ -773,18 +759,18 @@ def pd(
 
 
 @wp.func
-def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
-    """Return (now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term
+def other_terms(answer: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
+    """Return (now, end, slope) of `pd`'s answer with the torque of the feed-forward and the integral term
     [N.m]; the
     integral goes on over the step: + gain * dt * (e - rate dt), gain = `integral_gain` (source: above)."""
-    now = asked[0]
-    end = asked[1]
-    slope = asked[2]
-    if asked[4] > type(dt)(0.5):
+    now = answer[0]
+    end = answer[1]
+    slope = answer[2]
+    if answer[4] > type(dt)(0.5):
         now += feed + integral
         end += feed + integral
-    if asked[4] > type(dt)(1.5):
-        end += gain * dt * (asked[3] - dt * rate)
+    if answer[4] > type(dt)(1.5):
+        end += gain * dt * (answer[3] - dt * rate)
         slope += scale * gain * dt * dt
     return wp.vector(now, end, slope)
 
@@ -822,10 +808,10 @@ def hold(stamp: Any, span: Any, until: Any, begin: Any, dt: Any):
 
 
 @wp.func
-def wind(integral: Any, step: Any, asked: Any, lower: Any, upper: Any):
+def wind(integral: Any, step: Any, answer: Any, lower: Any, upper: Any):
     """Return the integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for,
     with it, is beyond the limits -lower .. upper and the step would take it further (conditional integration: K.
     Astrom, T. Hagglund, PID Controllers, 2nd ed. 1995, section 3.5)."""
-    if (asked > upper and step > type(step)(0.0)) or (asked < -lower and step < type(step)(0.0)):
+    if (answer > upper and step > type(step)(0.0)) or (answer < -lower and step < type(step)(0.0)):
         return integral
     return integral + step

@@ -54,11 +54,7 @@ def over_time(
 
 
 def measured_position(
-    p: Mapping[str, Any],
-    q: Any,
-    features: Collection[str] = FEATURES,
-    xp: Any = np,
-    step: Step | None = None,
+    p: Mapping[str, Any], q: Any, features: Collection[str] = FEATURES, xp: Any = np, step: Step | None = None
 ) -> tuple[Any, Any]:
     """Return (position [...] rad that an encoder shows where what it turns with is at q [...] rad, its slope in q):
     scale, offset and all terms of `laws.encoder_error`.
@@ -66,11 +62,11 @@ def measured_position(
     p: columns by name; features: those of `columns.FEATURES` that count; xp: whose arrays these are, `numpy` or
     `torch`: a servo says with this what its encoders report; step: what they remember, None from rest."""
     step = step or Step()
-    shown, slope = p["position_scale"] * q + p["position_offset"], p["position_scale"]
+    reading, slope = p["position_scale"] * q + p["position_offset"], p["position_scale"]
     if "rare" in features:
-        shown = shown + p["eccentric_sin"] * xp.sin(q) + p["eccentric_cos"] * (xp.cos(q) - 1.0)
+        reading = reading + p["eccentric_sin"] * xp.sin(q) + p["eccentric_cos"] * (xp.cos(q) - 1.0)
         slope = slope + p["eccentric_sin"] * xp.cos(q) - p["eccentric_cos"] * xp.sin(q)
-    return shown, slope
+    return reading, slope
 
 
 def shown_position(
@@ -260,7 +256,7 @@ def warm_motor(
 
 
 def torque_along(
-    asked: np.ndarray,
+    wanted: np.ndarray,
     v: np.ndarray,
     stall: Numbers,
     no_load: Numbers,
@@ -271,17 +267,17 @@ def torque_along(
 ) -> np.ndarray:
     """Return the motor torque [S] N.m along a measured motion: `laws.torque_limits`, or `laws.voltage_torque`.
 
-    asked [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
+    wanted [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
     (inf: no limit); supply: of its nominal voltage, of a voltage drive alone; limited: False leaves what is asked as it
     is; braking_slope: of the line while the drive brakes, of a torque drive (1: as it drives)."""
     if voltage:
-        duty = np.clip(asked, -1, 1) if limited else asked
+        duty = np.clip(wanted, -1, 1) if limited else wanted
         return stall * duty * supply - (stall / no_load * v if np.all(np.isfinite(no_load)) else 0.0)
     if not limited or not np.all(np.isfinite(stall)):
-        return asked
-    slope = np.where(asked * v < 0, braking_slope, 1.0)
+        return wanted
+    slope = np.where(wanted * v < 0, braking_slope, 1.0)
     limit = stall * np.maximum(1 - slope * (np.abs(v) / no_load), 0.0)
-    return np.clip(asked, -limit, limit)
+    return np.clip(wanted, -limit, limit)
 
 
 def lagged(t: np.ndarray, torque: np.ndarray, time: float, stages: int = 1) -> np.ndarray:
@@ -300,11 +296,7 @@ def lagged(t: np.ndarray, torque: np.ndarray, time: float, stages: int = 1) -> n
 
 
 def parasitic_torque(
-    p: Mapping[str, Numbers],
-    q: Numbers,
-    v: Numbers,
-    features: Collection[str] = FEATURES,
-    step: Step | None = None,
+    p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Return (torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its
     motor is
@@ -372,11 +364,7 @@ def dry_friction(
 
 
 def friction_acts(
-    p: Mapping[str, Numbers],
-    q: Numbers,
-    v: Numbers,
-    features: Collection[str] = FEATURES,
-    step: Step | None = None,
+    p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers]:
     """(share [...] by which the level moving positive is above the mean of both directions, how far [...] rad the joint
     gives way before it slides): of all terms of `laws.friction_acts`.
@@ -482,8 +470,8 @@ def servo(
         feed = p["speed_feedforward"] * rates[0] + p["acceleration_feedforward"] * rates[1]
         counted = np.where(dead, 0.0, e)
         added = dt * p["integral_gain"] * counted
-        asked = now + feed + integral
-        waits = ((asked > upper) & (added > 0.0)) | ((asked < -lower) & (added < 0.0))
+        wanted = now + feed + integral
+        waits = ((wanted > upper) & (added > 0.0)) | ((wanted < -lower) & (added < 0.0))
         integral = np.where(np.asarray(enabled) == 0.0, 0.0, integral + np.where(waits, 0.0, added))
         fed, off = ~dead | damped, ~dead
         now = now + np.where(fed, feed + integral, 0.0)
@@ -552,9 +540,7 @@ def servo(
     y = v_drive * dt / np.where(gives, give, 1.0)
     taken = np.where(gives & ~first, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
     sliding = np.where(gives, np.where(two, own, level), 0.0)
-    grease = grease + sliding * dt / np.where(gives, give, 1.0) * (1.0 - taken * np.sign(v_drive)) / (
-        1.0 + np.abs(y)
-    )
+    grease = grease + sliding * dt / np.where(gives, give, 1.0) * (1.0 - taken * np.sign(v_drive)) / (1.0 + np.abs(y))
     of_motor = of_motor - sliding * taken
 
     one = {
@@ -593,14 +579,11 @@ def servo(
         if play
         else base_armature
     )
-    kept = {name: np.asarray(value) for name, value in step.memory.items()}
-    return out | kept | {
-        "torque": motor_now,
-        "dof_armature": armature,
-        "rotor": rotor_q,
-        "integral": integral,
-        "taken": taken,
-    }
+    return (
+        out
+        | {name: np.asarray(value) for name, value in step.memory.items()}
+        | {"torque": motor_now, "dof_armature": armature, "rotor": rotor_q, "integral": integral, "taken": taken}
+    )
 
 
 def _rotor(

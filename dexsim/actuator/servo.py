@@ -218,12 +218,9 @@ class Servo:
     # -- targets ------------------------------------------------------------
 
     def send(
-        self,
-        target: torch.Tensor,
-        mask: torch.Tensor | None = None,
-        stamp: torch.Tensor | float | None = None,
+        self, target: torch.Tensor, mask: torch.Tensor | None = None, stamp: torch.Tensor | float | None = None
     ) -> None:
-        """Queues target [N, J] (rad) where mask [N] bool holds (None: all worlds), stamped [s] ([N] or one; None: now).
+        """Queue target [N, J] (rad) where mask [N] bool holds (None: all worlds), stamped [s] ([N] or one; None: now).
 
         Stamps must not decrease. With the table's control_rate a target acts from that bus's next tick. No host sync.
         """
@@ -275,8 +272,8 @@ class Servo:
 
     def measured(self, q: torch.Tensor) -> torch.Tensor:
         """Return what the encoders report [N, J] where they stand at q [N, J] (rad)."""
-        shown: torch.Tensor = measured_position(self._by_name, q, self.features, torch, self._remembered())[0]
-        return shown
+        reading: torch.Tensor = measured_position(self._by_name, q, self.features, torch, self._remembered())[0]
+        return reading
 
     def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
         """Return the position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
@@ -343,8 +340,7 @@ def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None
         if used and (source not in range(len(joints)) or source == j):
             raise UserError(
                 f"{table.source}: joints.{joint}.coupling_from is {source:g}; it must be the number of another joint, "
-                f"0 to {len(joints) - 1}: "
-                + ", ".join(f"{k} {name}" for k, name in enumerate(joints) if k != j)
+                f"0 to {len(joints) - 1}: " + ", ".join(f"{k} {name}" for k, name in enumerate(joints) if k != j)
             )
 
 

@@ -54,8 +54,6 @@ KEYS = (
 ALL = "*"
 
 
-
-
 class Content(msgspec.Struct):
     """`servo.yaml` around its columns, whose values `parse_value` reads. A per N.m, Hz, V."""
 
@@ -242,12 +240,7 @@ class ServoTable:
         return Value(neutral, neutral, neutral)
 
     def set(
-        self,
-        joint: str,
-        column: str,
-        value: float | None,
-        low: float | None = None,
-        high: float | None = None,
+        self, joint: str, column: str, value: float | None, low: float | None = None, high: float | None = None
     ) -> None:
         """States one joint's column (a fit, say); checked like a file's entry. value None: unknown."""
         if column not in INDEX:

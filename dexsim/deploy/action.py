@@ -32,7 +32,7 @@ class ActionRule:
 
     @classmethod
     def from_manifest(cls, action: dict) -> ActionRule:
-        """From a manifest's `action`."""
+        """Build it from a manifest's `action`."""
         if action["mode"] not in ("relative", "absolute"):
             raise UserError(f"manifest: action.mode={action['mode']}: must be relative or absolute")
         lead, low, high = (np.array(action[k], np.float32) for k in ("lead", "low", "high"))

@@ -43,7 +43,7 @@ class Bundle:
         return bool(self.manifest["policy"].get("state"))
 
     def begin(self) -> None:
-        """An episode begins: a recurrent policy forgets."""
+        """Begin an episode: a recurrent policy forgets."""
         self._carried = {}
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ def _hand(which: manifests.HandEntry, path: Path) -> Hand:
 
 
 def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
-    """The observation that the network was trained on is the one that is built here, row by row."""
+    """Check that the network was trained on the observation that is built here, row by row."""
     here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
     ours = [tuple(row[:3]) for row in measure.of(m["task"]).table(m, hand)]
     if here != ours:
@@ -184,7 +184,7 @@ def _act(
 
 
 def _tried(data: bytes, policy: Path, p: dict[str, Any]) -> None:
-    """The network answers an observation of zeros with one finite action a joint."""
+    """Check that the network answers an observation of zeros with one finite action a joint."""
     loaded = session(data, policy)
     try:
         out = np.asarray(_act(loaded, p, np.zeros((1, p["observation_size"]), np.float32), _blank(p))[0])

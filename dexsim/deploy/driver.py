@@ -78,7 +78,7 @@ class HandDriver(Protocol):
         text, False, or an object with an `error_code` that is not 0."""
 
     def relax(self) -> None:
-        """Mode 0 at every joint, as soon as possible; may be called from another thread, and twice."""
+        """Set mode 0 at every joint, as soon as possible; may be called from another thread, and twice."""
 
     def close(self) -> None:
         """Relax and disconnect."""

@@ -76,7 +76,7 @@ class Faults:
 
     @classmethod
     def parse(cls, text: str) -> Faults:
-        """From `crc=0.005,board=2`. Raises UserError."""
+        """Read faults from text such as `crc=0.005,board=2`. Raises UserError."""
         fields = {f.name: f for f in dataclasses.fields(cls)}
         changes: dict[str, Any] = {}
         for part in filter(None, text.split(",")):
@@ -107,17 +107,17 @@ class LaggingHand:
         self.target, self.stiff, self.limit = np.array(c.position, float), float(c.kp), np.array(c.tor_max, float)
 
     def relax(self) -> None:
-        """The motors are off."""
+        """Turn the motors off."""
         self.stiff = 0.0
 
     def advance(self, t: float) -> None:
-        """Up to time t [s]."""
+        """Advance up to time t [s]."""
         step, self.time = max(t - self.time, 0.0), t
         driven = (self.stiff > 0) & (self.limit > self.least)
         self.q = self.q + driven * (self.target - self.q) * (1 - np.exp(-step / self.lag))
 
     def state(self, now: float) -> HandState:
-        """As the SDK would give it."""
+        """Return the state as the SDK would give it."""
         drive = np.clip(20.0 * (self.target - self.q - self.push), -1, 1) * self.limit * (self.stiff > 0)
         touch = np.zeros((BOARDS, TAXELS, 3), np.int16)
         return HandState(now, 0, self.q + self.push, np.round(-drive), np.full(JOINTS, 33.0), tactile=touch)
@@ -159,8 +159,8 @@ class FakeXHand:
         return out
 
     def handle(self, what: int) -> None:
-        """The object is held out (1) or let go (2), in the simulated world; somebody presses finger k (3 + k), holds
-        something hard to joint j (101 + j), or no longer (100)."""
+        """Act as a person beside the simulated hand would: hold the object out (1), let it go (2), press finger k (3 +
+        k), hold something hard to joint j (101 + j), or no longer (100)."""
         if what >= 100:
             self.blocked = (what - 101, float("nan")) if what > 100 else (-1, float("nan"))
         elif what > 2:
@@ -316,7 +316,7 @@ class _Control:
         return _error(held.code), held.cache  # a frame is not written again once it is there
 
     def close_device(self) -> None:
-        """The hand keeps its last command."""
+        """Close the connection; the hand keeps its last command."""
         self._fake.closed.append(self._fake.time)
         self._port = ""
 
@@ -420,7 +420,7 @@ class _Control:
         return frame
 
     def _hold(self, s: HandState, hand: int) -> None:
-        """A joint that something is held to stays; it draws 3 A a rad that its target is ahead, and presses."""
+        """Stop a joint that something is held to: it draws 3 A a rad that its target is ahead, and presses."""
         j, at = self._fake.blocked
         if j < 0:
             return
@@ -434,7 +434,7 @@ class _Control:
         s.tactile[board, 60:66, 2] += int(0.02 * push)
 
     def _store(self, frame: SimpleNamespace, held: _Kept) -> None:
-        """The package's thread writes the cache: now, or, of a torn frame, to its end in 1.5 ms."""
+        """Write the cache, as the package's thread does: now, or, of a torn frame, to its end in 1.5 ms."""
         fake = self._fake
         held.cache, held.half = frame, None
         if fake.rng.random() < fake.faults.torn:

@@ -87,8 +87,8 @@ class UdpImu:
         """Return whether a first orientation comes within that time. What comes is read at once: in a flood of others'
         lines a queue that is looked at now and then would nearly always be full."""
         limit = time.monotonic() + seconds
-        while self.orientation(time.monotonic()) is None and (left := limit - time.monotonic()) > 0:
-            select.select([self._socket], [], [], left)
+        while self.orientation(time.monotonic()) is None and (remaining := limit - time.monotonic()) > 0:
+            select.select([self._socket], [], [], remaining)
         return self._last is not None
 
     def close(self) -> None:

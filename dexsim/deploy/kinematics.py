@@ -28,7 +28,7 @@ class HandKinematics:
         self.data = mujoco.MjData(self.model)
         m = self.model
         self._couplings = Couplings(m, hand.joints)
-        self._sensed = hand.sensed
+        self._joints, self._sensed = len(hand.joints), hand.sensed
         self._follower = [int(m.joint(name).qposadr[0]) for name in hand.sensed]
         bodies = [*hand.tip_bodies, *(p.body for p in hand.pads[len(hand.fingers) :])]
         self._body = np.array([m.body(b).id for b in bodies])
@@ -37,10 +37,9 @@ class HandKinematics:
         # taxels where the simulated ones are: on the surface that is pressed
         self.taxels = np.zeros((0, 0, 3)) if layout is None else layout.lifted(tip_skins(hand)).point.copy()
         self.pad_centre = np.zeros((0, 3)) if layout is None else layout.centre()
+        self.forget()
 
-    def __call__(
-        self, q: np.ndarray, follower: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, q: np.ndarray, follower: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return angles [J] rad -> (tips [F, 3] m, positions [B, 3] m and rotations [B, 3, 3] of the bodies of tips and
         skin). follower [S] rad: of measured joints without a drive; None: where the others hold them."""
         d = self.data
@@ -51,6 +50,21 @@ class HandKinematics:
         position, turn = d.xpos[self._body].copy(), d.xmat[self._body].reshape(-1, 3, 3).copy()
         f = len(self._offset)
         return position[:f] + np.einsum("fij,fj->fi", turn[:f], self._offset), position, turn
+
+    def forget(self) -> None:
+        """Forget the readings before, from which a velocity would follow."""
+        self._last: tuple[float, np.ndarray] | None = None
+        self._speed = np.zeros(self._joints)
+
+    def velocity(self, state: HandState) -> np.ndarray:
+        """Return [J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        if state.velocity is not None and np.isfinite(state.velocity).all():
+            return np.asarray(state.velocity, float)
+        q = np.asarray(state.position, float)
+        if self._last is not None and state.time > self._last[0]:
+            self._speed = (q - self._last[1]) / (state.time - self._last[0])
+        self._last = state.time, q
+        return self._speed
 
     def followers(self, state: HandState) -> torch.Tensor:
         """Return angles [1, S] rad of measured joints without a drive. Raises UserError where the driver does not

@@ -164,8 +164,8 @@ class Loop:
         keep: bool = False,
         say: Callable[[str], None] | None = None,
     ):
-        """eye: what sees the object, as `measure.needs` of the bundle's task has it (None: nothing has to). say: told
-        what a person beside the hand has to do."""
+        """Check the bundle against the driver. eye: what sees the object, as `measure.needs` of the bundle's task has
+        it (None: nothing has to). say: told what a person beside the hand has to do."""
         m, self.settings = bundle.manifest, settings
         settings.check()
         self.bundle, self.driver, self.eye, self.clock = bundle, driver, eye, clock or Clock()
@@ -212,7 +212,7 @@ class Loop:
         self._lock = threading.Lock()
         self._tripped: str | None = None
         self._sequence: int | None = None  # of the last reading that the driver gave, taken or not
-        self._felt = False  # the first reading had taxels
+        self._has_touch = False  # the first reading had taxels
         self._wrong: str | None = None  # why readings since the last good one were not taken
         self._given: HandState | None = None  # the driver's own object of the last reading
         self._sent: HandCommand | None = None
@@ -270,7 +270,7 @@ class Loop:
         return self.report
 
     def _shut(self, interval: float, watch: threading.Thread | None) -> None:
-        """What the run had changed is as it was, and its recording whole."""
+        """Undo what the run had changed, and complete its recording."""
         self.stop.set()
         gc.enable()
         gc.unfreeze()
@@ -305,7 +305,7 @@ class Loop:
         if (why := bad_sequence(state.sequence, None)) is not None:
             raise UserError(f"{self.driver.name}: {why}")
         self.state, self._sequence, self._good_at, self._checked = copied(state), state.sequence, now, now
-        self._felt = np.size(state.tactile) > 0
+        self._has_touch = np.size(state.tactile) > 0
         self.target = np.asarray(state.position, float).copy()
         if self.settings.home:
             self._begin_homing(self.clock.now())
@@ -314,7 +314,7 @@ class Loop:
             self._begin_run(self.clock.now())
 
     def _turns(self) -> None:
-        """Wake for whatever is due next, a reading or an action."""
+        """Take turns of the loop, each when a reading or an action is due."""
         c, s, timing = self.clock, self.settings, self.report.timing
         read_at = act_at = c.now()
         good_since, in_a_row = None, 0
@@ -422,7 +422,7 @@ class Loop:
         if given.sequence == self._sequence:
             return False
         state, self._given, self._sequence = copied(given), None, given.sequence
-        self._wrong = implausible(state, now, self.bundle.hand, self._taxels, self._felt)
+        self._wrong = implausible(state, now, self.bundle.hand, self._taxels, self._has_touch)
         if self._wrong is not None:
             self.report.counts["bad_readings"] += 1
             return False
@@ -589,7 +589,7 @@ class Loop:
         self._home_s = max(0.5, 1.875 * float(np.abs(self.home - self._from).max()) / self.settings.home_speed)
 
     def _end_homing(self) -> None:
-        """The hand must be at home; what the taxels say now is nothing."""
+        """Check that the hand is at home, and take what the taxels say now as zero."""
         error = np.abs(np.asarray(self.state.position, float) - self.home)
         if error.max() > self.settings.home_error:
             j = int(error.argmax())
@@ -647,7 +647,8 @@ class Loop:
                 continue
 
     def _confirm(self) -> None:
-        """What the hand shows of being limp, from a driver that can tell; waited for a second at most."""
+        """Wait, for a second at most, until a driver that can tell says whether the hand is limp; return what it
+        says."""
         released, limit = getattr(self.driver, "released", None), self.clock.now() + CONFIRM
         while released is not None and not self.report.not_relaxed:
             self.driver.read()
@@ -667,7 +668,7 @@ class Loop:
             self.say(f"DANGER   the hand may still drive: cut its power ({self.report.not_relaxed})")
 
     def _watch(self) -> None:
-        """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""
+        """Relax the hand when the loop itself hangs, in a driver's call, say: the watchdog's thread."""
         limit = self.settings.hang
         while not self.stop.wait(min(0.02, limit / 4)):
             assert self._beat is not None  # before this thread began

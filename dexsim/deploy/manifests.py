@@ -202,7 +202,7 @@ def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
 
 
 def _table(m: Manifest, source: object) -> None:
-    """The rows follow one another and fill the observation."""
+    """Check that the rows follow one another and fill the observation."""
     at = 0
     for k, row in enumerate(m.observation):
         if row.start != at or row.stop <= row.start:
@@ -217,7 +217,7 @@ def _table(m: Manifest, source: object) -> None:
 
 
 def _limits(m: Manifest, source: object, hand: Hand) -> None:
-    """One number a joint; ranges and speeds lie within the hand's own, poses within the ranges."""
+    """Check that each joint has a number, that ranges and speeds lie within the hand's own, poses within the ranges."""
     low, high = hand.limits.T
     J = len(hand.joints)
     slack = 1e-3

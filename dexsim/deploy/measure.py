@@ -28,7 +28,7 @@ class Measure(Protocol):
     needs: str | None
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin a new episode."""
 
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray

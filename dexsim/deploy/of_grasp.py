@@ -21,7 +21,7 @@ SIGNALS = observations
 
 
 def check(m: Any, source: object, again: str) -> None:
-    """UserError for a manifest that lacks what this task needs."""
+    """Raise UserError for a manifest that lacks what this task needs."""
     if m.normalization.force_max_N is None:
         raise UserError(f"{source}: lacks normalization.force_max_N, which task={m.task} needs; {again}")
 
@@ -101,7 +101,7 @@ class Measure:
         self.reset()
 
     def reset(self) -> None:
-        """A new episode: the next object position is the first."""
+        """Begin a new episode: the next object position is the first."""
         self._xy: np.ndarray | None = None
         self._z: torch.Tensor | None = None
 

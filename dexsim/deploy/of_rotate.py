@@ -25,7 +25,7 @@ SIGNALS = observations_rotate
 
 
 def check(m: Any, source: object, again: str) -> None:
-    """UserError for a manifest that lacks what this task needs."""
+    """Raise UserError for a manifest that lacks what this task needs."""
     if m.task_settings is None or m.grip is None:
         raise UserError(f"{source}: lacks task_settings or grip, which task={m.task} needs; {again}")
     convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", again)
@@ -120,12 +120,11 @@ class TurnMeasure:
         return len(hand.joints), len(hand.fingers), len(self.calibration.gain), len(hand.sensed)
 
     def reset(self) -> None:
-        """A new episode: the next orientation gives the first goal."""
+        """Begin a new episode: the next orientation gives the first goal."""
         self.goal: torch.Tensor | None = None
         self.goals = 0
         self._past: torch.Tensor | None = None
-        self._last: tuple[float, np.ndarray] | None = None
-        self._speed = np.zeros(len(self.calibration.hand.joints))
+        self.hand.forget()
 
     @torch.inference_mode()
     def observe(
@@ -163,12 +162,12 @@ class TurnMeasure:
             tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), tensor(target), self._middle, self._half,
             self.task["observe"].get("last_action", "step"))  # fmt: skip
         return observations_rotate.Signals(
-            tensor(state.position), tensor(self._velocity(state)), q, q if self.goal is None else self.goal, sent,
+            tensor(state.position), tensor(self.hand.velocity(state)), q, q if self.goal is None else self.goal, sent,
             tensor(force), tensor(centre), tensor(tips), past, torch.tensor([fresh]),
             self.hand.followers(state))  # fmt: skip
 
     def _aim(self, q: torch.Tensor) -> None:
-        """The first goal, or the next where this one is reached."""
+        """Set the first goal, or the next where this one is reached."""
         # rotation.error(q, goal): the angle whose half has the cosine |<q, goal>|; tangent of the half, accurate near 0
         reached = False
         if self.goal is not None:
@@ -177,13 +176,3 @@ class TurnMeasure:
         self.goals += reached
         if self.goal is None or reached:
             self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
-
-    def _velocity(self, state: HandState) -> np.ndarray:
-        """Return [J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
-        if state.velocity is not None and np.isfinite(state.velocity).all():
-            return np.asarray(state.velocity, float)
-        q = np.asarray(state.position, float)
-        if self._last is not None and state.time > self._last[0]:
-            self._speed = (q - self._last[1]) / (state.time - self._last[0])
-        self._last = state.time, q
-        return self._speed

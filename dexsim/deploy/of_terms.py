@@ -46,12 +46,12 @@ class Measured:
     methods for all else; whatever a hand does not tell is refused. asked: the signals that were used."""
 
     def __init__(self, task: Task, given: dict[str, torch.Tensor], term: str = ""):
-        self.__dict__.update(_task=task, _given=given, _term=term, asked={})
+        self.__dict__.update(_task=task, _given=given, _term=term, used={})
 
     def __getattr__(self, name: str) -> Any:
         task, given = self._task, self._given
         if name in given:
-            self.asked[name] = None
+            self.used[name] = None
             return given[name]
         if name == "commands":
             return _Commands(self)
@@ -92,19 +92,19 @@ class Observation(torch.nn.Module):
         self.rows = [r for r in task._sensed if task._named(task.task["observations"][r.term.name]["actor"])]
         shapes = signals(len(task.hand.joints), task.fingers, task.pads)
         self.shapes = shapes | {f"command {k}": (v.shape[1],) for k, v in task.commands.items()}
-        self.names = names or self._asked()
+        self.names = names or self._used()
 
-    def _asked(self) -> list[str]:
+    def _used(self) -> list[str]:
         """Return signals that the rows use, found by computing them once."""
         zeros = {k: torch.zeros(1, *shape) for k, shape in self.shapes.items()}
         zeros["object_pose"][:, 3] = 1.0
-        asked: dict[str, None] = {}
+        used: dict[str, None] = {}
         for row in self.rows:
             view = Measured(self.task, zeros, row.term.name)
             self._value(row, view)
-            asked |= view.asked
-        told = [k for k, x in self.task.task["commands"].items() if x["actor"]]
-        return [*asked, *(f"command {k}" for k in told if f"command {k}" not in asked)]
+            used |= view.used
+        commanded = [k for k, x in self.task.task["commands"].items() if x["actor"]]
+        return [*used, *(f"command {k}" for k in commanded if f"command {k}" not in used)]
 
     def _value(self, row: Any, view: Measured) -> torch.Tensor:
         value = row.term.method(view, **row.params)
@@ -114,8 +114,8 @@ class Observation(torch.nn.Module):
         """See the class."""
         by_name = dict(zip(self.names, given, strict=True))
         out = [self._value(row, Measured(self.task, by_name, row.term.name)) for row in self.rows]
-        told = [k for k, x in self.task.task["commands"].items() if x["actor"]]
-        return torch.cat([*out, *(by_name[f"command {k}"] for k in told)], 1)
+        commanded = [k for k, x in self.task.task["commands"].items() if x["actor"]]
+        return torch.cat([*out, *(by_name[f"command {k}"] for k in commanded)], 1)
 
     def of_env(self, world: int = 0) -> dict[str, torch.Tensor]:
         """Return the signals as the simulation has them, without noise."""
@@ -126,7 +126,7 @@ class Observation(torch.nn.Module):
 
 
 def check(m: Any, source: object, again: str) -> None:
-    """UserError for a manifest that lacks what a task of terms needs."""
+    """Raise UserError for a manifest that lacks what a task of terms needs."""
     if m.terms is None:
         raise UserError(f"{source}: task={m.task} is none of this dexsim's, and the manifest has no terms; {again}")
     wide = sum(r.width * r.frames for r in m.terms.rows) + sum(len(v) for v in m.terms.commands.values())
@@ -149,8 +149,8 @@ def parts(env: Task) -> dict[str, Any]:
     for row in of.rows:
         wide = row.width * row.frames * env.history
         rows.append((row.term.name, wide, row.unit or "1", row.term.options["real"] or row.term.text, "none"))
-    told = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
-    rows += [(k, v.shape[1] * env.history, "1", "told", "none") for k, v in told.items()]
+    commanded = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
+    rows += [(k, v.shape[1] * env.history, "1", "told", "none") for k, v in commanded.items()]
     width = env.sampler.width.clone()
     env.sampler.width.fill_(0.0)  # the middle of every range
     env.reset_all()
@@ -161,7 +161,7 @@ def parts(env: Task) -> dict[str, Any]:
             "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
             "rows": [{"name": r.term.name, "width": r.width, "frames": r.frames} for r in of.rows],
             "history": int(env.history),
-            "commands": {k: floats(v[0]) for k, v in told.items()},
+            "commands": {k: floats(v[0]) for k, v in commanded.items()},
         },
         "perception": {"object_pose": "something that sees where the object is and how it is turned, palm frame"
                        if "object_pose" in of.names else "none", "critic": "not deployed"},
@@ -203,11 +203,10 @@ class TermsMeasure:
         self.reset()
 
     def reset(self) -> None:
-        """A new episode: no past."""
+        """Begin a new episode, without a past."""
         self._frames: list[np.ndarray] = []
         self._past: np.ndarray | None = None
-        self._last: tuple[float, np.ndarray] | None = None
-        self._speed = np.zeros(len(self.calibration.hand.joints))
+        self.hand.forget()
         self._steps = 0
 
     def observe(
@@ -218,15 +217,15 @@ class TermsMeasure:
         c = self.calibration
         tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
-        told = self.commands
-        if len(told) == 1 and next(iter(told.values())).size == 1:
-            told = dict.fromkeys(told, np.array([command], np.float32))
+        commanded = self.commands
+        if len(commanded) == 1 and next(iter(commanded.values())).size == 1:
+            commanded = dict.fromkeys(commanded, np.array([command], np.float32))
         now = {
-            "q": state.position, "qd": self._velocity(state), "target": target,
+            "q": state.position, "qd": self.hand.velocity(state), "target": target,
             "torque": c.torque_norm(np.asarray(state.current, float) * 1e-3) * self.tau_max,
             "action": np.clip(np.nan_to_num(action), -1.0, 1.0), "touch_force": force, "touch_centre": centre,
             "tips": tips, "age": self._steps * self.period, "object_pose": seen,
-        } | {f"command {k}": v for k, v in told.items()}  # fmt: skip
+        } | {f"command {k}": v for k, v in commanded.items()}  # fmt: skip
         self._steps += 1
         return self.built({name: np.asarray(now[name], np.float32) for name in self.names}), force
 
@@ -249,16 +248,6 @@ class TermsMeasure:
         else:
             self._past = np.concatenate([whole[None], self._past[:-1]])
         return self._past.reshape(1, -1).astype(np.float32)
-
-    def _velocity(self, state: HandState) -> np.ndarray:
-        """Return [J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
-        if state.velocity is not None and np.isfinite(state.velocity).all():
-            return np.asarray(state.velocity, float)
-        q = np.asarray(state.position, float)
-        if self._last is not None and state.time > self._last[0]:
-            self._speed = (q - self._last[1]) / (state.time - self._last[0])
-        self._last = state.time, q
-        return self._speed
 
 
 def _input(name: str) -> str:

@@ -62,11 +62,11 @@ class Body(Protocol):
         """Return the object [9]: place [3] m, its time [s], orientation [4] w x y z, its time [s]; NaN where none."""
 
     def handle(self, what: int) -> None:
-        """The object is held out (1), or let go (2); finger k is pressed (3 + k); joint j is blocked (101 + j), or
-        none any more (100)."""
+        """Hold the object out (1), let it go (2), press finger k (3 + k), block joint j (101 + j), or none any more
+        (100)."""
 
     def close(self) -> None:
-        """Disconnect."""
+        """Close the connection."""
 
 
 class BusDriver:
@@ -123,9 +123,7 @@ class BusDriver:
         self._process = (
             _Thread(lambda: _serve(self._make, v, self.joints, self.hang, lambda: False))
             if self._inside
-            else context.Process(
-                target=_child, args=(self._make, shared, self.joints, self.hang, path), daemon=True
-            )
+            else context.Process(target=_child, args=(self._make, shared, self.joints, self.hang, path), daemon=True)
         )
         self._process.start()
         limit = time.monotonic() + self.start
@@ -195,20 +193,20 @@ class BusDriver:
         return None if state < 0 else (state == 1, _text(self._v["proof"]))
 
     def present(self) -> None:
-        """The object is held out."""
+        """Hold the object out."""
         self._handle(1)
 
     def started(self) -> None:
-        """The policy begins: the object is let go."""
+        """Let the object go: the policy begins."""
         self._handle(2)
 
     def press(self, finger: int) -> None:
-        """A fingertip is pressed, where somebody simulates that."""
+        """Press a fingertip, where somebody simulates that."""
         self._handle(3 + finger)
         self.relax()
 
     def block(self, joint: int) -> None:
-        """Something hard is held before a joint (-1: no longer), where somebody simulates that."""
+        """Hold something hard before a joint (-1: no longer), where somebody simulates that."""
         self._handle(101 + joint)
 
     def close(self) -> None:
@@ -293,7 +291,7 @@ class BusDriver:
                 self._lock.release()
 
     def _step(self, body: Body) -> HandState | None:
-        """In place: the bus cycles that have begun by now."""
+        """Step in place: the bus cycles that have begun by now."""
         clock, now = self.clock, self.clock.now()
         assert isinstance(clock, VirtualClock)
         clock.go(self._bus_time)  # the bus is ahead of the loop, by one clock: the package may have been given it
@@ -323,7 +321,7 @@ class BusDriver:
         return how
 
     def _end(self) -> None:
-        """No child, no files."""
+        """End the child and delete its files."""
         p, self._process = self._process, None
         if p is not None and p.is_alive():
             p.terminate()
@@ -351,17 +349,15 @@ class _Thread(threading.Thread):
             self.exitcode = code
 
     def terminate(self) -> None:
-        """Nobody can."""
+        """Do nothing: there is no process to end."""
 
     kill = terminate
 
 
 # -- the child
 # -------------------------------------------------------------------------------------------------------------------
-def _child(
-    make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, output: str
-) -> None:
-    """The child's process: no key of the loop's terminal reaches the one that holds the hand."""
+def _child(make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, output: str) -> None:
+    """Run the child's process: no key of the loop's terminal reaches the one that holds the hand."""
     system.leave_terminal()
     for number in system.hand_signals():
         signal.signal(number, signal.SIG_IGN)
@@ -471,5 +467,3 @@ def _say(where: Any, text: str) -> None:
 
 def _text(where: Any) -> str:
     return where.value.decode(errors="replace")
-
-

@@ -27,15 +27,12 @@ class _Bounds:
     high: Any
 
 
-_JOINT = (
-    _Bounds("current", "mA", -32768.0, 32767.0),
-    _Bounds("temperature", "degC", -60.0, 250.0),
-)
+_JOINT = (_Bounds("current", "mA", -32768.0, 32767.0), _Bounds("temperature", "degC", -60.0, 250.0))
 _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded or cut
 
 
 def implausible(
-    state: HandState, now: float, hand: Hand, taxels: tuple[int, int], felt: bool = False
+    state: HandState, now: float, hand: Hand, taxels: tuple[int, int], has_touch: bool = False
 ) -> str | None:
     """Return why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies
     ahead, an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not
@@ -56,7 +53,7 @@ def implausible(
     if error is None or error.shape != (J,):
         return f"error is not {J} codes"
     touch = _array(state.tactile)
-    if touch is None or ((touch.size or felt) and touch.shape != (*taxels, 3)):
+    if touch is None or ((touch.size or has_touch) and touch.shape != (*taxels, 3)):
         return f"tactile is not {' x '.join(map(str, (*taxels, 3)))} numbers"
     top = float(np.abs(touch).max(initial=0.0))
     if not top <= _TOUCH:
@@ -122,7 +119,7 @@ class Lasting:
         self.what, self._not = "", 0
 
     def note(self, so: bool, now: float, what: str = "") -> None:
-        """It is so, or not, at time now [s]."""
+        """Note whether it is so at time now [s]."""
         self._not = 0 if so else self._not + 1
         if so:
             self.since, self.what = now if self.since is None else self.since, what
@@ -140,7 +137,7 @@ class Frozen:
         self._bits, self._since, self._target = b"", 0.0, np.zeros(0)
 
     def note(self, now: float, state: HandState, target: np.ndarray | None) -> None:
-        """A new reading, and the targets [J] rad that stand."""
+        """Note a new reading, and the targets [J] rad that stand."""
         parts = (state.position, state.current, state.temperature, state.tactile, state.velocity)
         bits = b"".join(np.asarray(x).tobytes() for x in parts if x is not None)
         if bits != self._bits or target is None:

@@ -59,8 +59,8 @@ class Recorder:
         self._thread.start()
 
     def put(self, kind: str, t: float, *values: Any) -> None:
-        """kind: command, state, tactile, temperature, `HAND`, or a topic of `LABELS`; values are not to be changed
-        afterwards."""
+        """Queue values for the file. kind: command, state, tactile, temperature, `HAND`, or a topic of `LABELS`; values
+        are not to be changed afterwards."""
         if self._queue.qsize() >= self._most or self.error:
             self.dropped += 1
         else:
@@ -120,7 +120,7 @@ class Recorder:
                 time.sleep(0.002)  # a few samples at a time: fewer turns taken from the loop
 
     def _array(self, topic: str, t: float, value: Any) -> None:
-        """A topic that recordings do not have: declared on its first message."""
+        """Declare a topic that recordings do not have, on its first message."""
         w = self.writer
         if topic not in w._channels:
             kind = schema.MULTI_ARRAY

@@ -38,10 +38,10 @@ class Transport(Protocol):
         """Call `heard` from a thread of the transport's, for each message."""
 
     def publish(self, topic: str, names: Sequence[str], c: HandCommand, message: str = "joint_state") -> None:
-        """One command: targets, and the current limits as effort."""
+        """Publish one command: targets, and the current limits as effort."""
 
     def close(self) -> None:
-        """No more messages."""
+        """End the subscriptions."""
 
 
 def transport() -> Transport:
@@ -84,9 +84,7 @@ class Rclpy:
         if message == "xhand":
             from xhand_control_interfaces.msg import XHandStateArray
 
-            self._node.create_subscription(
-                XHandStateArray, topic, lambda m: heard(*of_xhand(m)), self._quality
-            )
+            self._node.create_subscription(XHandStateArray, topic, lambda m: heard(*of_xhand(m)), self._quality)
             return
         self._node.create_subscription(
             self._state, topic, lambda m: heard(m.name, m.position, m.velocity, m.effort), self._quality
@@ -216,7 +214,7 @@ class Ros2Hand:
         self._peak, self._relaxed = 0.0, False
 
     def open(self) -> dict[str, str]:
-        """Subscribe; wait for the first message. Raises UserError."""
+        """Open the subscriptions and wait for the first message. Raises UserError."""
         self._by = self._by or transport()
         self._by.subscribe(self.topics[0], self._heard, self.message)
         limit = time.monotonic() + 5.0

@@ -112,7 +112,7 @@ class SimulatedHand:
         self.lie_flat()
 
     def lie_flat(self) -> None:
-        """The hand open and free, as it is before anybody drives it; the object waits over it."""
+        """Place the hand open and free, as before anybody drives it; the object waits over it."""
         env, torch = self.env, self._torch
         q = torch.as_tensor(np.clip(np.full(env.num_actions, 0.05), *env.hand.limits.T))[None]
         env.engine.t.qpos[:, env.joint_q] = q.to(env.engine.t.qpos.dtype)
@@ -129,11 +129,11 @@ class SimulatedHand:
         t.qvel[:, self.env.object_v] = 0.0
 
     def present(self) -> None:
-        """Somebody holds the object where the fingers will close on it."""
+        """Hold the object where the fingers will close on it."""
         self._away.zero_()
 
     def release(self) -> None:
-        """The object is let go."""
+        """Let the object go."""
         self.present()
         self.held = False
 
@@ -159,7 +159,7 @@ class SimulatedHand:
         s.send(torch.as_tensor(self.target)[None])
 
     def relax(self) -> None:
-        """Mode 0: the motors are off; the gears still damp."""
+        """Turn the motors off (mode 0); the gears still damp."""
         s = self.env.servo
         s.state[:, :, s.slots["enabled"]] = 0.0
 
@@ -246,7 +246,7 @@ class SimulatedImu:
         self._past: list[tuple[float, np.ndarray]] = []
 
     def measure(self, t: float) -> None:
-        """A reading of time t [s]."""
+        """Take a reading at time t [s]."""
         import torch
 
         from dexsim import rotation
@@ -487,7 +487,7 @@ def _physics(args: tuple) -> SimulatedHand:
 
 
 def _one_thread() -> None:
-    """In a process of the hand's own."""
+    """Use one thread, in a process of the hand's own."""
     import multiprocessing
 
     import torch

@@ -17,12 +17,12 @@ class Timing:
         self.overruns = 0
 
     def start(self, late: float) -> None:
-        """A turn begins, `late` s after it should have."""
+        """Start a turn, `late` s after it should have begun."""
         self._late = late
         self._wall, self._cpu = time.perf_counter(), time.thread_time()
 
     def end(self) -> float:
-        """Return the turn ends; returns its wall time [s]."""
+        """End the turn; return its wall time [s]."""
         cpu, wall = time.thread_time() - self._cpu, time.perf_counter() - self._wall
         self._rows[self.turns % len(self._rows)] = cpu, wall, self._late
         self.turns += 1

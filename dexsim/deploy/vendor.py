@@ -160,7 +160,7 @@ class XHandBus:
         return None
 
     def _seed(self, port: str) -> None:
-        """Whole frames until the cache holds what the hand reads: what was there before are zeros."""
+        """Ask for whole frames until the cache holds what the hand reads: before, it holds zeros."""
         limit, whole = self.clock.now() + 6.0, 0
         while whole < SEED:
             whole += self.cycle(None) is not None
@@ -268,8 +268,8 @@ class XHandBus:
             speed if self._fast else None, silent if silent.any() else None)  # fmt: skip
 
     def _feel(self, raw: Any, code: int, now: float) -> None:
-        """The taxels of boards that answer: of all with a good code; else of those whose content changes, or is there
-        and stood still before, too."""
+        """Return the taxels of boards that answer: of all with a good code; else of those whose content changes, or is
+        there and stood still before, too."""
         self._unfelt += 1
         if code == CRC:
             return
@@ -290,8 +290,8 @@ class XHandBus:
         self._touch_worked = self._touch_worked or code in GOOD_TOUCH
 
     def _stir(self, now: float, code: int) -> None:
-        """Since when no bit of the cache has changed. Encoders that go to and fro while the hand stands still show that
-        its readings never stand."""
+        """Note since when no bit of the cache has changed. Encoders that go to and fro while the hand stands still show
+        that its readings never stand."""
         bits = (self._frame, list(self._boards))
         self._same += 1
         if bits != self._last_bits:
@@ -340,7 +340,7 @@ class XHandBus:
         return HandCommand(at, np.zeros(JOINTS), 0, 0, 0, self._letting_go["mode"])
 
     def _watch_limp(self, code: int, state: HandState | None) -> None:
-        """What currents and joints do after the hand has taken the command; the second way where they do not end."""
+        """Watch currents and joints after the hand has taken the command; take the second way where they do not end."""
         go, now = self._letting_go, self.clock.now()
         assert go is not None
         if dead := self._dead():
@@ -362,10 +362,10 @@ class XHandBus:
             what = (
                 f"the largest current went from {go['before']:.0f} to {go['peak']:.0f} mA, joints moved {moved:.3f} rad"
             )
-            shown = max(go["before"], *go["loads"].values(), 0.0) > LIMP or moved > YIELD
+            proven = max(go["before"], *go["loads"].values(), 0.0) > LIMP or moved > YIELD
             go["proof"] = True, (
                 f"limp by {how}: {what}"
-                if shown
+                if proven
                 else f"the hand took the command; {what}: that it is limp shows when somebody moves a joint"
             )
             return
@@ -397,12 +397,12 @@ class XHandBus:
         return np.full(9, np.nan) if look is None else look()
 
     def handle(self, what: int) -> None:
-        """Held out or let go, of a simulated hand behind the package."""
+        """Hold out or let go the object of a simulated hand behind the package."""
         if (act := getattr(self._sdk, "handle", None)) is not None:
             act(what)
 
     def close(self) -> None:
-        """Disconnect. EtherCAT is asked to go to INIT before: the next session finds it there."""
+        """Close the connection. EtherCAT is asked to go to INIT before: the next session finds it there."""
         init = getattr(self._device, "set_firmware_state", None)
         if self.port.startswith("ethercat") and init is not None:
             self._call(lambda: init(self._id, 1, 1, 500_000), None)

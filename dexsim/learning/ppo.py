@@ -75,9 +75,7 @@ def scale_first_actions(actor: torch.nn.Module, factor: object) -> None:
         last.bias.mul_(factor)
 
 
-def load_policy(
-    data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset(), noise: float = 0.0
-) -> Any:
+def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset(), noise: float = 0.0) -> Any:
     """Return the trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:

@@ -67,8 +67,7 @@ def of(setting: str) -> Base:
         return Base(("hold_rate_turned_90", "hold_rate_turned_180"))
     if setting == "lift":
         return Base(
-            ("hold_rate_lifted", "hold_rate_shaken"),
-            gravity=lambda t: GRAVITY - lifted(t) - shaken(t - STAGES[0]),
+            ("hold_rate_lifted", "hold_rate_shaken"), gravity=lambda t: GRAVITY - lifted(t) - shaken(t - STAGES[0])
         )
     if not str(setting).lower().endswith(".csv"):
         raise UserError(f"task.evaluation.base={setting}: must be turn, lift, or a path: a .csv file of t,x,y,z")

@@ -1,5 +1,4 @@
-"""Builds what an environment steps: hand, object and what else there is in one scene, its engine, drives and touch.
-"""
+"""Builds what an environment steps: hand, object and what else there is in one scene, its engine, drives and touch."""
 
 from __future__ import annotations
 
@@ -58,16 +57,16 @@ def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[Con
     geoms counts as its whole distal link. root: the hand's root body."""
     obj, own = ("body", OBJECT), ("subtree", root)
     tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
-    felt = dict(pad_pairs(hand))
+    pads = dict(pad_pairs(hand))
     links = {p.body: name for p, name in zip(hand.pads, self_pairs(hand), strict=True) if p.body not in hand.tip_bodies}
     return (
         *(ContactPair(f"tip_{f.name}", tip, obj) for f, tip in zip(hand.fingers, tips, strict=True)),
         *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
         ContactPair("palm", ("body", hand.palm_body), obj),
         *(ContactPair(f"self_{f.name}", ("body", f.body), own) for f in hand.fingers),
-        *(ContactPair(name, first, obj) for name, first in felt.items() if name.startswith("link_")),
+        *(ContactPair(name, first, obj) for name, first in pads.items() if name.startswith("link_")),
         *(ContactPair(name, ("body", body), own) for body, name in links.items()),
-        *(ContactPair(f"{name}:{body}", first, ("body", body)) for body in parts for name, first in felt.items()),
+        *(ContactPair(f"{name}:{body}", first, ("body", body)) for body in parts for name, first in pads.items()),
     )
 
 
@@ -103,8 +102,12 @@ class Built(VecEnv):
     """Whether `objects=` and `kept_out=` may give it a user's own objects (`task.objects`)."""
     camera: ClassVar[dict[str, Any] | None] = None
     """View of a film: lookat [3] m, distance m, azimuth and elevation in degrees; None: the usual one."""
+    evaluation: ClassVar[str] = "dexsim.tasks.evaluation"
+    """Module whose `evaluate` plays episodes."""
     given: Sequence[str] = ()
     """Names of settings that the user gave: after the first step each must have been read."""
+    _own: Sequence[str] = ()
+    """Names of settings that the task's class brings: likewise, in training and where the user gave none."""
     learning = True
     """False while an evaluation plays."""
     history = 1
@@ -212,13 +215,13 @@ class Built(VecEnv):
             self.objects.friction_factor = self.reality.friction_factor(
                 self.engine.mjm, self.objects.hand_geoms.tolist()
             )
-        shown = [v.shape for v in table.variants] if table is not None else []
+        shapes = [v.shape for v in table.variants] if table is not None else []
         pairs = [[name, *(f"{name}:{body}" for body in bodies)] for name, _ in pad_pairs(self.hand)]
         skin = bool(self.hand.file.skin)
         self.touch = Tactile(
             self.engine,
             hand_layout(self.hand) or tip_layout(self.hand),
-            ShapeSet([*shown, *(p.touch for p in self.furniture.parts)], device),
+            ShapeSet([*shapes, *(p.touch for p in self.furniture.parts)], device),
             [OBJECT, *bodies] if bodies else OBJECT,
             cfg["tactile"],
             pairs=pairs,
@@ -227,7 +230,7 @@ class Built(VecEnv):
             selves=self_pairs(self.hand) if skin else None,
         )
         for k, part in enumerate(self.furniture.parts, 1):
-            self.touch.shape_id[:, k] = len(shown) + k - 1
+            self.touch.shape_id[:, k] = len(shapes) + k - 1
             self.touch.shape_size[:, k] = torch.as_tensor(part.size, dtype=torch.float32, device=device)
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()

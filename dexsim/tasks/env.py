@@ -8,6 +8,7 @@ here reads from the device: decisions are masks, buffers live as long as the env
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -34,10 +35,9 @@ class HandEnv(Kept):
     """N hands with one object each. A task subclasses it; see `tasks/grasp.py`.
 
     Shapes: actions [N, J] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
-    dones [N]. J joints, F fingers, P touch pads (F and those of its skin,
-    or 0 without touch) in the hand's order. Positions are in the palm
-    frame, which is the world frame (the hand is fixed; gravity turns). `unit`: the hand's span over UNIT_SPAN;
-    `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
+    dones [N]. J joints, F fingers, P touch pads (F and those of its skin, or 0 without touch) in the hand's order.
+    Positions are in the palm frame, which is the world frame (the hand is fixed; gravity turns). `unit`: the hand's
+    span over UNIT_SPAN; `rise`: m by which its palm is higher than that of the hand that heights in settings are for.
     """
 
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
@@ -51,7 +51,7 @@ class HandEnv(Kept):
         self._check_widths()
 
     def _check_rewards(self) -> None:
-        """UserError for a weight of a reward that the task does not know, or that is no number."""
+        """Raise UserError for a weight of a reward that the task does not know, or that is no number."""
         known, file = self.reward_words(), type(self).__module__
         for name, weight in self.task["rewards"].items():
             if name not in known:
@@ -77,19 +77,20 @@ class HandEnv(Kept):
         """Make what the task of this configuration must find before it is built. given: arguments of the class."""
 
     def _check_given(self) -> None:
-        """UserError for one of the settings `given` that nothing has read: it would change nothing."""
-        keys, self.given = self.given, ()
+        """Raise UserError for one of the settings `given`, or without those that its class brings, that nothing has
+        read: it would change nothing."""
+        mine = [k for k in self.given if k.startswith(("task.", "randomize."))] or (self._own if self.learning else ())
+        self.given = self._own = ()
         read = self.task.read | {f"randomize.{name}" for name in self.sampler.read}
         later = ("task.evaluation", "task.presets", "task.objects.emphasis")
-        mine = [k for k in keys if k.startswith(("task.", "randomize.")) and not k.startswith(later)]
-        for key in unread(read, mine):
+        for key in unread(read, [k for k in mine if not k.startswith(later)]):
             raise UserError(
                 f"{key}: nothing reads this setting, with the others as they are, so that it would change nothing;"
                 " leave it out, or switch on what it belongs to"
             )
 
     def _check_widths(self) -> None:
-        """UserError where a group of observations has not the columns that its table states."""
+        """Raise UserError where a group of observations has not the columns that its table states."""
         for group, rows in self.describe()["observations"].items():
             stated, is_wide = sum(row[1] for row in rows), self.obs[group].shape[1]
             if stated != is_wide:
@@ -100,7 +101,7 @@ class HandEnv(Kept):
 
     @classmethod
     def check_deployed(cls, source: str) -> None:
-        """UserError where a policy of this task cannot be exported for a robot. source: its checkpoint."""
+        """Raise UserError where a policy of this task cannot be exported for a robot. source: its checkpoint."""
         raise UserError(
             f"{source}: {cls.__name__} declares no terms, so that the deployed loop cannot build what its policy sees"
         )
@@ -119,7 +120,7 @@ class HandEnv(Kept):
         """Commands, pushes: once a control step, before physics."""
 
     def feel(self) -> None:
-        """Sensing after the last physics step of a control step: launches only, since it is recorded in the step's
+        """Sense after the last physics step of a control step: launches only, since it is recorded in the step's
         graph."""
         self.touch.launch()
 
@@ -128,7 +129,7 @@ class HandEnv(Kept):
         raise NotImplementedError
 
     def reward_words(self) -> dict[str, str]:
-        """By name of each reward term that the task knows: what it is, for the first screen."""
+        """Describe each reward term that the task knows, by its name, for the first screen."""
         raise NotImplementedError
 
     def mirror_signs(self) -> torch.Tensor | None:
@@ -183,7 +184,7 @@ class HandEnv(Kept):
         substeps = self.decimation if self.reality is None else self.reality.substeps(self.decimation)
         self.engine.step(substeps, self.servo.before_each, self.feel)
         self._replay("after", self._after)
-        if self.given:
+        if self.given or self._own:
             self._check_given()
         if self.keep_final_obs:
             final = {k: torch.nan_to_num(v, 0.0, 0.0, 0.0) for k, v in self.observe(advance=False).items()}
@@ -218,7 +219,7 @@ class HandEnv(Kept):
         self._log(terms, ends, torch.cat([reward, rates]).mean(1))
 
     def _check_terms(self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]) -> None:
-        """UserError for a term that is not one value for each world."""
+        """Raise UserError for a term that is not one value for each world."""
         for kind, values in (("termination", ends), ("reward", terms)):
             for name, value in values.items():
                 if value.shape != (self.num_envs,):
@@ -227,7 +228,8 @@ class HandEnv(Kept):
                         " world (squeeze the last axis?)"
                     )
         if not terms:
-            raise UserError(f"task {self.task['name']}: no reward is left; give one a weight, task.rewards.NAME=1")
+            name = self.task["name"]
+            raise UserError(f"task {name}: has no reward; declare one, or give one a weight: task.rewards.NAME=1")
         self.end_names = (*ends, "nan", "time_out")
 
     def ended_by(self) -> torch.Tensor:
@@ -345,7 +347,7 @@ class HandEnv(Kept):
         self.engine.check_overflow()
 
     def _check_share(self) -> None:
-        """A few worlds that diverge cost their episodes only; many mean that a setting makes them."""
+        """Raise UserError where many worlds diverge, which a setting causes; a few cost their episodes only."""
         if self._wrong is None:
             return
         counts, steps = self._wrong.tolist(), self._steps_since * self.num_envs
@@ -381,7 +383,7 @@ class HandEnv(Kept):
         return dict.fromkeys(self.last, "")
 
     def judge_kept_out(self, kept_out: bool) -> None:
-        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        """Begin episodes with objects kept out of the training from now on, or with those of it."""
         raise UserError(f"task {self.task['name']}: has task.objects.held_out, and no judge_kept_out that draws them")
 
     def evaluate(
@@ -391,7 +393,6 @@ class HandEnv(Kept):
         seed: int = 0,
         progress: Callable[..., None] | None = None,
     ) -> dict:
-        """Play episodes; returns {"metrics", "tables", "frames"} and perhaps "plots" (`dexsim.tasks.evaluation`)."""
-        from dexsim.tasks.evaluation import evaluate
-
-        return evaluate(self, policy, episodes, seed, progress)
+        """Play episodes, as the module of the class' `evaluation` does; returns {"metrics", "tables", "frames"} and
+        perhaps "plots"."""
+        return importlib.import_module(self.evaluation).evaluate(self, policy, episodes, seed, progress)

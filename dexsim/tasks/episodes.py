@@ -71,9 +71,9 @@ class Episodes(Built):
         target: torch.Tensor | None = None,
         also: Mapping[int, torch.Tensor] | None = None,
     ) -> None:
-        """Where mask holds: hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); object at pose
-        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own), where
-        it moves freely. also: values [N] of further numbers of qpos, by index (`q_of`)."""
+        """Place, where mask holds, the hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); the
+        object at pose [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the
+        object's own), where it moves freely. also: values [N] of further numbers of qpos, by index (`q_of`)."""
         e, target = self.engine, hand_q if target is None else target
         # what else there is begins as the scene has it
         qpos = e.t.qpos.clone() if self._alone else self._begin_q.expand_as(e.t.qpos).clone()
@@ -147,8 +147,8 @@ class Episodes(Built):
             state_kernels.Places, joint_q=self.joint_q, joint_v=self.joint_v, object_q=object_q, object_v=object_v,
             tip_body=self.tip_body, tip_offset=self.tip_offset,
         )  # fmt: skip
-        kept = state_kernels.Seen.vars  # type: ignore[attr-defined]  # wp.struct adds it
-        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in kept})
+        names = state_kernels.Seen.vars  # type: ignore[attr-defined]  # wp.struct adds it
+        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in names})
         self._read_args = [
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
             state.xmat, at, seen,

@@ -37,11 +37,11 @@ def evaluate(env: HandEnv, policy: Policy, episodes: int, seed: int, progress: P
     env.sampler.width.fill_(1.0)  # all of what a curriculum widens
     try:
         found, frames = _episodes(env, policy, episodes, True, progress)
-        kept = None
+        held_out = None
         if env.scene.object is not None and env.task["objects"]["held_out"]:
             env.judge_kept_out(True)
             try:
-                kept = _episodes(env, policy, max(episodes // 2, 1), False, progress)[0]
+                held_out = _episodes(env, policy, max(episodes // 2, 1), False, progress)[0]
             finally:
                 env.judge_kept_out(False)
     finally:
@@ -49,8 +49,8 @@ def evaluate(env: HandEnv, policy: Policy, episodes: int, seed: int, progress: P
         env.sampler.width.copy_(width)
     metrics = _summary(env, found, resamples, seed)
     rows = [("", *row) for row in _rows(env, metrics)]
-    if kept is not None:
-        metrics["kept_out"] = _summary(env, kept, resamples, seed)
+    if held_out is not None:
+        metrics["kept_out"] = _summary(env, held_out, resamples, seed)
         rows += [("kept out", *row) for row in _rows(env, metrics["kept_out"])]
     ends = [(name, count, f"{100 * count / metrics['episodes']:.1f}") for name, count in metrics["ends"].items()]
     tables = [
@@ -84,8 +84,8 @@ def _play(
     total, steps = torch.zeros(n, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
     end = torch.full((n,), -1, dtype=torch.long, device=dev)
     figures = {name: torch.zeros(n, device=dev) for name in env.last}
-    shown = list(range(min(SHOWN, n))) if film else []
-    models, qpos, forces = [env.drawn_model(w) for w in shown], [], []
+    films = list(range(min(SHOWN, n))) if film else []
+    models, qpos, forces = [env.drawn_model(w) for w in films], [], []
     for k in range(env.max_episode_length):
         obs, reward, done, extras = env.step(policy(obs))
         total += reward * alive
@@ -95,9 +95,9 @@ def _play(
             value.copy_(torch.where(over, env.last[name], value))
         end = torch.where(over, env.ended_by(), end)
         alive = alive & ~over
-        if shown and k * env.dt < SHOWN_S:
-            qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
-            forces.append(env.touch.force_clean[shown][:, : env.fingers].cpu().numpy())
+        if films and k * env.dt < SHOWN_S:
+            qpos.append(env.engine.t.qpos[films].double().cpu().numpy())
+            forces.append(env.touch.force_clean[films][:, : env.fingers].cpu().numpy())
         if k % 20 == 19:
             if progress is not None:
                 at = before + min(n, episodes - before) * (k + 1) // env.max_episode_length
@@ -108,13 +108,13 @@ def _play(
         "return": total.cpu().numpy(), "length_s": steps.cpu().numpy() * env.dt, "end": end.cpu().numpy(),
         **{name: value.cpu().numpy() for name, value in figures.items()},
     }  # fmt: skip
-    if not shown:
+    if not films:
         return out, None
-    stop = [max(1, min(len(qpos), int(steps[w]) - 1)) for w in shown]  # the end's own frame is the next episode's
+    stop = [max(1, min(len(qpos), int(steps[w]) - 1)) for w in films]  # the end's own frame is the next episode's
     return out, {
         "model": models, "dt": env.dt, "names": env.hand.finger_names, "full": 5.0,
         "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
-        "label": [f"{', '.join(f'{name} {float(figures[name][w]):.2g}' for name in list(figures)[:2])}" for w in shown],
+        "label": [f"{', '.join(f'{name} {float(figures[name][w]):.2g}' for name in list(figures)[:2])}" for w in films],
         "overlay": [{"force": np.stack([f[i] for f in forces[:s]])} for i, s in enumerate(stop)],
         "camera": env.camera,
     }  # fmt: skip

@@ -31,13 +31,14 @@ def _is_range(pair: Any) -> bool:
 class GraspEnv(Launches):
     """Catch an object, hold it against pushes, press with a commanded force."""
 
+    evaluation = "dexsim.tasks.grasp_eval"
     choices = {"critic": ("paper", "privileged"), "observe.touch": (True, False)}
     ranges = {"object.scale": (0.3, 3.0), "servo.delay": (-0.5, 0.5), "push.weights": (0.0, 20.0)}
 
     # -- setting up
     @classmethod
     def check_deployed(cls, source: str) -> None:
-        """It can."""
+        """Accept every policy: the deployed loop has this task."""
 
     @classmethod
     def another_world(cls, u: Callable[..., float], friction: float, size: float) -> dict[str, Any]:
@@ -48,9 +49,9 @@ class GraspEnv(Launches):
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:
         """`observe.touch` and `critic` as switches of observations."""
         t = self.task
-        felt = {"actor": (t.get("observe") or {}).get("touch", True)}  # checkpoints from before have no such setting
+        touch = {"actor": (t.get("observe") or {}).get("touch", True)}  # checkpoints from before have no such setting
         sensed = dict.fromkeys(("actor", "critic"), bool(self.hand.sensed))
-        return {"contact_force": felt, "contact_centre": felt, "follower_angle": sensed,
+        return {"contact_force": touch, "contact_centre": touch, "follower_angle": sensed,
                 "privileged": {"critic": t["critic"] == "privileged"}}  # fmt: skip
 
     def prepare_task(self) -> None:
@@ -121,14 +122,14 @@ class GraspEnv(Launches):
         self.place(mask, self.begun.hand, self.begun.pose, self.begun.velocity)
 
     def before_physics(self) -> None:
-        """The command changes once it was held for long enough; pushes come and go."""
+        """Change commands that were held for long enough; begin and end pushes."""
         super().before_physics()
-        left = self.command_left if self.thumb_range is None else self.command_left.clone()
+        before = self.command_left if self.thumb_range is None else self.command_left.clone()
         self.launch_orders()
-        self._command_thumb(self.command_left > left)  # a new command is held for longer than was left of the old
+        self._command_thumb(self.command_left > before)  # a new command is held for longer than was left of the old
 
     def _command_thumb(self, mask: torch.Tensor) -> None:
-        """Where mask [N] holds, a new command of the thumb's own, if it has one."""
+        """Renew the thumb's own command, if it has one, where mask [N] holds."""
         if self.thumb_range is None:
             return
         low, high = self.thumb_range
@@ -242,18 +243,6 @@ class GraspEnv(Launches):
     def describe(self) -> dict:
         """Return tables for the first screen."""
         return super().describe() | {"headline": ["task/held", "task/force_error"]}
-
-    def evaluate(
-        self,
-        policy: Callable[..., torch.Tensor],
-        episodes: int = 256,
-        seed: int = 0,
-        progress: Callable[..., None] | None = None,
-    ) -> dict:
-        """Play `episodes` episodes; see `tasks/grasp_eval.py`."""
-        from dexsim.tasks.grasp_eval import evaluate
-
-        return evaluate(self, policy, episodes, seed, progress)
 
     def scripted_policy(self, rate: float = 0.5, wait: float = 0.35) -> Callable[[Mapping], torch.Tensor]:
         """Return a policy without learning; see `tasks/grasp_eval.py`."""

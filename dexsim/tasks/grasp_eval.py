@@ -41,13 +41,7 @@ RESAMPLES = 1000  # of the bootstrap
 
 
 @torch.inference_mode()
-def evaluate(
-    env: GraspEnv,
-    policy: Policy,
-    episodes: int,
-    seed: int,
-    progress: Progress | None = None,
-) -> dict:
+def evaluate(env: GraspEnv, policy: Policy, episodes: int, seed: int, progress: Progress | None = None) -> dict:
     """Play `episodes` episodes, `env.num_envs` at a time, half as many again on shapes that were never trained on.
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
@@ -81,7 +75,7 @@ def _play_all(
     env: GraspEnv, policy: Policy, episodes: int, rows: torch.Tensor, progress: Progress | None, label: str
 ) -> dict:
     parts: list[dict] = []
-    kept = (env._rows, env._chances)
+    rows_before = (env._rows, env._chances)
     env.draw_from(rows)
     done = 0
     while done < episodes:
@@ -89,20 +83,14 @@ def _play_all(
             _play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes)
         )
         done += env.num_envs
-    env._rows, env._chances = kept
+    env._rows, env._chances = rows_before
     out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
     out["frames"] = parts[0]["frames"]
     return out
 
 
 def _play(
-    env: GraspEnv,
-    policy: Policy,
-    keep_frames: bool,
-    progress: Progress | None,
-    label: str,
-    done: int,
-    episodes: int,
+    env: GraspEnv, policy: Policy, keep_frames: bool, progress: Progress | None, label: str, done: int, episodes: int
 ) -> dict:
     """Return one episode in every world."""
     n, dev, dt, base = env.num_envs, env.device, env.dt, _base(env)
@@ -131,8 +119,8 @@ def _play(
     by_tips, by_all = torch.zeros(n, device=dev), torch.zeros(n, device=dev)  # forces that press on the object
     moved, untouched = torch.zeros_like(alive), torch.zeros_like(alive)  # what went wrong within the hold
     force, torque, samples = torch.zeros_like(env.tip_force), torch.zeros_like(env.torque), torch.zeros(n, device=dev)
-    shown = list(range(min(4, n))) if keep_frames else []
-    models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
+    filmed = list(range(min(4, n))) if keep_frames else []
+    models = [env.drawn_model(w) for w in filmed]  # before an episode ends and its object is replaced
     qpos, shown_force = [], []
     drawn: dict[str, list[np.ndarray]] = {"push": [], "gravity": [], "taxels": []}
     push_force = (PUSH_WEIGHTS * 9.81 * mass)[:, None] * direction
@@ -154,8 +142,8 @@ def _play(
             by_tips += env.tip_force.sum(1)
             by_all += env.finger_force.sum(1) + env.palm_force
         if t > SETTLE:
-            felt = env.finger_force > 0
-            touched = felt[:, env.opposing].any(1) & felt[:, env.others].any(1)
+            touches = env.finger_force > 0
+            touched = touches[:, env.opposing].any(1) & touches[:, env.others].any(1)
             near = (p - place).norm(dim=1) <= env.unit * RADIUS
             good = alive & touched & near
             if t <= SETTLE + HOLD:
@@ -173,13 +161,13 @@ def _play(
                 if t <= SETTLE + HOLD + base.stages[0]:
                     held90 &= good
                 held180 &= good
-        if shown:
-            qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
-            shown_force.append(env.tip_force[shown].cpu().numpy())
-            drawn["push"].append(env.outside_force[shown].cpu().numpy())
-            drawn["gravity"].append(env.engine.field("opt.gravity")[shown].cpu().numpy())
+        if filmed:
+            qpos.append(env.engine.t.qpos[filmed].double().cpu().numpy())
+            shown_force.append(env.tip_force[filmed].cpu().numpy())
+            drawn["push"].append(env.outside_force[filmed].cpu().numpy())
+            drawn["gravity"].append(env.engine.field("opt.gravity")[filmed].cpu().numpy())
             if env.touch.raw is not None:
-                drawn["taxels"].append(env.touch.raw[shown].cpu().numpy())
+                drawn["taxels"].append(env.touch.raw[filmed].cpu().numpy())
         if progress is not None and k % 10 == 0:
             progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
     env.outside_force.zero_()
@@ -194,15 +182,15 @@ def _play(
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
     out["frames"] = None
-    if shown:
-        force_shown, given = np.stack(shown_force, 1), command[shown].cpu().numpy()
-        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
+    if filmed:
+        force_shown, given = np.stack(shown_force, 1), command[filmed].cpu().numpy()
+        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"][filmed]]
         out["frames"] = {
             "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": env.hand.finger_names,
             "full": 1.2 * env.f_max,
             "label": [f"{name}, {1000 * m:.0f} g, friction"
                       f" {mu:.1f}" for name, m,
-                      mu in zip(names, out["mass"][shown], out["friction"][shown], strict=True)],
+                      mu in zip(names, out["mass"][filmed], out["friction"][filmed], strict=True)],
             "overlay": [
                 {"force": f, "command": np.full(steps, c * env.f_max), "layout": env.touch.layout}
                 | {k: np.stack([row[i] for row in rows]) for k, rows in drawn.items() if rows}
@@ -290,15 +278,11 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
         out["force_slope"], out["force_offset_N"] = float(slope), float(offset)
         out["force_error_N"] = float(np.abs(_of(r["force"][held], others) - r["command"][held, None] * f_max).mean())
         out["contact_force_range_N"] = [float(x) for x in np.percentile(r["force"][held].sum(1), [5, 95])]
-        out["joint_torque_range_Nm"] = [
-            float(x) for x in np.percentile(torque[held].mean(1), [5, 95])
-        ]
+        out["joint_torque_range_Nm"] = [float(x) for x in np.percentile(torque[held].mean(1), [5, 95])]
         out["torque_command_correlation"] = _corr(r["command"][held], torque[held].sum(1))
         out["by_command"] = _by_command(r, held, torque)
         out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held])
-        out["torque_command_correlation_interval"] = _corr_interval(
-            r["command"][held], torque[held].sum(1)
-        )
+        out["torque_command_correlation_interval"] = _corr_interval(r["command"][held], torque[held].sum(1))
     for name, part, among in (
         ("hold_rate", r, ~pushed & firm),
         ("hold_rate_pushed", r, pushed & able),

@@ -50,7 +50,7 @@ def new_command(w: int, r: CommandRange, d: Draws, o: Orders):
 
 @wp.func
 def new_push(w: int, mass: float, d: Draws, o: Orders):
-    """In any direction, of a multiple of the object's weight, after a wait."""
+    """Draw a push in any direction, of a multiple of the object's weight, after a wait."""
     v = wp.vec3(d.direction[w, 0], d.direction[w, 1], d.direction[w, 2])
     v = v / wp.max(wp.length(v), 1.0e-9) * (d.weights[w] * mass * 9.81)
     for c in range(3):
@@ -144,14 +144,14 @@ class Begun:
 
 @wp.func
 def about(axis: wp.vec3, angle: float):
-    """Quaternion (w, x, y, z) of a turn by angle [rad] about a unit axis."""
+    """Return the quaternion (w, x, y, z) of a turn by angle [rad] about a unit axis."""
     s = wp.sin(0.5 * angle)
     return wp.vec4(wp.cos(0.5 * angle), axis[0] * s, axis[1] * s, axis[2] * s)
 
 
 @wp.func
 def times(a: wp.vec4, b: wp.vec4):
-    """Hamilton product: first b, then a."""
+    """Return the Hamilton product: first b, then a."""
     return wp.vec4(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -173,8 +173,8 @@ def begin(
     b: Begun,
     o: Orders,
 ):
-    """New episodes in the masked worlds. The object's longest axis lies across the fingers (palm y) up to the tilt; its
-    lowest point is `drop` over the palm."""
+    """Begin new episodes in the masked worlds. The object's longest axis lies across the fingers (palm y) up to the
+    tilt; its lowest point is `drop` over the palm."""
     w = wp.tid()
     if not mask[w]:
         return
@@ -252,7 +252,7 @@ def sense(
     # in and out
     s: Sensed,
 ):
-    """What encoders, currents and a camera say of each world: noisy; the height late too."""
+    """Sense each world by encoders, currents and a camera: noisy; the height late too."""
     w, k = wp.tid()
     joints = t.q.shape[1]
     if k < joints:

@@ -66,13 +66,9 @@ class Launches(Task):
         self._dropped = zeros(dtype=torch.bool)
         self.measured = torch.zeros(len(grasp_rewards.METRICS) + 1, self.num_envs, device=self.device)
         names = ("command", "command_left", "push_left", "push_wait")
-        self._orders = filled(
-            kernels.Orders, push=self.push_force, **{name: getattr(self, name) for name in names}
-        )
+        self._orders = filled(kernels.Orders, push=self.push_force, **{name: getattr(self, name) for name in names})
         begun = ("first_xy", "z_history", "z_delay", "z_seen", "torque_bias")
-        self._begun = filled(
-            kernels.Begun, **vars(self.begun), **{name: getattr(self, name) for name in begun}
-        )
+        self._begun = filled(kernels.Begun, **vars(self.begun), **{name: getattr(self, name) for name in begun})
         low, high = (round(x / self.dt) for x in t["sensors"]["vision_delay"])
         self._place = filled(
             kernels.Place, unit=self.unit, rise=self.rise, xy=wp.vec2(*self.centre0.tolist()), pose=self.pose0,
@@ -80,9 +76,7 @@ class Launches(Task):
         )  # fmt: skip
         state = ("q", "qd", "torque", "action", "last_action", "tip_force", "self_force", "object_pose")
         moving = ("object_velocity", "command", "thumb_command", "episode_length")
-        own = {
-            name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in state + moving
-        }
+        own = {name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in state + moving}
         self._state = filled(grasp_rewards.State, clearance=self.clearance.distance, **own)
         hand = ("opposing", "others", "roots", "root_closes", "tau_max", "inner", "inner_closes", "outer", "q_mid")
         tables = {name: getattr(self, name) for name in hand}

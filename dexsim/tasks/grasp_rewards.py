@@ -104,7 +104,7 @@ def touches(f: int, w: int, s: State, shape: Shape):
 
 @wp.func
 def opposes(f: int, shape: Shape):
-    """Whether a finger presses against the others, wherever it stands in the hand's order."""
+    """Return whether a finger presses against the others, wherever it stands in the hand's order."""
     found = bool(False)
     for i in range(shape.opposing.shape[0]):
         if shape.opposing[i] == f:
@@ -114,9 +114,9 @@ def opposes(f: int, shape: Shape):
 
 @wp.func
 def tracking(x: float, command: float, x_max: float, sigma: float, low: float, high: float):
-    """R_i of a finger that touches (R_force, R_torque): exp(-(x - command x_max)^2 / (2 (sigma x_max)^2)) within [low
-    x_max, high x_max]; for a command below 0, as the thumb's is unless it has its own, the band alone. The paper prints
-    tau_thumb in the fingers' torque band; we take it for tau_i."""
+    """Return R_i of a finger that touches (R_force, R_torque): exp(-(x - command x_max)^2 / (2 (sigma x_max)^2)) within
+    [low x_max, high x_max]; for a command below 0, as the thumb's is unless it has its own, the band alone. The paper
+    prints tau_thumb in the fingers' torque band; we take it for tau_i."""
     if not (x >= low * x_max and x <= high * x_max):
         return float(0.0)
     if command < 0.0:
@@ -127,7 +127,7 @@ def tracking(x: float, command: float, x_max: float, sigma: float, low: float, h
 
 @wp.func
 def force(w: int, s: State, shape: Shape):
-    """R_force: sum over the fingers that touch of R_i at their force."""
+    """Return R_force: sum over the fingers that touch of R_i at their force."""
     total = float(0.0)
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
@@ -139,7 +139,7 @@ def force(w: int, s: State, shape: Shape):
 
 @wp.func
 def torque(w: int, s: State, shape: Shape):
-    """R_torque: the same at the torque of their first joints, over its maximum."""
+    """Return R_torque: the same at the torque of their first joints, over its maximum."""
     total = float(0.0)
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
@@ -151,7 +151,7 @@ def torque(w: int, s: State, shape: Shape):
 
 @wp.func
 def diff(w: int, s: State, shape: Shape):
-    """R_diff: variance of the first joints [rad^2] of the fingers beside the opposing one."""
+    """Return R_diff: variance of the first joints [rad^2] of the fingers beside the opposing one."""
     n = shape.inner.shape[0]
     mean = float(0.0)
     for i in range(n):
@@ -166,7 +166,7 @@ def diff(w: int, s: State, shape: Shape):
 
 @wp.func
 def outer(w: int, s: State, shape: Shape):
-    """R_outter: distance of the second joints [rad] from their mid-range, not squared."""
+    """Return R_outter: distance of the second joints [rad] from their mid-range, not squared."""
     total = float(0.0)
     for i in range(shape.outer.shape[0]):
         j = shape.outer[i]
@@ -177,15 +177,15 @@ def outer(w: int, s: State, shape: Shape):
 
 @wp.func
 def is_dropped(w: int, s: State, shape: Shape):
-    """The object's centre is below the palm or far from it. While a world's gravity is turned, "below" means away from
-    the palm."""
+    """Return whether the object's centre is below the palm or far from it. While a world's gravity is turned, "below"
+    means away from the palm."""
     p = wp.vec3(s.object_pose[w, 0], s.object_pose[w, 1], s.object_pose[w, 2])
     return wp.length(p - shape.middle) > shape.distance or p[2] < shape.below
 
 
 @wp.func
 def action(w: int, s: State):
-    """R_action: squared change of the action."""
+    """Return R_action: squared change of the action."""
     total = float(0.0)
     for j in range(s.action.shape[1]):
         off = s.action[w, j] - s.last_action[w, j]
@@ -195,7 +195,7 @@ def action(w: int, s: State):
 
 @wp.func
 def velocity(w: int, s: State):
-    """R_vel: squared joint speeds [rad^2/s^2]."""
+    """Return R_vel: squared joint speeds [rad^2/s^2]."""
     total = float(0.0)
     for j in range(s.qd.shape[1]):
         total += s.qd[w, j] * s.qd[w, j]
@@ -204,7 +204,7 @@ def velocity(w: int, s: State):
 
 @wp.func
 def opposed(w: int, s: State, shape: Shape):
-    """Whether an opposing finger touches."""
+    """Return whether an opposing finger touches."""
     found = bool(False)
     for i in range(shape.opposing.shape[0]):
         if touches(shape.opposing[i], w, s, shape):
@@ -214,7 +214,7 @@ def opposed(w: int, s: State, shape: Shape):
 
 @wp.func
 def pressed(w: int, s: State, shape: Shape):
-    """How many of the others touch."""
+    """Return how many of the others touch."""
     count = float(0.0)
     for i in range(shape.others.shape[0]):
         if touches(shape.others[i], w, s, shape):
@@ -224,8 +224,8 @@ def pressed(w: int, s: State, shape: Shape):
 
 @wp.func
 def aside(i: int, by_torque: bool, w: int, s: State, shape: Shape):
-    """How far the force of the i-th of the others is from the command, as a fraction of F_max; or, by_torque, the
-    torque of its first joint, as a fraction of that one's maximum."""
+    """Return how far the force of the i-th of the others is from the command, as a fraction of F_max; or, by_torque,
+    the torque of its first joint, as a fraction of that one's maximum."""
     f = shape.others[i]
     x = s.tip_force[w, f] / shape.f_max
     if by_torque:
@@ -235,7 +235,7 @@ def aside(i: int, by_torque: bool, w: int, s: State, shape: Shape):
 
 @wp.func
 def near(by_torque: bool, w: int, s: State, shape: Shape):
-    """Ours, dense where R_force (or R_torque) is flat: 1 - `aside`, not below 0, mean of the others."""
+    """Return 1 - `aside`, not below 0, mean of the others. Ours, dense where R_force (or R_torque) is flat."""
     total = float(0.0)
     for i in range(shape.others.shape[0]):
         total += at_least(1.0 - aside(i, by_torque, w, s, shape), 0.0)
@@ -244,7 +244,7 @@ def near(by_torque: bool, w: int, s: State, shape: Shape):
 
 @wp.func
 def worst(by_torque: bool, w: int, s: State, shape: Shape):
-    """Ours: `near` of the finger that is furthest off; the mean hides one that presses on nothing."""
+    """Return `near` of the finger that is furthest off. Ours; the mean hides one that presses on nothing."""
     furthest = float(0.0)
     for i in range(shape.others.shape[0]):
         off = aside(i, by_torque, w, s, shape)
@@ -255,8 +255,8 @@ def worst(by_torque: bool, w: int, s: State, shape: Shape):
 
 @wp.func
 def thumb_near(w: int, s: State, shape: Shape):
-    """Ours: 1 - |F_thumb / F_max - its own command|, not below 0, mean of the opposing fingers; 0 where they have
-    none."""
+    """Return 1 - |F_thumb / F_max - its own command|, not below 0, mean of the opposing fingers; 0 where they have
+    none. Ours."""
     if s.thumb_command[w] < 0.0:
         return float(0.0)
     total = float(0.0)
@@ -268,8 +268,8 @@ def thumb_near(w: int, s: State, shape: Shape):
 
 @wp.func
 def reach(w: int, s: State, shape: Shape):
-    """Ours: pads near the object, mean of the others. A finger that does not touch has nothing else that says which way
-    the object lies."""
+    """Return how near the pads are to the object, mean of the others. Ours: a finger that does not touch has nothing
+    else that says which way the object lies."""
     total = float(0.0)
     for i in range(shape.others.shape[0]):
         total += wp.exp(-at_least(s.clearance[w, shape.others[i]], 0.0) / shape.reach_length)
@@ -278,7 +278,7 @@ def reach(w: int, s: State, shape: Shape):
 
 @wp.func
 def on_itself(w: int, s: State):
-    """N, sum of what the fingers press on the hand with."""
+    """Return the sum of what the fingers press on the hand with, N."""
     total = float(0.0)
     for f in range(s.self_force.shape[1]):
         total += s.self_force[w, f]
@@ -287,20 +287,20 @@ def on_itself(w: int, s: State):
 
 @wp.func
 def still(w: int, s: State):
-    """Ours: speed of the object [m/s], at most 1."""
+    """Return the speed of the object [m/s], at most 1. Ours."""
     v = wp.vec3(s.object_velocity[w, 0], s.object_velocity[w, 1], s.object_velocity[w, 2])
     return at_most(wp.length(v), 1.0)
 
 
 @wp.func
 def centre(w: int, s: State, shape: Shape):
-    """Ours: how far the object lies to one side, out of reach of the outer fingers; at most 2."""
+    """Return how far the object lies to one side, out of reach of the outer fingers; at most 2. Ours."""
     return at_most(wp.abs(s.object_pose[w, 1] - shape.beside) / shape.centre_length, 2.0)
 
 
 @wp.func
 def force_error(w: int, s: State, shape: Shape):
-    """N, mean distance of the others' force from the command."""
+    """Return the mean distance of the others' force from the command, N."""
     total = float(0.0)
     for i in range(shape.others.shape[0]):
         total += wp.abs(s.tip_force[w, shape.others[i]] - s.command[w] * shape.f_max)
@@ -315,7 +315,7 @@ def dropped(s: State, shape: Shape, out: wp.array(dtype=wp.bool)):
 
 @wp.kernel(enable_backward=False)
 def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.array2d(dtype=float)):
-    """out [T + M, N]: TERMS, weighted, then METRICS and whether they count. period: s of a control step."""
+    """Compute out [T + M, N]: TERMS, weighted, then METRICS and whether they count. period: s of a control step."""
     w = wp.tid()
     fingers = pressed(w, s, shape)
     thumb = opposed(w, s, shape)

@@ -38,8 +38,8 @@ class Drops:
         low, high = self.place.min(0), self.place.max(0)
         axes = (np.arange(a, b + FINE, FINE) for a, b in zip(low, high, strict=True))
         places = np.vstack([start, np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)])
-        apart = ((places[:, None] - self.place) ** 2).sum(2)
-        weight = np.exp(-apart / (2 * (unit * AROUND) ** 2))
+        squared = ((places[:, None] - self.place) ** 2).sum(2)
+        weight = np.exp(-squared / (2 * (unit * AROUND) ** 2))
         total = weight.sum(1) + 1.0
         share = weight @ self.held / total
         top = share.argmax()
@@ -103,7 +103,7 @@ def drop(env: GraspEnv, place: torch.Tensor) -> Drops:
             env.engine.field("opt.gravity").copy_(9.81 * (math.cos(turned) * down + math.sin(turned) * aside))
             obs, _, done, _ = env.step(torch.where(first, one(obs), other(obs)))
             alive &= ~done.bool()
-        felt = env.finger_force > 0
-        held.append((alive & felt[:, env.opposing].any(1) & felt[:, env.others].any(1)).numpy())
+        touches = env.finger_force > 0
+        held.append((alive & touches[:, env.opposing].any(1) & touches[:, env.others].any(1)).numpy())
     env.fixed_command, env.pushes, env.max_episode_length = None, True, length
     return Drops(place.double().numpy(), np.concatenate(held))

@@ -195,7 +195,7 @@ def _begin(env: RotateEnv, start: GraspSet) -> None:
 
 
 def _play(env: RotateEnv, target: torch.Tensor) -> None:
-    """One control step of physics and servo alone: no episode ends."""
+    """Step physics and servo alone, for one control step: no episode ends."""
     env.target.copy_(target)
     env.servo.send(env.target)
     env.engine.step(env.decimation, env.servo.before_each, env.touch.launch)
@@ -203,14 +203,9 @@ def _play(env: RotateEnv, target: torch.Tensor) -> None:
 
 
 def generate(
-    cfg: dict,
-    count: int,
-    worlds: int,
-    seed: int,
-    sizes: tuple[float, float],
-    report: Callable[[str], None] = print,
+    cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report: Callable[[str], None] = print
 ) -> GraspSet:
-    """At least `count` poses held by fingertips alone, made on the CPU by C MuJoCo."""
+    """Generate at least `count` poses held by fingertips alone, on the CPU by C MuJoCo."""
     rng, draw = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     pads = Pads(hand_of(cfg), rng)
     first = candidates(worlds, sizes, pads, rng)

@@ -47,9 +47,7 @@ LAND, CLOSE, SPEED, LEAD = 0.4, 2.0, 1.5, 0.08  # s, s, rad/s, rad: the fingers 
 TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses on
 
 
-def candidates(
-    env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator, reach: Reach
-) -> GraspSet:
+def candidates(env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator, reach: Reach) -> GraspSet:
     """Return n open hands, each with an object (cubes with edges of sizes [m]; others in turns) above its palm and the
     joint angles (`target`) that it will close to: fingertips against a cube's sides where they can, or those of a
     square block as wide as another object's narrower side, about the cupped pose where they cannot."""
@@ -162,8 +160,8 @@ def _begin(env: RotateEnv, start: GraspSet) -> None:
 
 
 def _play(env: RotateEnv, seconds: float, towards: torch.Tensor | None = None) -> None:
-    """Physics and servo alone: no episode ends. With `towards` [N, J] every finger moves there at SPEED, at most LEAD
-    ahead of its joints, until its tip touches the cube; without, the targets stay."""
+    """Step physics and servo alone: no episode ends. With `towards` [N, J] every finger moves there at SPEED, at most
+    LEAD ahead of its joints, until its tip touches the cube; without, the targets stay."""
     touched = torch.zeros(env.num_envs, env.fingers + 1, dtype=torch.bool)
     finger = torch.tensor([k if k >= 0 else env.fingers for k in env.hand.finger_of_joint])  # the last: of none
     press = PRESS * torch.as_tensor(approach(env.hand), dtype=torch.float32)
@@ -195,8 +193,8 @@ def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:
 def ensure(
     cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report: Callable[[str], None] = print
 ) -> None:
-    """The held poses of a config's hand are there: else they are searched for and kept in the hand's folder. Raises
-    UserError."""
+    """Ensure that the held poses of a config's hand are there: else search for them and keep them in the hand's folder.
+    Raises UserError."""
     hand, objects = hand_of(cfg), cfg["task"]["objects"]
     task_class(cfg).check_objects(cfg["task"])  # type: ignore[attr-defined]  # of a task that turns objects
     own = [name for name in (*objects["train"], *objects["held_out"]) if name != CUBE]
@@ -221,12 +219,7 @@ def ensure(
 
 
 def generate(
-    cfg: dict,
-    count: int,
-    worlds: int,
-    seed: int,
-    sizes: tuple[float, float],
-    report: Callable[[str], None] = print,
+    cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report: Callable[[str], None] = print
 ) -> GraspSet:
     """`count` held poses (of several objects about as many each), made on the CPU by C MuJoCo. sizes: edges of the
     cubes [m]. Raises UserError."""

@@ -31,7 +31,7 @@ _THREADS = 64  # that copy one field
 
 @wp.kernel(enable_backward=False)
 def _first(nan: wp.array(dtype=wp.bool), first: wp.array(dtype=int)):
-    """The lowest world that is not finite."""
+    """Find the lowest world that is not finite."""
     w = wp.tid()
     if nan[w]:
         wp.atomic_min(first, 0, w)
@@ -39,7 +39,7 @@ def _first(nan: wp.array(dtype=wp.bool), first: wp.array(dtype=int)):
 
 @wp.func_native("((unsigned*)to)[k] = ((const unsigned*)(source + stride * (unsigned long long)world))[k];")
 def _copy_word(to: wp.uint64, source: wp.uint64, stride: wp.uint64, world: int, k: int):
-    """4 bytes of a world's row. Fields differ in type and shape; what is kept of them is bytes."""
+    """Copy 4 bytes of a world's row. Fields differ in type and shape; what is kept of them is bytes."""
     ...
 
 
@@ -87,18 +87,19 @@ class NanDump:
             **{f"field/{k}": e.field(k) for k in (*e.field_names, "body_subtreemass", "body_invweight0")},
         }
         self._rows = rows
-        self._kept = {k: torch.zeros(v.shape[1:], dtype=v.dtype, device=dev) for k, v in rows.items()}
+        self._copies = {k: torch.zeros(v.shape[1:], dtype=v.dtype, device=dev) for k, v in rows.items()}
         self._world = torch.zeros(1, dtype=torch.long, device=dev)
         self._taken = torch.zeros(1, dtype=torch.bool, device=dev)
         self._first = torch.full((1,), _NONE, dtype=torch.int32, device=dev)
-        self._fields = torch.tensor([_row(rows[k], kept) for k, kept in self._kept.items()], dtype=torch.int64).to(dev)
+        fields = [_row(rows[k], copy) for k, copy in self._copies.items()]
+        self._fields = torch.tensor(fields, dtype=torch.int64).to(dev)
 
     def before(self) -> None:
-        """Targets are sent and forces set; physics is next."""
+        """Keep the state before physics, once targets are sent and forces set."""
         torch._foreach_copy_(list(self._before.values()), list(self._live.values()))
 
     def after(self, nan: torch.Tensor) -> None:
-        """nan [N]: worlds that are not finite. Keeps one of them, unless one is kept that is not written yet."""
+        """Keep one of the worlds that are not finite (nan [N]), unless one is kept that is not written yet."""
         device = str(nan.device)
         first, taken = wp.from_torch(self._first), wp.from_torch(self._taken)
         fields = wp.from_torch(self._fields, dtype=wp.uint64)
@@ -116,7 +117,7 @@ class NanDump:
             self._count += 1
             path = folder / f"nan_{self._count}.npz"
         self._count += 1
-        data = {k.replace("/", "."): v.cpu().numpy() for k, v in self._kept.items()}
+        data = {k.replace("/", "."): v.cpu().numpy() for k, v in self._copies.items()}
         cfg = {
             k: v for k, v in self._env.cfg.items() if k in ("choices", "task", "sim", "servo", "tactile", "randomize")
         }
@@ -133,12 +134,12 @@ class NanDump:
         return path
 
 
-def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
+def _row(source: torch.Tensor, copy: torch.Tensor) -> list[int]:
     """Return what `keep_world` has to know of a field [N, ...]."""
     if not source[0].is_contiguous() or source.element_size() % 4:
         raise ValueError(f"NanDump: a world's row of {tuple(source.shape)} {source.dtype} is not words in one piece")
     size = source.element_size()
-    return [source.data_ptr(), source.stride(0) * size, kept.data_ptr(), kept.numel() * size // 4]
+    return [source.data_ptr(), source.stride(0) * size, copy.data_ptr(), copy.numel() * size // 4]
 
 
 def load(path: Path) -> dict[str, np.ndarray]:

@@ -64,7 +64,7 @@ class Known:
 
 @wp.func
 def primitive_inertia(kind: int, size: wp.vec3):
-    """Principal inertia per kg [m^2] of a box, sphere or capsule with MuJoCo's sizes; see
+    """Return the principal inertia per kg [m^2] of a box, sphere or capsule with MuJoCo's sizes; see
     `assets.objects.shape.primitive_mass_properties` for the formulas."""
     a = size[0]
     b = size[1]
@@ -84,7 +84,7 @@ def primitive_inertia(kind: int, size: wp.vec3):
 
 @wp.func
 def half_extents(kind: int, size: wp.vec3):
-    """Of a primitive's bounding box [m]."""
+    """Return half the edges of a primitive's bounding box [m]."""
     r = size[0]
     if kind == wp.static(SPHERE):
         return wp.vec3(r, r, r)
@@ -123,7 +123,7 @@ def write_kernel(real: type) -> wp.Kernel:
 
     @wp.func
     def write_geom(v: int, s: int, kind: int, size: wp.vec3, half: wp.vec3, bound: float, w: int, t: Table, f: Fields):
-        """One of the object's geoms: as the table has it, or the primitive in use."""
+        """Write one of the object's geoms: as the table has it, or the primitive in use."""
         g = t.slots[s]
         f.geom_dataid[w, g] = t.dataid[v, s]
         for c in range(4):
@@ -145,8 +145,8 @@ def write_kernel(real: type) -> wp.Kernel:
 
     @wp.func
     def write_body(body: int, mass: float, inertia: wp.vec3, com: wp.vec3, w: int, f: Fields):
-        """Mass and inertia, and what MuJoCo derives from them: of a free body in closed form (mj_setConst gives the
-        same; tested), translational inverse weight 1 / m, rotational the mean inverse inertia."""
+        """Write mass and inertia, and what MuJoCo derives from them: of a free body in closed form (mj_setConst gives
+        the same; tested), translational inverse weight 1 / m, rotational the mean inverse inertia."""
         f.body_mass[w, body, 0] = real(mass)
         f.body_subtreemass[w, body, 0] = real(mass)
         # the world's trees: the hand (body 1) and the object

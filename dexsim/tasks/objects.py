@@ -111,7 +111,7 @@ class Objects:
         stiffness: torch.Tensor,
         damping_ratio: torch.Tensor,
     ) -> None:
-        """Where mask [N] holds, give the world this object.
+        """Give the worlds where mask [N] holds this object.
 
         variant [N] row of the scene's table; scale [N, 3] of a primitive's sizes (hulls keep their baked scale);
         mass [N] kg; com [N, 3]: offset of the centre of mass as a fraction of the largest extent; friction [N]

@@ -28,9 +28,9 @@ def fingertip_press(
     if finger is None:
         finger = hand.finger_names[hand.others[(len(hand.others) - 1) // 2]]
     own, table = hand.fingers[hand.finger_names.index(finger)], ServoTable.from_dict(servo)
-    told = [table.value(hand.joints[j], "torque_limit") for j in own.flexion]
+    limits = [table.value(hand.joints[j], "torque_limit") for j in own.flexion]
     limit = []
-    for j, v in zip(own.flexion, told, strict=True):
+    for j, v in zip(own.flexion, limits, strict=True):
         if v.value is None:
             raise UserError(
                 f"hand {hand.folder}: force: cannot be told: the servo's torque_limit of {hand.joints[j]} is unknown;"

@@ -95,7 +95,8 @@ class Reality:
                 raise UserError(f"reality.solver.{key}={cfg['solver'][key]}: must be {' or '.join(known)}")
 
     def change_model(self, spec: mujoco.MjSpec) -> None:
-        """Solver, contact softness, torsional and rolling friction, friction by finger (relative to the world's)."""
+        """Change solver, contact softness, torsional and rolling friction, friction by finger (relative to the
+        world's)."""
         c, o = self.cfg["contact"], spec.option
         o.cone, o.solver = CONES[self.cfg["solver"]["cone"]], SOLVERS[self.cfg["solver"]["solver"]]
         o.tolerance = self.cfg["solver"]["tolerance"]

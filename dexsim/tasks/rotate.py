@@ -131,7 +131,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         return out
 
     def _advance_goal(self) -> None:
-        """The next goal where this one was reached."""
+        """Set the next goal where this one was reached."""
         self.goal = torch.where(self.reached[:, None], self.next_goal(self.object_pose[:, 3:]), self.goal)
         self.goal_heading = torch.where(self.reached, self.heading, self.goal_heading)
         self.successes += self.reached

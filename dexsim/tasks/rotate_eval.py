@@ -49,6 +49,8 @@ TOUCH = 0.1  # N on anything but fingertips that counts as touching it
 class Trials:
     """How a rotation is evaluated, for its environment to inherit."""
 
+    evaluation = __name__
+
     def trial_facts(self) -> dict[str, torch.Tensor]:
         """Return what an evaluation keeps of each trial as it begins, [N] each."""
         return {}
@@ -60,10 +62,6 @@ class Trials:
     def of_trials(self, r: dict) -> dict:
         """Return further metrics of an evaluation, from the arrays [E] of its trials."""
         return {}
-
-    def evaluate(self, policy: Policy, episodes: int = 256, seed: int = 0, progress: Progress | None = None) -> dict:
-        """Play `episodes` trials; see `evaluate`."""
-        return evaluate(self, policy, episodes, seed, progress)  # type: ignore[arg-type]  # a RotateEnv inherits it
 
 
 class TipTrials(Trials):
@@ -101,13 +99,7 @@ class TipTrials(Trials):
 
 
 @torch.inference_mode()
-def evaluate(
-    env: RotateEnv,
-    policy: Policy,
-    episodes: int,
-    seed: int,
-    progress: Progress | None = None,
-) -> dict:
+def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress: Progress | None = None) -> dict:
     """Play `episodes` trials, `env.num_envs` at a time.
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
@@ -119,14 +111,18 @@ def evaluate(
     training_length, env.max_episode_length = env.max_episode_length, int(round(cap / env.dt)) + 2
     try:
         r, frames = _trials(env, policy, cap, episodes, True, progress)
-        kept = _kept_out(env, policy, cap, max(episodes // 2, 1), progress) if env.task["objects"]["held_out"] else None
+        others = env.task["objects"]["held_out"]
+        kept_out = _kept_out(env, policy, cap, max(episodes // 2, 1), progress) if others else None
     finally:
         env.max_episode_length = training_length
     resamples = env.task["evaluation"]["resamples"]
-    metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, resamples, seed)
-    if kept is not None:
-        metrics["kept_out"] = summary(kept["successes"], kept["time"], kept["end"] == "capped", cap, resamples, seed)
-    metrics |= _by_object(env, [r] if kept is None else [r, kept])
+    metrics, *others = (
+        summary(x["successes"], x["time"], x["end"] == "capped", cap, resamples, seed)
+        for x in ([r] if kept_out is None else [r, kept_out])
+    )
+    if others:
+        metrics["kept_out"] = others[0]
+    metrics |= _by_object(env, [r] if kept_out is None else [r, kept_out])
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
     metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.end_names[:-1], "capped")}
@@ -209,13 +205,7 @@ def _interval(x: np.ndarray) -> list[float | None]:
 
 
 def _play(
-    env: RotateEnv,
-    policy: Policy,
-    cap: float,
-    keep_frames: bool,
-    progress: Progress | None,
-    done: int,
-    episodes: int,
+    env: RotateEnv, policy: Policy, cap: float, keep_frames: bool, progress: Progress | None, done: int, episodes: int
 ) -> dict:
     """Return one trial in every world."""
     n, dev, dt = env.num_envs, env.device, env.dt
@@ -229,8 +219,8 @@ def _play(
     how = torch.full((n,), len(names), dtype=torch.long, device=dev)
     facts = {k: v.clone().cpu().numpy() for k, v in env.trial_facts().items()}  # the next episode writes over them
     sums: dict[str, torch.Tensor] = {}
-    shown = list(range(min(SHOWN, n))) if keep_frames else []
-    models = [env.drawn_model(w) for w in shown]
+    filmed = list(range(min(SHOWN, n))) if keep_frames else []
+    models = [env.drawn_model(w) for w in filmed]
     which = env.objects.variant.cpu().numpy().copy()
     wide = [f"{2000 * float(x):.0f} mm" if env.names[v] == CUBE else env.names[v]
             for x, v in zip(env.objects.size[:, 0], which, strict=True)]  # fmt: skip
@@ -248,12 +238,12 @@ def _play(
         for name, seen in env.trial_counts().items():
             sums[name] = sums.get(name, torch.zeros_like(count)) + (seen & alive)
         alive = alive & ~ended
-        if shown and k * dt < SHOWN_S:
-            qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
-            force.append(env.touch.force_clean[shown][:, : env.fingers].cpu().numpy())
-            score.append(count[shown].cpu().numpy())
+        if filmed and k * dt < SHOWN_S:
+            qpos.append(env.engine.t.qpos[filmed].double().cpu().numpy())
+            force.append(env.touch.force_clean[filmed][:, : env.fingers].cpu().numpy())
+            score.append(count[filmed].cpu().numpy())
             if env.touch.raw is not None:
-                taxels.append(env.touch.raw[shown].cpu().numpy())
+                taxels.append(env.touch.raw[filmed].cpu().numpy())
         if k % 40 == 39:
             if progress is not None:
                 at = done + min(n, episodes - done) * (k + 1) // steps
@@ -265,13 +255,13 @@ def _play(
         "end": np.array([*names, "capped"])[how.cpu().numpy()], "object": which, "frames": None,
         **facts, **{name: total.cpu().numpy() for name, total in sums.items()},
     }  # fmt: skip
-    if shown:
-        stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in shown]  # the end's own frame is the next trial's
+    if filmed:
+        stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in filmed]  # the end's own frame is the next trial's
         out["frames"] = {
             "model": models, "dt": dt, "names": env.hand.finger_names, "full": 5.0,
             "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
             "label": [f"{wide[w]}, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
-                      for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
+                      for i, (w, s) in enumerate(zip(filmed, stop, strict=True))],
             "overlay": [
                 {"force": np.stack([f[i] for f in force[:s]]), "layout": env.touch.layout}
                 | ({"taxels": np.stack([x[i] for x in taxels[:s]])} if taxels else {})
@@ -309,11 +299,11 @@ def _tables(env: RotateEnv, m: dict, r: dict) -> list:
         ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
     ]  # fmt: skip
     ends = [(name, count, f"{100 * count / m['episodes']:.1f}") for name, count in m["ends"].items()]
-    kept = m.get("kept_out")
-    if kept is not None:
+    kept_out = m.get("kept_out")
+    if kept_out is not None:
         intervals.append(
-            ("average, objects kept out", f"{kept['consecutive_successes']['average']:.2f}",
-             _range(kept["consecutive_successes"]["average_interval"]))
+            ("average, objects kept out", f"{kept_out['consecutive_successes']['average']:.2f}",
+             _range(kept_out["consecutive_successes"]["average_interval"]))
         )  # fmt: skip
     by = [(name, f"{value:.1f}") for name, value in m.get("successes_by_object", {}).items()]
     own = [("Successes in a row by object", ("object", "average"), by)] if by else []
@@ -341,8 +331,8 @@ def _successes_plot(ax: Axes, successes: np.ndarray) -> None:
 def _survival_plot(ax: Axes, time: np.ndarray, cap: float) -> None:
     t = np.sort(time)
     fallen = t < cap
-    left = 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t))
-    ax.step([0, *t[fallen], cap], [100, *left, 100 * (~fallen).mean()], where="post")
+    turning = 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t))
+    ax.step([0, *t[fallen], cap], [100, *turning, 100 * (~fallen).mean()], where="post")
     ax.set_xlabel("time [s]")
     ax.set_ylabel("trials still turning [%]")
     ax.set_ylim(0, 102)

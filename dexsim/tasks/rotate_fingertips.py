@@ -64,12 +64,12 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     @classmethod
     def check_deployed(cls, source: str) -> None:
-        """UserError: it cannot."""
+        """Raise UserError: no policy of this task can be exported."""
         raise UserError(f"{source}: its task's camera and arm are not read by the deployed loop; export another policy")
 
     @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:
-        """Nothing: poses held by fingertips come with dexsim, or are given."""
+        """Prepare nothing: poses held by fingertips come with dexsim, or are given."""
 
     @classmethod
     def another_world(cls, u: Any, friction: float, size: float) -> dict[str, Any]:
@@ -149,14 +149,14 @@ class FingertipEnv(TipTrials, RotateEnv):
         self.hidden = torch.where(mask, s.draw("camera.hidden"), self.hidden)
 
     def _advance_goal(self) -> None:
-        """The next goal where this one was reached, and in training where it was not for `goal.patience` s."""
+        """Set the next goal where this one was reached, and in training where it was not for `goal.patience` s."""
         super()._advance_goal()
         late = self.since * self.dt >= self.patience
         self.goal = torch.where(late[:, None], self._drawn_goal(self.goal), self.goal)
         self.since.masked_fill_(late, 0)
 
     def end_curriculum(self) -> None:
-        """As the base class; and a goal now stays until it is reached."""
+        """End it as the base class does; a goal now stays until it is reached."""
         super().end_curriculum()
         self.patience.fill_(math.inf)
 
@@ -176,7 +176,7 @@ class FingertipEnv(TipTrials, RotateEnv):
     # -- pushes
     # --------------------------------------------------------------------------------------------------------------
     def _new_push(self, mask: torch.Tensor) -> None:
-        """A push in a random direction, of a multiple of the object's weight, after a random wait."""
+        """Draw a push in a random direction, of a multiple of the object's weight, after a random wait."""
         s = self.sampler
         size = s.draw("push.weights") * self.objects.mass * 9.81
         self.push_force = torch.where(mask[:, None], s.direction() * size[:, None], self.push_force)

@@ -39,9 +39,9 @@ class Free:
 
 
 @dataclass(frozen=True)
-class Hinge:
-    """The object turns about one axis: a knob, a lever, a door. at: m; axis: unit vector; range: rad; friction: N.m of
-    dry friction; damping: N.m.s/rad; armature: kg.m2."""
+class Jointed:
+    """The object moves along or about one axis. at: m; axis: unit vector; range: rad, of a slide m; friction: N.m of
+    dry friction, N; damping: N.m.s/rad, N.s/m; armature: kg.m2, kg; quat: w x y z."""
 
     at: Vector = (0.07, 0.0, 0.06)
     axis: Vector = (0.0, 0.0, 1.0)
@@ -53,30 +53,24 @@ class Hinge:
 
 
 @dataclass(frozen=True)
-class Slide:
-    """The object moves along one axis: a drawer, a button. As `Hinge`, in m, N and kg."""
+class Hinge(Jointed):
+    """The object turns about one axis: a knob, a lever, a door."""
 
-    at: Vector = (0.07, 0.0, 0.06)
+
+@dataclass(frozen=True)
+class Slide(Jointed):
+    """The object moves along one axis: a drawer, a button."""
+
     axis: Vector = (1.0, 0.0, 0.0)
-    range: tuple[float, float] | None = None
-    friction: float = 0.0
     damping: float = 0.1
     armature: float = 1e-3
-    quat: Wxyz = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Screw:
-    """The object turns and moves along the same axis, `pitch` m a turn; range: rad. Else as `Hinge`."""
+class Screw(Jointed):
+    """The object turns and moves along the same axis, `pitch` m a turn."""
 
-    at: Vector = (0.07, 0.0, 0.06)
-    axis: Vector = (0.0, 0.0, 1.0)
     pitch: float = 0.002
-    range: tuple[float, float] | None = None
-    friction: float = 0.0
-    damping: float = 1e-4
-    armature: float = 1e-6
-    quat: Wxyz = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -145,7 +139,7 @@ class Scene:
     """What a task's world holds beside the hand. object: how the object moves, whose shapes `task.objects` names; None:
     there is none. base: None where the hand is fixed."""
 
-    object: Free | Hinge | Slide | Screw | None = Free()
+    object: Free | Jointed | None = Free()
     base: Base | None = None
     table: Table | None = None
     things: tuple[Thing, ...] = ()
@@ -198,7 +192,7 @@ def mount(spec: mujoco.MjSpec, base: Base) -> None:
         )  # fmt: skip
 
 
-def fasten(body: mujoco.MjsBody, how: Hinge | Slide | Screw, spec: mujoco.MjSpec) -> None:
+def fasten(body: mujoco.MjsBody, how: Jointed, spec: mujoco.MjSpec) -> None:
     """Give the object's body its joint in place of a free one."""
     axis = np.asarray(how.axis, float)
     if not np.linalg.norm(axis) > 0:
@@ -241,7 +235,7 @@ def furnish(spec: mujoco.MjSpec, scene: Scene) -> Built:
 
 
 def _table(spec: mujoco.MjSpec, table: Table) -> None:
-    """It meets the hand, and objects: bits of both."""
+    """Build the table, which meets the hand and objects: bits of both."""
     thick = 0.02
     body = spec.worldbody.add_body(name="table", pos=[*table.centre, table.top - thick])
     both = OBJECT_BIT | HAND_BIT
@@ -312,7 +306,7 @@ def _tree(spec: mujoco.MjSpec, tree: Tree) -> tuple[list[Part], list[str]]:
     model = own.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    parts = [_felt(model, b, tree.name) for b in range(1, model.nbody) if _colliding(model, b)]
+    parts = [_part(model, b, tree.name) for b in range(1, model.nbody) if _colliding(model, b)]
     joints = [f"{tree.name}/{joint.name}" for joint in own.joints]
     frame = spec.worldbody.add_frame(name=f"{tree.name}_frame", pos=tree.at, quat=tree.quat)
     spec.attach(own, prefix=f"{tree.name}/", frame=frame)
@@ -323,7 +317,7 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[int]:
     return [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_contype[g]]
 
 
-def _felt(model: mujoco.MjModel, body: int, tree: str) -> Part:
+def _part(model: mujoco.MjModel, body: int, tree: str) -> Part:
     """Return what pads feel of a body: the convex hull of its colliding geoms."""
     points = np.concatenate([_corners(model, g) for g in _colliding(model, body)])
     name = f"{tree}/{model.body(body).name}"

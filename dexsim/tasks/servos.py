@@ -73,7 +73,7 @@ class ServoRandomizer:
     """
 
     def __init__(self, servo: Servo, sampler: Sampler, exact: Sequence[str] = ()):
-        """exact: joints whose drives stay as the table has them."""
+        """Prepare draws for each joint. exact: joints whose drives stay as the table has them."""
         wp.init()
         self.servo, self.sampler = servo, sampler
         low, high = servo.table.bounds(servo.joints)
@@ -118,7 +118,7 @@ class ServoRandomizer:
             )
 
     def draw(self, mask: torch.Tensor) -> None:
-        """New parameters in the worlds that mask [N] selects; others keep theirs."""
+        """Draw new parameters in the worlds that mask [N] selects; others keep theirs."""
         n, joints, columns = self.servo.params.shape
         drawn = [self.sampler.draw(f"servo.{name}", joints) for name in self.columns]
         u = self.sampler.uniform(joints, len(self.simulated))

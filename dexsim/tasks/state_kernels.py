@@ -102,7 +102,7 @@ def clear_touch(
     centre: wp.array2d(dtype=wp.vec3),
     centre_clean: wp.array2d(dtype=wp.vec3),
 ):
-    """Nothing is felt in the masked worlds, centres are the pads' own."""
+    """Clear touch in the masked worlds: no force, and the pads' own centres."""
     w, f = wp.tid()
     if mask[w]:
         force[w, f] = float(0.0)
@@ -137,7 +137,7 @@ def act(
     last_action: wp.array2d(dtype=float),
     target: wp.array2d(dtype=float),
 ):
-    """Actions to targets, see `HandEnv.act`; what is not a number is 0."""
+    """Make targets of actions, see `HandEnv.act`; what is not a number is 0."""
     w, j = wp.tid()
     a = given[w, j]
     if wp.isnan(a):
@@ -182,8 +182,8 @@ def judge(
     nan_count: wp.array(dtype=wp.int64),
     out: Ended,
 ):
-    """Which worlds end, and what they earned. One whose state, a reward or the last observation is not finite ends as
-    `nan` and earns nothing."""
+    """Decide which worlds end, and what they earned. One whose state, a reward or the last observation is not finite
+    ends as `nan` and earns nothing."""
     w = wp.tid()
     terms = reward.shape[0]
     bad = nan[w]
@@ -222,7 +222,8 @@ def judge(
 
 @wp.kernel(enable_backward=False)
 def note_not_finite(value: wp.array2d(dtype=float), row: int, blind: wp.array2d(dtype=wp.bool)):
-    """blind [1 + groups, N]: worlds of which any group, or this one (row), holds a number that is not finite."""
+    """Note in blind [1 + groups, N] the worlds of which any group, or this one (row), holds a number that is not
+    finite."""
     w, k = wp.tid()
     if not wp.isfinite(value[w, k]):
         blind[0, w] = True

@@ -35,11 +35,11 @@ from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 from dexsim.tasks import registry
 from dexsim.tasks.env import HandEnv
-from dexsim.tasks.scenes import BASE
+from dexsim.tasks.scenes import BASE, Jointed
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, held_poses
 from dexsim.tasks.terms import Memory, Sensing, Term, memories_of, span, terms_of
-from dexsim.tasks.watched import Watched
+from dexsim.tasks.watched import Watched, names
 
 SWITCHES = ("actor", "critic")
 STATE = (
@@ -115,7 +115,7 @@ class Task(HandEnv):
 
     @classmethod
     def check_deployed(cls, source: str) -> None:
-        """UserError for a task whose machine is more than a hand."""
+        """Raise UserError for a task whose machine is more than a hand."""
         if cls.scene.base is not None:
             raise UserError(
                 f"{source}: its hand moves on a base of six servos, which the deployed loop does not drive; export a"
@@ -125,7 +125,7 @@ class Task(HandEnv):
     def __init__(
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
-        """grasps: what `hold` begins with, instead of the hand's own held poses."""
+        """Build the worlds. grasps: what `hold` begins with, instead of the hand's own held poses."""
         self.grasps = grasps
         super().__init__(cfg, n_worlds, device, seed, engine)
 
@@ -135,8 +135,13 @@ class Task(HandEnv):
         n, dev, t = self.num_envs, self.device, self.task
         self._terms = terms_of(type(self))
         self._check_names()
+        self._check_reads()
         self._check_settings()
         self._complete()
+        self._own = [
+            name for owner in type(self).__mro__ for part in ("settings", "randomize")
+            for name in names(vars(owner).get(part, {}), part.replace("settings", "task"))
+        ]  # fmt: skip
         self._clean_read, self._is_clean = False, False
         for held in memories_of(type(self)).values():
             held.allocate(self)
@@ -150,7 +155,7 @@ class Task(HandEnv):
             self._sensed.append(Sensing(x, {**given, **named}, f"task.observations.{x.name}"))
         self._history: torch.Tensor | None = None
         self.commands: dict[str, torch.Tensor] = {}
-        self._left: dict[str, torch.Tensor] = {}
+        self._remaining: dict[str, torch.Tensor] = {}
         self._due: dict[str, torch.Tensor] = {}
         for x in self._terms["event"]:
             if t["events"][x.name]["every_s"] is not None:
@@ -166,7 +171,7 @@ class Task(HandEnv):
         for x in self._terms["command"]:
             value = self._command_value(x)
             self.commands[x.name] = torch.zeros_like(value)
-            self._left[x.name] = torch.zeros(n, device=dev)
+            self._remaining[x.name] = torch.zeros(n, device=dev)
 
     def prepare_task(self) -> None:
         """Allocate what the task needs beside declared memory; called once, before the first episode."""
@@ -221,6 +226,15 @@ class Task(HandEnv):
                     raise UserError(f"task.{part}.{name}: there is no such term; there are"
                                     f" {', '.join(known[kind]) or 'none'}")  # fmt: skip
 
+    def _check_reads(self) -> None:
+        """Raise UserError for a term that reads an object, or its joint, which the scene has not: it would be 0."""
+        lacks = set() if isinstance(self.scene.object, Jointed) else {"object_joint", "object_speed"}
+        lacks |= {"object_pose", "object_velocity", "object_spin"} if self.scene.object is None else set()
+        for x in (x for terms in self._terms.values() for x in terms):
+            reads = getattr(getattr(x.method, "__code__", None), "co_names", ())
+            if "scene" not in reads and (wrong := sorted(lacks.intersection(reads))):
+                raise UserError(f"{x.kind} {x.name}: reads {wrong[0]}, but the task's scene has none")
+
     def set_objects(self) -> None:
         """Find which rows of the scene's table are trained on, and how likely each is: every shape as likely as any,
         whatever the number of its baked sizes, in training times its `task.objects.emphasis`."""
@@ -243,7 +257,7 @@ class Task(HandEnv):
         self.judge_kept_out(False)
 
     def judge_kept_out(self, kept_out: bool) -> None:
-        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        """Begin episodes with objects kept out of the training from now on, or with those of it."""
         self.draw_from(self.held_rows) if kept_out else self.draw_from(self.train_rows, self.emphasis)
 
     def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
@@ -341,8 +355,8 @@ class Task(HandEnv):
         }  # fmt: skip
 
     def give_object(self, mask: torch.Tensor, row: torch.Tensor, scale: torch.Tensor) -> None:
-        """Where mask holds: an object by its row [N] of the scene's table, of `scale` [N, 3] times its shape's size
-        where that is a box, sphere or capsule; its mass and friction as drawn."""
+        """Give, where mask holds, an object by its row [N] of the scene's table, of `scale` [N, 3] times its shape's
+        size where that is a box, sphere or capsule; its mass and friction as drawn."""
         self.objects.write(mask, row, scale=scale, **self._physics)
         here = self.touch if self.touch.shape_id.dim() == 1 else None
         ids, sizes = (self.touch.shape_id, self.touch.shape_size) if here is not None else (
@@ -364,7 +378,7 @@ class Task(HandEnv):
         target: torch.Tensor | None = None,
         also: Mapping[int, torch.Tensor] | None = None,
     ) -> torch.Tensor:
-        """Return where mask holds: the hand in a pose (its name, or [J] or [N, J] rad), give or take
+        """Place, where mask holds, the hand in a pose (its name, or [J] or [N, J] rad), give or take
         `randomize.initial.joint`, at rest, sent to `target` [N, J]; the object at object_pose [N, 7], which is
         returned. also: see `place`."""
         n = self.num_envs
@@ -380,8 +394,8 @@ class Task(HandEnv):
         return pose
 
     def drop_object(self, mask: torch.Tensor, above: float = 0.03, spread: float = 0.01) -> torch.Tensor:
-        """Return where mask holds: the open hand, the object at rest in any orientation, `above` m over the palm and
-        its own radius, give or take `spread` m aside. Returns its pose [N, 7]."""
+        """Place, where mask holds, the open hand, and the object at rest in any orientation, `above` m over the palm
+        and its own radius, give or take `spread` m aside. Returns its pose [N, 7]."""
         s = self.sampler
         where = torch.as_tensor(self.places.catch, dtype=torch.float32, device=self.device).expand(self.num_envs, 3)
         where = where.clone()
@@ -390,7 +404,7 @@ class Task(HandEnv):
         return self.start(mask, "open", torch.cat([where, s.quaternion()], 1))
 
     def hold(self, mask: torch.Tensor) -> torch.Tensor:
-        """Return where mask holds: a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its
+        """Place, where mask holds, a box that lies firmly in the hand, as rotation begins (`dexsim stable-grasps`); its
         edge is `randomize.object.size`, m. Returns its pose [N, 7]."""
         s = self.sampler
         if self.grasps is None:
@@ -412,12 +426,12 @@ class Task(HandEnv):
         return _columns(value, self.num_envs, f"command {term.name}").float()
 
     def renew(self, name: str, mask: torch.Tensor) -> None:
-        """A new value of a command where mask [N] holds."""
+        """Draw a new value of a command where mask [N] holds."""
         term = next(x for x in self._terms["command"] if x.name == name)
         self.commands[name].copy_(torch.where(mask[:, None], self._command_value(term), self.commands[name]))
         low, high = span(self.task["commands"][name]["hold_s"], f"task.commands.{name}.hold_s")
         held = low if low == high else low + (high - low) * self.sampler.uniform()
-        self._left[name].copy_(torch.where(mask, held, self._left[name]))
+        self._remaining[name].copy_(torch.where(mask, held, self._remaining[name]))
 
     def before_physics(self) -> None:
         """Widen ranges, change commands that are held long enough, and let events happen that are due."""
@@ -428,8 +442,8 @@ class Task(HandEnv):
         for x in self._terms["command"]:
             low, _ = span(self.task["commands"][x.name]["hold_s"], f"task.commands.{x.name}.hold_s")
             if low != float("inf"):
-                self._left[x.name] -= self.dt
-                self.renew(x.name, self._left[x.name] <= 0)
+                self._remaining[x.name] -= self.dt
+                self.renew(x.name, self._remaining[x.name] <= 0)
         for x in self._terms["event"]:
             self._happen(x, None, False)
 
@@ -531,8 +545,8 @@ class Task(HandEnv):
         for x in rows:
             pattern = x.term.options["mirror"] or (1,)
             signs += [pattern[k % len(pattern)] for k in range(x.width)] * x.frames
-        told = sum(v.shape[1] for k, v in self.commands.items() if self.task["commands"][k]["actor"])
-        return torch.tensor((signs + [1] * told) * self.history, dtype=torch.float32, device=self.device)
+        commanded = sum(v.shape[1] for k, v in self.commands.items() if self.task["commands"][k]["actor"])
+        return torch.tensor((signs + [1] * commanded) * self.history, dtype=torch.float32, device=self.device)
 
     def sense(self, fresh: torch.Tensor) -> None:
         """Move sensors of the task's own on by a control step, before its observations; fresh [N]: an episode
@@ -543,7 +557,7 @@ class Task(HandEnv):
         if advance:
             self.sense(fresh)
         actor, critic = [], []
-        told = [(x.name, self.task["commands"][x.name]) for x in self._terms["command"]]
+        commanded = [(x.name, self.task["commands"][x.name]) for x in self._terms["command"]]
         for row in self._sensed:
             given, value = self.task["observations"][row.term.name], None
             if self._named(given["actor"]):
@@ -558,8 +572,8 @@ class Task(HandEnv):
                     self._is_clean = False
                 row.clean_width = value.shape[1]
                 critic.append(value)
-        actor += [self.commands[name] for name, given in told if given["actor"]]
-        critic += [self.commands[name] for name, given in told if given["critic"]]
+        actor += [self.commands[name] for name, given in commanded if given["actor"]]
+        critic += [self.commands[name] for name, given in commanded if given["critic"]]
         if not actor:
             raise UserError(f"task {self.task['name']}: the actor sees nothing; declare or switch on a row")
         seen = torch.where(self.nan[:, None], 0.0, torch.cat(actor, 1))
@@ -596,7 +610,7 @@ class Task(HandEnv):
         for row in self._sensed:
             own |= row.memory()
         own |= {f"command.{k}": v for k, v in self.commands.items()}
-        own |= {f"command_left.{k}": v for k, v in self._left.items()}
+        own |= {f"command_left.{k}": v for k, v in self._remaining.items()}
         own |= {f"event_due.{k}": v for k, v in self._due.items()} | {f"last.{k}": v for k, v in self.last.items()}
         if self._history is not None:
             own["history"] = self._history

@@ -45,12 +45,13 @@ class Term:
     params: dict[str, Any] = field(default_factory=dict)
 
 
-def _declare(
-    kind: str, method: Callable[..., Any], unit: str, options: dict[str, Any], name: str | None = None
-) -> Any:
+def _declare(kind: str, method: Callable[..., Any], unit: str, options: dict[str, Any], name: str | None = None) -> Any:
     text = ((method.__doc__ or "").strip().splitlines() or [""])[0]
     params, skip = {}, {"event": 2}.get(kind, 1)
-    for k, (argument, p) in enumerate(inspect.signature(method).parameters.items()):
+    takes = inspect.signature(method).parameters
+    if len(takes) < skip:
+        raise UserError(f"term {method.__name__}: must take {'self and mask [N]' if kind == 'event' else 'self'}")
+    for k, (argument, p) in enumerate(takes.items()):
         if k < skip:
             continue
         if p.default is inspect.Parameter.empty:
@@ -204,7 +205,7 @@ class Sensing:
         if self.delay[1] > 0:
             length = int(-(-self.delay[1] // env.dt)) + 1
             if self.past is None:
-                self.past = _kept(value, length)
+                self.past = _lasting(value, length)
             moved = torch.cat([value[:, None], self.past[:, :-1]], 1)
             moved = torch.where(fresh[:, None, None], value[:, None].expand_as(moved), moved)
             if advance:
@@ -214,14 +215,14 @@ class Sensing:
             value = moved.gather(1, pick)[:, 0]
         if self.dropout:
             if self.got is None:
-                self.got = _kept(value, 1)[:, 0]
+                self.got = _lasting(value, 1)[:, 0]
             lost = (sampler.uniform() < self.dropout) & ~fresh
             value = torch.where(lost[:, None], self.got, value)
             if advance:
                 self.got.copy_(value)
         if self.frames > 1:
             if self.seen is None:
-                self.seen = _kept(value, self.frames)
+                self.seen = _lasting(value, self.frames)
             moved = torch.cat([value[:, None], self.seen[:, :-1]], 1)
             moved = torch.where(fresh[:, None, None], value[:, None].expand_as(moved), moved)
             if advance:
@@ -237,7 +238,7 @@ class Sensing:
         return {f"{self.term.name}.{k}": v for k, v in own.items()}
 
 
-def _kept(value: torch.Tensor, count: int) -> torch.Tensor:
+def _lasting(value: torch.Tensor, count: int) -> torch.Tensor:
     """Return memory [N, count, D] that outlives the rollout that happens to come first."""
     with torch.inference_mode(False):
         return torch.zeros(len(value), count, value.shape[1], dtype=value.dtype, device=value.device)
@@ -276,11 +277,17 @@ class Memory:
 
     def __set__(self, env: Any, value: torch.Tensor) -> None:
         held = env.__dict__[self.name]
-        if value is not held:
+        if value is held:
+            return
+        try:
             held.copy_(value)
+        except (RuntimeError, TypeError) as error:
+            shape = list(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+            name = self.name.removeprefix("_memory_")
+            raise UserError(f"memory {name}: cannot take {shape}, it is declared as {list(held.shape)}") from error
 
     def allocate(self, env: Any) -> None:
-        """Zeros for all worlds of an environment."""
+        """Allocate zeros for all worlds of an environment."""
         shape = [size if isinstance(size, int) else size(env) for size in self.shape]
         env.__dict__[self.name] = torch.zeros(env.num_envs, *shape, dtype=self.dtype, device=env.device)
 

@@ -62,6 +62,15 @@ class Watched(dict):
         return dict, (dict(self.items()),)
 
 
+def names(node: Any, prefix: str) -> Iterator[str]:
+    """Yield the dotted names of all values below a nested mapping; none of what is no mapping."""
+    for key, value in node.items() if isinstance(node, Mapping) else ():
+        if isinstance(value, Mapping):
+            yield from names(value, f"{prefix}.{key}")
+        else:
+            yield f"{prefix}.{key}"
+
+
 def unread(read: set[str], keys: list[str]) -> list[str]:
     """Return those of the dotted names that were not read: neither they, nor anything in them, nor all that they are
     in."""

@@ -5,6 +5,7 @@ import torch
 
 from dexsim import rotation
 from dexsim.tasks import Base, Scene, Table, Task, done, event, memory, metric, observe, reward
+from dexsim_examples import rows
 
 UP = 0.05  # m
 TOP = -0.13  # m, of the table
@@ -76,10 +77,7 @@ class Lift(Task):
         """of hand and base, measured"""
         return self.q
 
-    @observe("1")
-    def sent(self):
-        """targets last sent, over each joint's range"""
-        return (self.target - self.q_mid) / self.q_half
+    sent = rows.sent
 
     @observe("m", noise=0.003, delay=(0.0, 0.08))
     def object_place(self):
@@ -91,10 +89,7 @@ class Lift(Task):
         """6D of its orientation, its radius"""
         return torch.cat([rotation.six(self.object_pose[:, 3:]), 10 * self.objects.radius[:, None]], 1)
 
-    @observe("N")
-    def touch(self):
-        """sum of a pad's normal forces"""
-        return self.touch_force
+    touch = rows.touch
 
     @observe("m")
     def fingertips(self):
@@ -135,10 +130,7 @@ class Lift(Task):
         """speed of the object up there, m/s"""
         return self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0) * (self.height() > 0.02)
 
-    @reward(-0.002)
-    def change(self):
-        """change of the action"""
-        return (self.action - self.last_action).square().sum(1)
+    change = rows.change
 
     @done
     def gone(self, far=0.2):

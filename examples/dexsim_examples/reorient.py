@@ -4,6 +4,7 @@ import torch
 
 from dexsim import rotation
 from dexsim.tasks import Task, done, memory, metric, observe, reward
+from dexsim_examples import rows
 
 REACHED = 0.4  # rad
 PATIENCE = 8.0  # s of training per goal
@@ -23,6 +24,7 @@ class Reorient(Task):
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
         },
     }  # fmt: skip
+    weights = {"change": -0.0005}
     randomize = {"object": {"size": [0.045, 0.052], "mass": {"log": [0.03, 0.1]}}}
 
     goal = memory(4)  # orientation to reach, w x y z
@@ -55,15 +57,7 @@ class Reorient(Task):
         return (self.object_pose[:, :3] - self.home).norm(dim=1)
 
     # -- what is seen
-    @observe("rad", noise=0.003)
-    def joint_position(self):
-        """measured"""
-        return self.q
-
-    @observe("1")
-    def sent(self):
-        """targets last sent, over each joint's range"""
-        return (self.target - self.q_mid) / self.q_half
+    joint_position, sent = rows.joint_position, rows.sent
 
     @observe("1", noise=0.02, delay=(0.0, 0.05))
     def to_goal(self):
@@ -80,15 +74,7 @@ class Reorient(Task):
         """from a camera, palm frame"""
         return self.object_pose[:, :3]
 
-    @observe("N")
-    def touch(self):
-        """sum of a pad's normal forces"""
-        return self.touch_force
-
-    @observe("m")
-    def fingertips(self):
-        """from the measured angles"""
-        return self.tips
+    touch, fingertips = rows.touch, rows.fingertips
 
     @observe("rad/s, m/s", only="critic")
     def motion(self):
@@ -128,10 +114,7 @@ class Reorient(Task):
         """drift of the cube, m"""
         return self.drift().clamp(max=0.2)
 
-    @reward(-0.0005)
-    def change(self):
-        """change of the action"""
-        return (self.action - self.last_action).square().sum(1)
+    change = rows.change
 
     @done
     def dropped(self, below=0.0, far=0.1):

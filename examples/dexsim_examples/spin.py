@@ -8,6 +8,7 @@ import torch
 
 from dexsim import rotation
 from dexsim.tasks import Task, done, memory, metric, observe, reward
+from dexsim_examples import rows
 
 RADIUS, HALF = (0.008, 0.011), (0.045, 0.06)  # m, of the stick: radius, half its length
 
@@ -73,30 +74,14 @@ class Spin(Task):
         self.turned += torch.nan_to_num(self.moved)
 
     # -- what is seen
-    @observe("rad", noise=0.003)
-    def joint_position(self):
-        """measured"""
-        return self.q
-
-    @observe("1")
-    def sent(self):
-        """targets last sent, over each joint's range"""
-        return (self.target - self.q_mid) / self.q_half
+    joint_position, sent = rows.joint_position, rows.sent
 
     @observe("m, 1", noise=0.002, delay=(0.0, 0.05))
     def stick(self):
         """middle and direction, from a camera, palm frame"""
         return torch.cat([self.object_pose[:, :3], 0.05 * self.along()], 1)
 
-    @observe("N")
-    def touch(self):
-        """sum of a pad's normal forces"""
-        return self.touch_force
-
-    @observe("m")
-    def fingertips(self):
-        """from the measured angles"""
-        return self.tips
+    touch, fingertips = rows.touch, rows.fingertips
 
     @observe("rad/s, m/s", only="critic")
     def motion(self):
@@ -131,10 +116,7 @@ class Spin(Task):
         """the stick fell"""
         return self.dropped().float()
 
-    @reward(-0.002)
-    def change(self):
-        """change of the action"""
-        return (self.action - self.last_action).square().sum(1)
+    change = rows.change
 
     @done
     def dropped(self, below=0.0, far=0.07, tilt=0.8):

@@ -7,6 +7,7 @@ import math
 import torch
 
 from dexsim.tasks import Hinge, Scene, Task, done, memory, metric, observe, reward
+from dexsim_examples import rows
 
 TURNS = 10  # there, and as many back
 LAST = 2 * math.pi * (TURNS + 0.5)  # rad, where the knob stops
@@ -59,15 +60,7 @@ class Turn(Task):
         self.way = torch.where(turn, -self.way, self.way)
 
     # -- what is seen
-    @observe("rad", noise=0.003)
-    def joint_position(self):
-        """measured"""
-        return self.q
-
-    @observe("1")
-    def sent(self):
-        """targets last sent, over each joint's range"""
-        return (self.target - self.q_mid) / self.q_half
+    joint_position, sent = rows.joint_position, rows.sent
 
     @observe("1", noise=0.02, delay=(0.0, 0.05))
     def knob(self):
@@ -79,15 +72,7 @@ class Turn(Task):
         """which way to turn"""
         return self.way
 
-    @observe("N")
-    def touch(self):
-        """sum of a pad's normal forces"""
-        return self.touch_force
-
-    @observe("m")
-    def fingertips(self):
-        """from the measured angles"""
-        return self.tips
+    touch, fingertips = rows.touch, rows.fingertips
 
     @observe("rad/s", only="critic")
     def motion(self):
@@ -106,10 +91,7 @@ class Turn(Task):
         """speed of the knob the way it should go, rad/s"""
         return (self.way * self.object_speed).clamp(-fastest, fastest)
 
-    @reward(-0.002)
-    def change(self):
-        """change of the action"""
-        return (self.action - self.last_action).square().sum(1)
+    change = rows.change
 
     @reward(-0.02)
     def on_itself(self):
