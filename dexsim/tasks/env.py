@@ -86,7 +86,7 @@ class HandEnv(Kept):
         for key in unread(read, [k for k in mine if not k.startswith(later)]):
             raise UserError(
                 f"{key}: nothing reads this setting, with the others as they are, so that it would change nothing;"
-                " leave it out, or switch on what it belongs to"
+                " leave it out, or switch on what it belongs to (of a task's own class: read it in prepare_task)"
             )
 
     def _check_widths(self) -> None:
