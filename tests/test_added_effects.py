@@ -182,8 +182,8 @@ def tilted(size: Any, q: Any):
             error += by_tilt[0]
             slope += by_tilt[1]
 '''),),
-    (("    return shown, slope\n", '''    if "tilt" in features:
-        shown = shown + p["tilt"] * xp.sin(2.0 * q)
+    (("    return reading, slope\n", '''    if "tilt" in features:
+        reading = reading + p["tilt"] * xp.sin(2.0 * q)
         slope = slope + 2.0 * p["tilt"] * xp.cos(2.0 * q)
 '''),),
     "signals", "((0.03,), (0.1,))", 'np.abs(np.sin(2 * case.regimes["position"]))', 0.12,
@@ -205,10 +205,10 @@ def soft_dead_zone(width: Any, e: Any):
 ''',
     "@cache\ndef lost_error(",
     ((
-        "        if wp.abs(left) < width:\n            acts = type(e)(0.0)\n            if kind",
+        "        if wp.abs(error) < width:\n            acts = type(e)(0.0)\n            if kind",
         '''        if wp.static("dead_zone" in features):
             if of[DEAD_ZONE] > type(e)(0.0):
-                soft = soft_dead_zone(of[DEAD_ZONE], left)
+                soft = soft_dead_zone(of[DEAD_ZONE], error)
                 lost += soft[0]
                 slope += soft[1]
 ''',
