@@ -177,11 +177,11 @@ def test_relative_orientation_does_not_know_the_heading():
 
 def test_speed_is_the_firmwares_or_the_difference_of_readings(made):
     m = turner(made)
-    assert np.allclose(m._velocity(state(0.0, 0.3, np.full(12, 0.7))), 0.7)
+    assert np.allclose(m.hand.velocity(state(0.0, 0.3, np.full(12, 0.7))), 0.7)
     m.reset()
-    assert np.allclose(m._velocity(state(0.0, 0.3)), 0)
-    assert np.allclose(m._velocity(state(0.02, 0.32)), 1.0, atol=1e-5)
-    assert np.allclose(m._velocity(state(0.02, 0.32)), 1.0, atol=1e-5), "the same reading again tells nothing new"
+    assert np.allclose(m.hand.velocity(state(0.0, 0.3)), 0)
+    assert np.allclose(m.hand.velocity(state(0.02, 0.32)), 1.0, atol=1e-5)
+    assert np.allclose(m.hand.velocity(state(0.02, 0.32)), 1.0, atol=1e-5), "the same reading again tells nothing new"
 
 
 @pytest.mark.slow
