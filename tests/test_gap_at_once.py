@@ -1,5 +1,4 @@
-"""What a diagnosis does at the same time: searches that take turns at the interpreter, hypotheses in threads of
-their own, joints judged before the last is searched. Each gives what one after the other gives, to the last bit."""
+"""What of a diagnosis is done while other joints are still searched, and what where time is out."""
 
 from __future__ import annotations
 
