@@ -26,7 +26,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.read.noise import noise
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, search_joint
 from dexsim.gap.touch import judge
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import drive
@@ -101,7 +101,7 @@ def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
-    return JointSearch(case, list(range(len(runs))), None, conditions(runs)).run()
+    return search_joint(JointSearch(case, list(range(len(runs))), None, conditions(runs)))
 
 
 # -- the plant

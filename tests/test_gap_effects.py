@@ -92,7 +92,7 @@ def found(changes: dict[str, float], servo: dict | None = None, allowed: set[str
     runs = [plant_run(f"run{k}", k, seconds, off | changes, seed=k, servo=servo) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
-    return JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed=allowed).run()
+    return search_joint(JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed=allowed))
 
 
 def steps(kind: int, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from dexsim.gap.finding import Finding
 from dexsim.gap.judge import handed_on
 from dexsim.gap.plant.case import build
 from dexsim.gap.read import conditions
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.search.search import JointSearch, without_search
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import realistic
@@ -302,7 +302,7 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
         )
         runs[-1].smooth()
     case = build(spec.compile(), runs)[0]
-    none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
+    none = without_search(JointSearch(case, [0, 2], None, conditions(runs))).none
     found = handed_on.fit_stand_in(case, runs, none, [0, 2], [1])
     assert found is not None and found.after < 0.5 * found.before
     assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
@@ -323,5 +323,5 @@ def test_no_stand_in_where_nothing_is_left():
     for r in runs:
         r.smooth()
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
-    none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
+    none = without_search(JointSearch(case, [0, 2], None, conditions(runs))).none
     assert handed_on.fit_stand_in(case, runs, none, [0, 2], [1]) is None
