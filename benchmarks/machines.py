@@ -201,6 +201,7 @@ def main(argv: list[str]) -> int:
     for gbit in (None, *rates):
         single = not rows
         folder = out / ("one" if single else f"{count}_nodes_{gbit or 'free'}")
+        shutil.rmtree(folder, ignore_errors=True)  # of an earlier time
         with Nodes(1 if single else count, folder, gbit, env) as nodes:
             rows.append(measure(nodes, ranks if single else ranks // count, settings, devices, end))
         print(json.dumps(rows[-1]), flush=True)
