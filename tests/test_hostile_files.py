@@ -574,8 +574,18 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("kind", MODELS)
-@pytest.mark.parametrize("reader", ["hand", "model=", "model_file=", "import-hand"])
+READERS = ("hand", "model=", "model_file=", "import-hand")
+
+
+def pairs():
+    """Yield each kind with each reader; quick are all kinds with one reader, and copies with all of them."""
+    for reader in READERS:
+        for kind in MODELS:
+            quick = reader == "hand" or kind == "copies"
+            yield pytest.param(kind, reader, marks=[] if quick else [pytest.mark.slow])
+
+
+@pytest.mark.parametrize(("kind", "reader"), list(pairs()))
 def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp_path, monkeypatch):
     """Each as a hand's own, a diagnosis', a training's and one to be imported, in one line."""
     from dexsim import guard
