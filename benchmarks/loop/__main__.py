@@ -1,7 +1,7 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run
 again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,...]
+    python -m benchmarks.loop [tasks=grasp,rotate] [realities=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,...]
                               [on=slurm|dask] [at_once=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [cap_s=60]
                               [variants=wide,fitted,truth] [out=out/loop] [report=false] [any setting of train.py]
 
@@ -39,7 +39,7 @@ from dexsim.paths import CONFIGS
 from dexsim.typed import whole
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "",
+SETTINGS = {"tasks": "grasp,rotate", "realities": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "",
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "report": "false", "cap_s": "60", "diagnose_s": "600",
             "variants": "wide,fitted,truth"}  # fmt: skip
 # what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand
@@ -65,7 +65,7 @@ class Loop:
 
     def __init__(self, s: dict[str, str], extra: Sequence[str] = (), device: str = "cpu") -> None:
         self.s, self.out = s, Path(s["out"]).expanduser().resolve()
-        self.tasks, self.worlds, self.variants = (s[k].split(",") for k in ("tasks", "worlds", "variants"))
+        self.tasks, self.worlds, self.variants = (s[k].split(",") for k in ("tasks", "realities", "variants"))
         if wrong := set(self.variants) - set(VARIANTS[1:]):
             raise UserError(f"variants={wrong.pop()}: must be of {', '.join(VARIANTS[1:])}")
         self.each = [(task, seed) for task in self.tasks for seed in range(1, whole("seeds", s["seeds"], 1, 99) + 1)]
@@ -82,9 +82,10 @@ class Loop:
 
     def train(self, resume: Path, iterations: int, out: Path, *settings: object) -> jobs.Job:
         """Return a training that goes on."""
-        worlds = f"worlds={128 if self.device == 'cpu' else 8192}"
+        given = [f"worlds={128 if self.device == 'cpu' else 8192}", *settings, *self.extra]
+        given = list({word.partition("=")[0]: word for word in given}.values())  # the last of a name counts
         return self.job(out, ("dexsim", "train", f"resume={resume}", f"iterations={iterations}", f"out={out / 'run'}",
-                              f"device={self.device}", "final_episodes=0", worlds, *settings, *self.extra),
+                              f"device={self.device}", "final_episodes=0", *given),
                         resumes=True)  # fmt: skip
 
     def policy(self, task: str, seed: int, variant: str, world: str) -> Path:
