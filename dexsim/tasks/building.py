@@ -215,13 +215,13 @@ class Built(VecEnv):
             self.objects.friction_factor = self.reality.friction_factor(
                 self.engine.mjm, self.objects.hand_geoms.tolist()
             )
-        shapes = [v.shape for v in table.variants] if table is not None else []
+        touched = [v.shape for v in table.variants] if table is not None else []
         pairs = [[name, *(f"{name}:{body}" for body in bodies)] for name, _ in pad_pairs(self.hand)]
         skin = bool(self.hand.file.skin)
         self.touch = Tactile(
             self.engine,
             hand_layout(self.hand) or tip_layout(self.hand),
-            ShapeSet([*shapes, *(p.touch for p in self.furniture.parts)], device),
+            ShapeSet([*touched, *(p.touch for p in self.furniture.parts)], device),
             [OBJECT, *bodies] if bodies else OBJECT,
             cfg["tactile"],
             pairs=pairs,
@@ -230,7 +230,7 @@ class Built(VecEnv):
             selves=self_pairs(self.hand) if skin else None,
         )
         for k, part in enumerate(self.furniture.parts, 1):
-            self.touch.shape_id[:, k] = len(shapes) + k - 1
+            self.touch.shape_id[:, k] = len(touched) + k - 1
             self.touch.shape_size[:, k] = torch.as_tensor(part.size, dtype=torch.float32, device=device)
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()

@@ -122,6 +122,12 @@ class Thing:
     mass: float = 0.1
     at: Vector = (0.1, 0.0, 0.1)
 
+    def __post_init__(self) -> None:
+        for name in ("size", "mass"):
+            value = getattr(self, name)
+            if not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+                raise UserError(f"Thing {self.name}: {name}={value}: must be a number above 0")
+
 
 @dataclass(frozen=True)
 class Tree:
