@@ -14,6 +14,7 @@ device=cpu: gloo. Needs root and iproute2; where there are no namespaces, all no
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import shutil
@@ -36,6 +37,9 @@ CABLES = (10.0, 100.0)
 """Gbit/s for which is computed what they give."""
 
 
+_COUNT = itertools.count()
+
+
 def sh(*command: str, check: bool = True) -> subprocess.CompletedProcess:
     """Run a command of the network's."""
     return subprocess.run(command, capture_output=True, text=True, check=check)
@@ -49,9 +53,10 @@ class Nodes:
 
     def __init__(self, count: int, folder: Path, gbit: float | None = None, env: dict[str, str] | None = None) -> None:
         self.count, self.gbit, self.folder, self.env = count, gbit, folder, env or {}
-        self.names = [f"dexsim{os.getpid() % 10000}n{k}" for k in range(count)]
+        tag = f"{os.getpid() % 10000}c{next(_COUNT)}"  # the kernel takes its time to forget those of before
+        self.names = [f"dexsim{tag}n{k}" for k in range(count)]
         self.addresses = [f"10.77.0.{k + 1}" for k in range(count)]
-        self.bridge = f"dxb{os.getpid() % 10000}"
+        self.bridge = f"dxb{tag}"
         self.apart = True
         """Whether the nodes are namespaces; else all are 127.0.0.1."""
 
