@@ -102,8 +102,8 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
             whole = {i: (0.0, r.duration) for i, r in enumerate(runs)}
             how = f"{NOTHING}, for all stands still in {how}; what is found is doubted until a motion is recorded twice"
             return Split(runs, every, every, whole, whole, how, proven=False)
-        begins, ends = {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every}
-        return Split(runs, every, every, begins, ends, how)
+        early, late = {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every}
+        return Split(runs, every, every, early, late, how)
     test = [i for i in range(len(runs)) if group[i] == chosen]
     train = [i for i in range(len(runs)) if i not in test]
     how = "one condition, " + ", ".join(runs[i].name for i in test)

@@ -118,7 +118,8 @@ def search_joint(search: JointSearch) -> Outcome:
             current = move(search, current)
     search.progressed(0.1)
     current, final = settled(search, current, pool)
-    rivals, confidence, gains = ({e: x[k] for e, x in final.items()} for k in range(3))
+    rivals = {e: x[0] for e, x in final.items()}
+    confidence, gains = {e: x[1] for e, x in final.items()}, {e: x[2] for e, x in final.items()}
     for e in final:
         price.setdefault(e, 0.0)
     return Outcome(search.case.joint, none, current, rivals, confidence, gains, price, scanned, search.costs)
