@@ -106,6 +106,7 @@ def _read(
         containers = [open_container(p) for p in _files(path)]
         reading = _Reading(path, containers, remap, hand)
         own = metadata.own_record([m for c in containers for m in c.metadata])
+        reading.stated = bool(own)
         stated, units, findings = metadata.collect(path, own, meta, units)
     reading.findings += findings
     modelled = hand is not None or limits is not None
@@ -147,6 +148,7 @@ class _Reading:
         self.findings: list[Finding] = []
         self.arrays: dict[str, np.ndarray] = {}
         self.si: set[tuple[str, str]] = set()  # (quantity, their joint) whose values are in SI already
+        self.stated = False  # the format of recordings that dexsim writes is in SI: other units there are a fault
         self.ranges: dict[str, str] = {}  # their joint -> the unit along its range that its columns name
         self.breaks: list[tuple[float, float]] = []
         self.streams: dict[str, list[_Stream]] = {}
@@ -564,7 +566,7 @@ class _Reading:
         both = {
             j: (r.commands.value[:, k], s.position.value[:, k])
             for k, j in enumerate(r.joints)
-            if free("command", j) and free("position", j)
+            if not self.stated and free("command", j) and free("position", j)
         }
         own = {j: self.ranges[n] for j, n in theirs.items() if n in self.ranges and free("position", j)}
         guessed = units.guess(both, own)
@@ -742,6 +744,7 @@ class _TableReading(_Reading):
             )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
         self.start_ns, self.config, self.sources, self.si = table.start_ns, None, {}, table.si
+        self.stated = False
         self.ranges = table.ranges
         self.arrays = table.arrays
 

@@ -3,7 +3,7 @@ it, and pushes from outside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -383,7 +383,11 @@ class Push:
 
 
 def find_pushes(
-    model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0, asked: Sequence[str] | None = None
+    model: mujoco.MjModel,
+    runs: Sequence[Run],
+    fitted: Sequence[int],
+    seed: int = 0,
+    asked: Collection[str] | None = None,
 ) -> list[Push]:
     """Return of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; []
     where no torque was logged. asked: joints (default all). One that rests tells of no inertia, gravity or friction."""
