@@ -190,7 +190,8 @@ class Units:
             also = "" if count == 4096 else " (or ticks:4096, of several turns?)"
             return (f"ticks:{count}@{count // 2}", f"by its {seen}{also}") if count else ("", "")
         if self._fits(ends, 1.0, *((0.0, SHARE) if top <= 1.02 else (BEYOND, 0.0))):
-            return "", ""
+            ends_of_one = not ranged and abs(low + 1) < 0.02 and abs(high - 1) < 0.02
+            return ("rad", f"by its {seen} (or normalized?)") if ends_of_one else ("", "")
         beyond = "its limits in the model" if ranged else "what a joint turns"
         if top <= 1.02 and low < -0.2 and high > 0.2:
             return "normalized", f"by its {seen}, which in rad are beyond {beyond}"
