@@ -92,8 +92,10 @@ def fitted():
 def test_the_plain_model_follows_what_it_can_state(fitted):
     case, true, plain = fitted
     assert plain.error < 1e-3 < 0.05 * plain.error_before
-    for name, tolerance in (("kp", 0.1), ("coulomb_friction", 0.1), ("delay", 0.15)):
-        assert plain.value[name] == pytest.approx(true[name], rel=tolerance), name
+    for name in ("kp", "coulomb_friction"):
+        assert plain.value[name] == pytest.approx(true[name], rel=0.1), name
+    late = plain.value["delay"] + plain.value["lag"]  # which steps and a slow wave do not tell apart
+    assert late == pytest.approx(true["delay"], rel=0.1)
     entry = plain.entry()
     assert entry["parameters"]["delay"]["unit"] == "s" and entry["error"] == plain.error
     data = baseline.overall([plain])

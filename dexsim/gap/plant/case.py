@@ -25,7 +25,7 @@ from dexsim.recording.mechanism import QUICK
 from dexsim.recording.smooth import local_polynomial
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
-STEPPED = 0.25  # of how far a joint goes: a first target farther from where it rests is a step
+STEPPED = 0.1  # of how far a joint goes: a first target farther from where it rests is a step
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 HALF_SECOND, FEWEST_SAMPLES = 0.5, 12  # s, and samples: numerics of the parts of a recording that may ring by itself
 FEWEST_OF_ALL = 2 * FEWEST_SAMPLES  # of a whole recording, of whose differences a moment or a correlation is taken
