@@ -354,6 +354,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Drives as Steps, Settings, diagnose, save
 from dexsim.gap.judge.handed_on import residual_torque
+from dexsim.gap.search.search import polished
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.servos import ServoRandomizer
 
