@@ -89,6 +89,7 @@ def call(
                 child.join()
         if answer != LOCKED:  # a fork may wait for a lock that a thread of this process held; a new process does not
             break
+        answer = WAITS if method == "spawn" else LOCKED
     if isinstance(answer, tuple):
         return answer[0]
     if isinstance(answer, BaseException):

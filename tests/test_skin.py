@@ -275,7 +275,7 @@ def test_an_import_lays_skin_and_a_later_one_keeps_it(tmp_path):
     skin.add(out, "palm:12")
     assert "# guess" in (out / "hand.yaml").read_text() and [p.name for p in load_hand(out).pads[4:]] == ["palm"]
     again = import_hand(robot, out, Settings(pads=(4, 3), drops=0), picture=False)
-    assert [p.name for p in load_hand(out).pads[4:]] == ["palm"] and not again.kept and not again.corrected
+    assert [p.name for p in load_hand(out).pads[4:]] == ["palm"] and not again.carried and not again.corrected
     with pytest.raises(UserError, match="skin=palm:12: needs pads on the fingertips"):
         import_hand(robot, tmp_path / "bare", Settings(pads=None, drops=0, skin="palm:12"), picture=False)
     assert not (tmp_path / "bare").exists()

@@ -38,6 +38,7 @@ def search(folder: Path, count: int, seed: int = 0) -> Region:
     import torch
 
     from dexsim.cli import start
+    from dexsim.hand.load import load_hand
     from dexsim.hand.places import surface
     from dexsim.paths import CONFIGS
     from dexsim.sim.quiet import quiet_warp
@@ -70,5 +71,5 @@ def search(folder: Path, count: int, seed: int = 0) -> Region:
     if here < FEWEST * half:
         return Region(None, here, half, within)
     catch = np.append(best, 0.0)
-    catch[2] = surface(env.hand, catch)
+    catch[2] = surface(load_hand(folder), catch)
     return Region(catch, here, half, within, there if moved > 0 else None, moved)
