@@ -106,15 +106,15 @@ class Nodes:
         sh("ip", "link", "set", f"{self.bridge}p{node}", "down")
 
     def sent(self) -> list[int]:
-        """Return bytes that each node has sent to others so far; of nodes that are not apart, what the loopback
-        carried."""
+        """Return bytes that each node has sent to others so far; of nodes that are not apart, an equal share of what
+        the loopback carried."""
         out = []
         for name in self.names:
             where = ("ip", "netns", "exec", name) if self.apart else ()
             device = "eth0" if self.apart else "lo"
             text = sh(*where, "cat", "/proc/net/dev").stdout
             line = next(x for x in text.splitlines() if x.strip().startswith(f"{device}:"))
-            out.append(int(line.split(":")[1].split()[8]))
+            out.append(int(line.split(":")[1].split()[8]) // (1 if self.apart else self.count))
         return out
 
     def start(self, node: int, ranks: int, argv: Sequence[str], devices: Sequence[str] = (), nodes: int | None = None,
