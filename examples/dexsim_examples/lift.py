@@ -1,4 +1,5 @@
 """Lift objects from a table with a hand on a base of six servos, and hold them up against pushes."""
+
 from __future__ import annotations
 
 import torch
@@ -19,7 +20,9 @@ class Lift(Task):
     settings = {
         "episode_s": 6.0,
         "objects": {
-            "train": ["box", "sphere", "capsule", "cylinder", "rock", "egg", "hexprism", "wedge", "tee"],
+            "train": ["box", "sphere", "capsule", "cylinder", "rock", "egg", "hexprism", "wedge", "tee", "bracket",
+                      "peanut", "bolt"],
+            "emphasis": {"wedge": 3.0, "hexprism": 2.0, "tee": 2.0},
             "held_out": ["tetra", "pebble", "crescent", "cross"],
             "baked_scales": [1.0, 1.15],
         },
