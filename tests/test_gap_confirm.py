@@ -147,8 +147,9 @@ def replayed(
     return best_of(m, runs, case, {"refitted": none, "found": found})
 
 
-def best_of(m, runs, case, trials):
-    """Return what is written of the only joint, of fitted hypotheses by name; run 1 is held out."""
+def best_of(m, runs, case, trials, **more):
+    """Return what is written of the only joint, of fitted hypotheses by name; run 1 is held out. more: of
+    `write_best`."""
     windows = case.plant.windows(None, [1])
     states = lambda r: States(Series(r.t, r.q), None, None)  # noqa: E731
     recordings = {r.name: SimpleNamespace(joints=r.joints, states=states(r)) for r in runs}
@@ -166,7 +167,7 @@ def best_of(m, runs, case, trials):
         return full_model.Candidate(name, plant, write, missing_of(case, trial))
 
     given = {case.joint: [candidate(name, trial) for name, trial in trials.items()]}
-    return full_model.write_best(m, runs, recordings, [case], given, {case.joint: 4e-4}, [1], None)
+    return full_model.write_best(m, runs, recordings, [case], given, {case.joint: 4e-4}, [1], None, **more)
 
 
 @pytest.mark.parametrize(
@@ -278,6 +279,27 @@ def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs(
         assert got == pytest.approx([kp, 0.12, 0.01, friction])
         run = SimpleNamespace(servo=own, supply=None)
         assert full_model.rows_of(table, run, ["joint"])[0] == pytest.approx(written[0], nan_ok=True)
+
+
+@pytest.mark.parametrize("budget, share", [(1e6, 1.0), (12.0, 0.5), (3.0, None)])
+def test_the_choice_keeps_to_the_time_there_is(budget, share, monkeypatch):
+    """A world takes a second for each second of it: two candidates over 4 s."""
+    runs = [plant_run(f"r{k}", k, 4.0, {"lag": 0.02}, seed=k) for k in (0, 1)]
+    for r in runs:
+        r.smooth()
+    case, clock, real = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0], [0.0], full_model.free_runs
+
+    def slow(spec, joints, worlds, *rest):
+        clock[0] += sum(w.duration for w in worlds)
+        return real(spec, joints, worlds, *rest)
+
+    monkeypatch.setattr(full_model, "free_runs", slow)
+    monkeypatch.setattr(full_model.time, "monotonic", lambda: clock[0])
+    none = JointSearch(case, [0], None, conditions(runs)).start()
+    room = lambda: budget - clock[0]  # noqa: E731
+    w = best_of(mechanism_of(runs[0].servo), runs, case, {"refitted": none, "believed": none}, room=room)
+    assert clock[0] <= budget and w.by_replay == (share is not None)
+    assert w.share == pytest.approx(share or 1.0, abs=0.2)
 
 
 def test_a_joint_that_anothers_choice_harms_is_not_left_worse_than_plain():

@@ -199,19 +199,19 @@ class TimeLimit:
 
     def left(self) -> float:
         """Return s that searches have left; infinite without a limit."""
-        if self.stopped:
-            return 0.0
-        return float("inf") if self.seconds is None else (1 - JUDGING) * self.seconds - (time.monotonic() - self._start)
+        return 0.0 if self.stopped else self.until(1 - JUDGING)
 
     def rest(self) -> float:
         """Return s until all but the page is to be done; infinite without a limit."""
-        if self.seconds is None:
-            return float("inf")
-        return (1 - PAGE) * self.seconds - (time.monotonic() - self._start)
+        return self.until(1 - PAGE)
+
+    def until(self, share: float) -> float:
+        """Return s until this share (0..1) of the limit is over; infinite without one."""
+        return float("inf") if self.seconds is None else share * self.seconds - (time.monotonic() - self._start)
 
     def spent(self, share: float) -> bool:
         """Return whether this share (0..1) of the limit is over."""
-        return self.seconds is not None and time.monotonic() - self._start > share * self.seconds
+        return self.until(share) < 0
 
     def leave_out(self, what: str) -> None:
         """Notes for the page what there was no time for, a sentence's begin."""

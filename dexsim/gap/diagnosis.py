@@ -575,19 +575,20 @@ class Drives(Steps):
         what = w.m, w.runs, w.by_name, cases, given, self.noise.joints, p.test, p.span_test
         best = partial(full_model.write_best, *what)
         engine = s.replay
-        if engine != "none" and self._late():
+        if engine != "none" and w.limit.spent(1 - PLANNING):
             w.limit.leave_out("not replayed in the engine that trains")
             engine = "none"
         try:
-            self.written = best(s.device, engine, self._late)
+            self.written = best(s.device, engine, lambda: w.limit.until(1 - PLANNING))
         except UserError as error:
             w.notes.append(f"not replayed in the engine that trains: {error}")
             self.written = best(engine="none")
+        else:
+            if engine != "none" and cases and not self.written.by_replay:
+                w.limit.leave_out("not replayed in the engine that trains")
+            elif cases and self.written.share < 1:
+                w.limit.leave_out(f"what is written is chosen by {_first_part(self.written.share)} held out")
         w.clock.lap("choice in the engine that trains")
-
-    def _late(self) -> bool:
-        """Return whether the limit of time leaves no more for the choice of what is written."""
-        return self.w.limit.spent(1 - PLANNING)
 
     def report(self, d: Diagnosis) -> None:
         """The joints into a diagnosis: findings, verdict, what is handed on."""
@@ -651,12 +652,14 @@ class Drives(Steps):
             return
         spec = w.m.spec if d.model_spec is None else d.model_spec
         cases = [x.case for x in self.searched]
-        late = lambda: w.limit.spent(1 - 0.5 * PLANNING)  # noqa: E731
-        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test, late)
+        room = lambda: w.limit.until(1 - 0.5 * PLANNING)  # noqa: E731
+        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test, room)
         if found is None:
             return
         if len(found.parts) < found.of:
             w.limit.leave_out(f"the files are replayed over {len(found.parts)} of {found.of} parts held out")
+        if found.share < 1:
+            w.limit.leave_out(f"the files are replayed over {_first_part(found.share)} held out")
         self.written.replayed = found
         d.data["held_out"]["replayed"] = found.entry()
         if d.data["held_out"]["error"].startswith("position"):
@@ -672,6 +675,11 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
         for e in sorted(asked or ())
         if e in left_out
     ]
+
+
+def _first_part(share: float) -> str:
+    """Return a share of each part held out, in words."""
+    return f"the first {100 * share:.0f} % of each part"
 
 
 def _evenly(runs: Sequence[Run], held: set[int], share: float) -> list[int]:

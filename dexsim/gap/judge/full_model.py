@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -51,7 +52,8 @@ if TYPE_CHECKING:
 
 REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
-SWAPS = 3  # times that each joint of the fairest choice is tried as another kind
+PROBE = 1.0  # s of what was held out that are replayed first, for how long all of it takes
+KINDS = 0.5  # of the time that there is for the choice: what every joint as its own kind may take
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
@@ -118,6 +120,7 @@ class Replayed:
     of: int = 0
     engine: str = "C MuJoCo"
     step_s: float = STEP
+    share: float = 1.0  # of each part, from its begin
 
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
@@ -139,6 +142,7 @@ class Written:
     chosen: dict[str, str]
     by_replay: bool = False
     replayed: Replayed | None = None
+    share: float = 1.0  # of each part held out, from its begin, that the choice was made by
 
     def candidate(self, joint: str) -> Candidate:
         """Return what is written of a joint."""
@@ -556,11 +560,12 @@ def write_best(
     span_test: dict[int, tuple[float, float]] | None,
     device: str = "cpu",
     engine: str = "mujoco",
-    passed: Callable[[], bool] = lambda: False,
+    room: Callable[[], float] = lambda: math.inf,
 ) -> Written:
     """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
-    engine: of `REPLAY`; none: by the search's own plant; passed: whether time is up. Raises UserError where the
-    model or a drive does not serve the engine."""
+    engine: of `REPLAY`; none: by the search's own plant; room: s that there are for it; too few: by the begin of each
+    part held out, by the search's own plant where there is no time for that either. Raises UserError where the model
+    or a drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if engine == "none" or not cases or not len(windows[0].window):
@@ -570,10 +575,15 @@ def write_best(
     of = [recordings[runs[int(r)].name] for r in first.run]
     starts = [_start(r, float(t)) for r, t in zip(of, first.window_t, strict=True)]
     ends = [float(within[first.sample_row[first.sample_window == k][-1]]) for k in range(len(starts))]
-    times = [a + STEP * np.arange(round((b - a) / STEP) + 1) for a, b in zip(starts, ends, strict=True)]
+    longest = max(b - a for a, b in zip(starts, ends, strict=True))
+    share, pace = 1.0, 0.0  # of each part; s of a choice
 
     def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
         """Return rms by joint of each choice."""
+        nonlocal pace
+        if not choices:
+            return []
+        begun = time.monotonic()
         given = [files(m, cases, {j: by[j][name] for j, name in x.items()}) for x in choices]
         groups: dict[str, list[int]] = {}  # those that change the model alike share an engine
         for i, (_, spec, said) in enumerate(given):
@@ -582,15 +592,19 @@ def write_best(
         count = len(windows[0].window)
         for group in groups.values():
             worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0])]
+            for w in worlds:
+                w.duration *= share
             spec = given[group[0]][1]
             q = free_runs(spec, m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
             for k, i in enumerate(group):
                 found[i] = q[k * count : (k + 1) * count]
+        pace = (time.monotonic() - begun) / len(choices)
         return [{c.joint: rms(c, found[i]) for c in cases} for i in range(len(choices))]
 
     def rms(case: Case, q: Sequence[np.ndarray]) -> float:
         """Return the error of a joint over all readings in recordings that tell of it."""
         j = m.joints.index(case.joint)
+        times = [a + STEP * np.arange(round(share * (b - a) / STEP) + 1) for a, b in zip(starts, ends, strict=True)]
         parts = [
             _missed(r, case.joint, t, x[: len(t), j])
             for r, t, x, run in zip(of, times, q, first.run, strict=True)
@@ -599,8 +613,21 @@ def write_best(
         square, count = np.sum(parts, 0) if parts else (0.0, 1.0)
         return math.sqrt(square / max(count, 1.0))
 
-    chosen = composed({j: tuple(x) for j, x in by.items()}, errors, noise, replayed, passed)
-    return Written(candidates, errors, chosen, True)
+    names = {j: tuple(x) for j, x in by.items()}
+    if math.isfinite(room()) and longest > PROBE:
+        share = PROBE / longest
+        kinds = _kinds(names)
+        replayed(kinds)
+        if pace * len(kinds) > KINDS * room():
+            return write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
+        share = min(1.0, share * KINDS * room() / (pace * len(kinds)))
+    chosen = composed(names, errors, noise, replayed, lambda count: count * pace > room())
+    return Written(candidates, errors, chosen, True, share=share)
+
+
+def _kinds(by: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
+    """Return choices: every joint as its own kind, of `ORDER`, where it has such a candidate."""
+    return [{j: k if k in x else x[0] for j, x in by.items()} for k in ORDER if any(k in x for x in by.values())]
 
 
 def composed(
@@ -608,47 +635,40 @@ def composed(
     errors: dict[str, dict[str, float]],
     noise: Mapping[str, float],
     replayed: Callable[[Sequence[dict[str, str]]], list[dict[str, float]]],
-    passed: Callable[[], bool] = lambda: False,
+    passed: Callable[[int], bool] = lambda count: False,
 ) -> dict[str, str]:
     """Return a candidate's name by joint. by: names of each joint's candidates; errors: filled with what each leaves
     [rad or m] where all joints are of its kind; noise: floor by joint; replayed: what whole choices leave by joint;
-    passed: whether time is up."""
+    passed: whether there is no time to replay so many more."""
     # every joint as its own kind first, then the best of each together; where joints pull at one another that may be
     # none of them: then each is asked once more with what the others now are
-    kinds = [k for k in ORDER if any(k in x for x in by.values())]
-    every = [{j: k if k in x else x[0] for j, x in by.items()} for k in kinds]
+    every = _kinds(by)
     done = list(zip(every, replayed(every), strict=True))
     for choice, found in done:
         for j, name in choice.items():
             errors[j][name] = found[j]
     here = {j: dict(x) for j, x in errors.items()}  # with what the others are by then
     chosen = {j: choose(x, noise[j]) for j, x in here.items()}
-    while chosen not in [c for c, _ in done] and len(done) < len(every) + TURNS and not passed():
+    while chosen not in [c for c, _ in done] and len(done) < len(every) + TURNS and not passed(1):
         (together,) = replayed([chosen])
         done.append((chosen, together))
         moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]] and len(by[j]) > 1]
         swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
+        if passed(len(swaps)):
+            break
         for (j, k), found in zip(swaps, replayed([chosen | {j: k} for j, k in swaps]), strict=True):
             here[j][k] = found[j]
         for j in by:
             here[j][chosen[j]] = together[j]
         chosen = {j: choose(x, noise[j]) for j, x in here.items()}
-    # of all that was replayed as a whole: what nowhere follows much worse than belief or plain model alone; that choice
-    # before others that do as well
-
+    # of all that was replayed as a whole, and the better of belief and plain model of each joint: what nowhere follows
+    # much worse than these; that choice before others that do as well
+    plainly = {j: [n for n in (BELIEVED, "plain") if n in x] for j, x in by.items()}
+    safe = {j: min(x, key=errors[j].__getitem__) if x else chosen[j] for j, x in plainly.items()}
+    if safe not in [c for c, _ in done] and not passed(1):
+        done += zip([safe], replayed([safe]), strict=True)
     quiet = {j: JUDGE.within**2 * noise[j] for j in by}
-    plainly = {j: min(x.get(n, math.inf) for n in (BELIEVED, "plain")) for j, x in errors.items()}
-
-    def worst(found: Mapping[str, float]) -> float:
-        return max(found[j] / max(x, quiet[j]) if math.isfinite(x) else 1.0 for j, x in plainly.items())
-
-    # where no choice is fair to every joint, what the fairest leaves with one joint as another kind, again and again
-    for _ in range(SWAPS):
-        nearest, found = min(done, key=lambda d: worst(d[1]))
-        further = [x for j, of in by.items() for k in of if (x := nearest | {j: k}) not in [c for c, _ in done]]
-        if worst(found) <= 1 + BELIEF.tolerance or not further or passed():
-            break
-        done += zip(further, replayed(further), strict=True)
+    worst = lambda x: max([x[j] / max(errors[j][safe[j]], quiet[j]) for j in by if plainly[j]], default=1.0)  # noqa: E731
     fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
     alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
     total = lambda d: sum(math.log(max(d[1][j], quiet[j])) - alike(d[0]) for j in by)  # noqa: E731
@@ -680,10 +700,11 @@ def replay_files(
     cases: Sequence[Case],
     test: list[int],
     span_test: dict[int, tuple[float, float]] | None,
-    passed: Callable[[], bool] = lambda: False,
+    room: Callable[[], float] = lambda: math.inf,
 ) -> Replayed | None:
     """Replay the files over all that was held out, as `play replay=` does with each recording or part of one; None
-    where there is nothing to replay. passed: whether time is up: further parts are left out then."""
+    where there is nothing to replay. room: s that there are for it; too few: a share of each part from its begin, or
+    not all parts."""
     ws = cases[0].plant.windows(None, test, span=span_test, every_run=True) if cases else None
     if ws is None or not len(ws.window):
         return None
@@ -693,13 +714,24 @@ def replay_files(
     parts: list[tuple[str, float, float]] = []
     total = {j: np.zeros(2) for j in judged}
     each: dict[str, dict[str, np.ndarray]] = {}
+    spans = []
     for w in range(len(ws.window)):
-        if parts and passed():
+        rows = ws.sample_row[ws.sample_window == w]
+        r = recordings[runs[int(ws.run[w])].name]
+        start, end = _start(r, float(ws.window_t[w])), float(t[rows[-1]])
+        whole = float(r.states.position.t[-1]) - end < STEP
+        spans.append((int(ws.run[w]), r, start, max(r.duration, end) if whole else end, whole))
+    share, (_, r, start, end, _) = 1.0, spans[0]
+    if math.isfinite(room()) and end - start > PROBE:
+        begun = time.monotonic()
+        replay(r, of_recording(written, r), start=start, end=start + PROBE)
+        pace = (time.monotonic() - begun) / PROBE
+        share = min(1.0, max(room(), 0.0) / (pace * sum(b - a for _, _, a, b, _ in spans)))
+    for run, r, start, end, whole in spans:
+        if parts and room() <= 0:
             break
-        run, rows = int(ws.run[w]), ws.sample_row[ws.sample_window == w]
-        r, start, end = recordings[runs[run].name], float(ws.window_t[w]), float(t[rows[-1]])
-        start, whole = _start(r, start), float(r.states.position.t[-1]) - end < STEP
-        end = max(r.duration, end) if whole else end
+        if share < 1.0:
+            end, whole = max(start + share * (end - start), min(end, start + PROBE)), False
         done = replay(r, of_recording(written, r), start=start, end=None if whole else end)
         parts.append((r.path.name, start, end))
         for case in cases:
@@ -716,4 +748,5 @@ def replay_files(
         {name: {j: rms(x) for j, x in given.items()} for name, given in each.items()},
         parts,
         len(ws.window),
+        share=share,
     )
