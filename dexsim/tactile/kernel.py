@@ -1,40 +1,38 @@
 """The touch kernel: transform, distance, force and reduction of all taxels in one launch.
 
-Two variants share every line of the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per
-(world, pad), for the CPU and for pads of more than 512 taxels; `lanes`, one warp per (world, pad), for CUDA: each lane
-keeps every 32nd taxel in registers, sums are shuffles, and there is no barrier and no shared memory. Both compose the
-two poses once a pad and reduce in the frame of the pad's body.
+Pads that share one force form a group, and each taxel's distance is measured once. Two variants share every line of
+the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per (world, group), for the CPU and for
+groups of more than 512 taxels; `lanes`, one warp per (world, group), for CUDA: each lane keeps the distances of every
+32nd taxel in registers, sums are shuffles, and there is no barrier and no shared memory. Both compose the two poses
+once a group and reduce in the frame of its body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from dexsim.tactile.lanes import LANES, lane_ballot, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.sdf import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    SPHERE,
+    GRID,
     Shapes,
     bound_radius,
     boxes_apart,
     distance,
     in_box,
     load4,
-    sd_box,
-    sd_capsule,
+    primitive,
     sd_cells,
-    sd_cylinder,
     sd_grid,
-    sd_sphere,
 )
 
 MAX_ROUNDS = 16
 """Taxels a lane may keep, in steps of 32 lanes."""
+CHUNK = 4
+"""Rounds of 32 taxels that are measured at a time: all their loads are under way before the first is used."""
 LINEAR = 0
 HERTZ = 1
 MOONEY_RIVLIN = 2
@@ -54,9 +52,22 @@ class Pads:
     # its first one with no area: they feel nothing and are never the only nearest.
     taxel: wp.array2d(dtype=wp.vec4)
     centre: wp.array(dtype=wp.vec3)  # [F] pad centre, body frame
-    bound: wp.array(dtype=wp.vec4)  # [F] bounding sphere: centre, radius
-    middle: wp.array(dtype=wp.vec3)  # [F] bounding box, body frame
-    half: wp.array(dtype=wp.vec3)  # [F]
+
+
+@wp.struct
+class Groups:
+    """Pads of one body that the same forces press, as one: G groups of up to R rounds of 32 taxels, a round of one
+    pad."""
+
+    body: wp.array(dtype=int)  # [G]
+    pads: wp.array(dtype=int)  # [F] pads, group by group
+    first: wp.array(dtype=int)  # [G + 1] where each group begins in `pads`
+    rounds: wp.array(dtype=int)  # [G]
+    round: wp.array2d(dtype=wp.vec3i)  # [G, R] its pad, the number of its first taxel there, 1: the pad's last round
+    taxel: wp.array2d(dtype=wp.vec4)  # [G, 32 R] as in `Pads`; copies of the first without area where no taxel is
+    bound: wp.array(dtype=wp.vec4)  # [G] bounding sphere: centre, radius
+    middle: wp.array(dtype=wp.vec3)  # [G] bounding box, body frame
+    half: wp.array(dtype=wp.vec3)  # [G]
 
 
 @wp.struct
@@ -74,7 +85,8 @@ class Law:
 
 @wp.struct
 class Surroundings:
-    """What F pads may touch in N worlds of O objects and B bodies, and how the physics has them press it: C pairs."""
+    """What G groups of pads may touch in N worlds of O objects and B bodies, and how the physics has them press it: C
+    pairs."""
 
     xpos: wp.array2d(dtype=wp.vec3)  # [N, B] m
     xmat: wp.array2d(dtype=wp.mat33)  # [N, B]
@@ -82,10 +94,10 @@ class Surroundings:
     object_body: wp.array(dtype=int)  # [O]
     shape_id: wp.array2d(dtype=int)  # [N, O] -1: no object
     shape_size: wp.array2d(dtype=wp.vec3)  # [N, O] m, of grids the scale first
-    pair_column: wp.array2d(dtype=int)  # [F, O] the pair of a pad and an object
+    pair_column: wp.array2d(dtype=int)  # [G, O] the pair of a group and an object
     link_body: wp.array(dtype=int)  # [L] bodies of the hand whose surfaces pads may touch
-    tip_column: wp.array2d(dtype=int)  # [F, L] the pair of a pad and such a body; -1: not declared
-    self_column: wp.array(dtype=int)  # [F] the pair of a pad's body and the rest of the hand
+    tip_column: wp.array2d(dtype=int)  # [G, L] the pair of a group and such a body; -1: not declared
+    self_column: wp.array(dtype=int)  # [G] the pair of a group's body and the rest of the hand
 
 
 @wp.struct
@@ -101,7 +113,7 @@ class Felt:
 
 @wp.struct
 class FlatFelt:
-    """The same without axes: a warp a pad finds its place by one number, and keeps its distances."""
+    """The same without axes: a warp finds a pad by one number, and keeps its distances."""
 
     force: wp.array(dtype=float)
     centre: wp.array(dtype=wp.vec3)
@@ -189,121 +201,33 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 
 @wp.func
-def may_meet(f: int, g: int, here: Surroundings, pads: Pads, w: int):
-    """Whether pad f may touch link g: another body, and pressed where the physics says so."""
-    near = here.link_body[g] != pads.body[f]
-    if near and here.tip_column[f, g] >= 0:
-        near = here.pair_normal[w, here.tip_column[f, g]] > 0.0
+def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
+    """Whether group g may touch link j: another body, and pressed where the physics says so."""
+    near = here.link_body[j] != groups.body[g]
+    if near and here.tip_column[g, j] >= 0:
+        near = here.pair_normal[w, here.tip_column[g, j]] > 0.0
     return near
 
 
 @wp.func
-def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3):
-    """Whether pad f, whose body has rotation a and origin b in that of link g, surely does not touch it."""
-    return boxes_apart(a, b, pads.middle[f], pads.half[f], tips.middle[g], tips.half[g])
+def tips_apart(groups: Groups, tips: Shapes, g: int, j: int, a: wp.mat33, b: wp.vec3):
+    """Whether group g, whose body has rotation a and origin b in that of link j, surely does not touch it."""
+    return boxes_apart(a, b, groups.middle[g], groups.half[g], tips.middle[j], tips.half[j])
 
 
 @wp.func
-def from_link(here: Surroundings, tips: Shapes, w: int, body: int, point: wp.vec3, g: int):
-    """Return the signed distance [m] of a point of a body, in the world, to link g; far where that is the body."""
+def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j: int):
+    """Return a distance [m] below which no taxel of group g is to link j; far where that is the group's own body."""
     out = float(FAR)
-    if g < here.link_body.shape[0]:
-        other = here.link_body[g]
+    if j < here.link_body.shape[0]:
+        body = groups.body[g]
+        other = here.link_body[j]
         if other != body:
-            out = sd_grid(tips, g, 1.0, wp.transpose(here.xmat[w, other]) * (point - here.xpos[w, other]))
+            a = turn_in(here.xmat, w, body, other)
+            b = pose_in(here.xpos, here.xmat, w, body, other)
+            # along a way, distances change by no more than its length; a millimetre for coarse grids
+            out = sd_grid(tips, j, 1.0, a * xyz(groups.bound[g]) + b) - groups.bound[g][3] - 1.0e-3
     return out
-
-
-@wp.func
-def links_near(here: Surroundings, tips: Shapes, w: int, body: int, ball: wp.vec4, lane: int):
-    """Return bits of the links (of the first 64) that may be the nearest to a point of a ball, in the world, and a
-    distance [m] that no point of it is below: along a way, distances change by no more than its length."""
-    low = int(0)
-    high = int(0)
-    least = float(FAR)
-    for g in range(here.link_body.shape[0]):
-        least = wp.min(least, from_link(here, tips, w, body, xyz(ball), g))
-    for g in range(wp.min(here.link_body.shape[0], 64)):
-        if from_link(here, tips, w, body, xyz(ball), g) <= least + 2.0 * ball[3]:
-            low = low | wp.where(g < 32, 1 << (g & 31), 0)
-            high = high | wp.where(g < 32, 0, 1 << (g & 31))
-    return wp.vec2i(low, high), least - ball[3]
-
-
-@wp.func
-def links_near_lanes(here: Surroundings, tips: Shapes, w: int, body: int, ball: wp.vec4, lane: int):
-    """Return the same, a link a lane."""
-    a = from_link(here, tips, w, body, xyz(ball), lane)
-    b = from_link(here, tips, w, body, xyz(ball), lane + 32)
-    least = lanes_min(wp.min(a, b))
-    far = least + 2.0 * ball[3]
-    return wp.vec2i(lane_ballot(a <= far), lane_ballot(b <= far)), least - ball[3]
-
-
-@wp.func
-def nearest_link(here: Surroundings, tips: Shapes, w: int, body: int, near: wp.vec2i, point: wp.vec3):
-    """Return the signed distance [m] of a point of a body, in the world, to the nearest of the hand's other links
-    `near`."""
-    out = float(FAR)
-    for g in range(here.link_body.shape[0]):
-        bits = wp.where(g < 32, near[0], near[1])
-        if g >= 64 or ((bits >> (g & 31)) & 1) != 0:
-            out = wp.min(out, from_link(here, tips, w, body, point, g))
-    return out
-
-
-@wp.func
-def ball_of(here: Surroundings, pads: Pads, w: int, f: int):
-    """Return the ball of pad f's taxels in the world: centre, and radius with a millimetre for coarse grids [m]."""
-    body = pads.body[f]
-    c = here.xmat[w, body] * xyz(pads.bound[f]) + here.xpos[w, body]
-    return wp.vec4(c[0], c[1], c[2], pads.bound[f][3] + 1.0e-3)
-
-
-@wp.func
-def beside_object(
-    here: Surroundings, pads: Pads, shapes: Shapes, shape: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, f: int, o: int,
-    first: int, step: int, level: float,
-):  # fmt: skip
-    """Return the least distance [m] and the sum of weights under `level` of every step-th taxel, from `first`, of the
-    other pads that share pad f's pair with object o."""
-    nearest = float(1.0e9)
-    weight = float(0.0)
-    for g in range(pads.body.shape[0]):
-        if g != f and here.pair_column[g, o] == here.pair_column[f, o]:
-            t = int(first)
-            while t < pads.count[g]:
-                d = distance(shapes, shape, size, a * xyz(pads.taxel[g, t]) + b)
-                nearest = wp.min(nearest, d)
-                weight += spread_weight(d, pads.taxel[g, t][3], level)
-                t += step
-    return wp.vec2(nearest, weight)
-
-
-@cache
-def _beside_links(lanes: bool) -> Callable:
-    look = links_near_lanes if lanes else links_near
-
-    @wp.func
-    def beside_links(here: Surroundings, pads: Pads, tips: Shapes, w: int, f: int, lane: int, level: float):
-        """Return the same for the rest of the hand, of the other pads on pad f's body. Pads that are no nearer than
-        `level` are passed over."""
-        nearest = float(FAR)
-        weight = float(0.0)
-        body = pads.body[f]
-        for g in range(pads.body.shape[0]):
-            if g != f and pads.body[g] == body:
-                near, least = look(here, tips, w, body, ball_of(here, pads, w, g), lane)
-                t = int(lane)
-                while least < level and t < pads.count[g]:
-                    point = here.xmat[w, body] * xyz(pads.taxel[g, t]) + here.xpos[w, body]
-                    d = nearest_link(here, tips, w, body, near, point)
-                    nearest = wp.min(nearest, d)
-                    weight += spread_weight(d, pads.taxel[g, t][3], level)
-                    t += wp.static(LANES if lanes else 1)
-        return wp.vec2(nearest, weight)
-
-    return beside_links
 
 
 @cache
@@ -315,26 +239,29 @@ def touch_kernel(
     *,
     law: str = "hertz",
     pads: int = 5,
+    groups: int = 5,
     taxels: int = 120,
+    rounds: int = 4,
     objects: int = 1,
     feel_others: bool = False,
     links: int = 5,
     selves: bool = False,
-    shared: bool = False,
     registers: int = 0,
 ) -> wp.Kernel:
-    """Return the kernel for one choice of options; dimensions: [N, F] threads (serial) or N * F * 32 (lanes).
+    """Return the kernel for one choice of options; dimensions: [N, G] threads (serial) or N * G * 32 (lanes).
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
     the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the
-    solver's, spread. pads, taxels, objects, links: the layout's sizes F and T, the objects in each world, and links L.
-    shared: pads on one body share its force. registers: CUDA, at most so many a thread (0: as the compiler likes).
+    solver's, spread. pads, groups, taxels, rounds, objects, links: the layout's sizes F, G, T and R (a multiple of
+    `CHUNK`, or less than it), the objects in each world, and links L. registers: CUDA, at most so many a thread (0: as
+    the compiler likes).
     """
-    rounds = -(-taxels // LANES)
-    make = _lanes if lanes else _serial
-    kernel = make(
-        solver, raw, others, LAWS[law], pads, taxels, objects, feel_others, links, selves, shared, rounds
-    )
+    if lanes:
+        kernel = _lanes(
+            solver, raw, others, LAWS[law], pads, groups, taxels, rounds, objects, feel_others, links, selves
+        )
+    else:
+        kernel = _serial(solver, raw, others, LAWS[law], feel_others, selves)
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
     return wp.kernel(
         kernel,
@@ -346,180 +273,250 @@ def touch_kernel(
     )
 
 
-def _serial(
-    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
-    links: int, selves: bool, shared: bool, rounds: int,
-) -> Callable:  # fmt: skip
-    beside_links = _beside_links(False)
+@wp.func
+def per_weight(pads: Pads, groups: Groups, distance: wp.array3d(dtype=float), w: int, g: int, level: float):
+    """Return one over the sum of a group's weights."""
+    whole = float(0.0)
+    for i in range(groups.first[g], groups.first[g + 1]):
+        f = groups.pads[i]
+        for t in range(pads.count[f]):
+            whole += spread_weight(distance[w, f, t], pads.taxel[f, t][3], level)
+    return 1.0 / whole
 
-    def serial(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: Felt):
-        w, f = wp.tid()
-        body = pads.body[f]
-        n = pads.count[f]
-        bound = pads.bound[f]
-        k = law.scale[w] * law.stiffness[f]
-        total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force
-        if wp.static(raw):
-            for t in range(out.felt.shape[2]):
-                out.felt[w, f, t] = 0.0
+
+def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool, selves: bool) -> Callable:
+    def serial(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: Felt):
+        w, g = wp.tid()
+        body = groups.body[g]
+        bound = groups.bound[g]
+        first = groups.first[g]
+        end = groups.first[g + 1]
+        for i in range(first, end):
+            f = groups.pads[i]
+            out.force[w, f] = 0.0
+            out.centre[w, f] = wp.vec3(0.0, 0.0, 0.0)  # moment of force, body frame
+            if wp.static(others):
+                out.force_other[w, f] = 0.0
+            if wp.static(raw):
+                for t in range(out.felt.shape[2]):
+                    out.felt[w, f, t] = 0.0
         for o in range(here.object_body.shape[0]):
             shape = here.shape_id[w, o]
             size = here.shape_size[w, o]
-            pressed = float(0.0)
+            pressed = float(1.0)
             if wp.static(solver):
-                pressed = here.pair_normal[w, here.pair_column[f, o]]
-            if shape >= 0 and (pressed > 0.0 or not wp.static(solver)):
+                pressed = here.pair_normal[w, here.pair_column[g, o]]
+            if shape >= 0 and pressed > 0.0:
                 a = turn_in(here.xmat, w, body, here.object_body[o])
                 b = pose_in(here.xpos, here.xmat, w, body, here.object_body[o])
+                level = float(0.0)
+                scale = float(1.0)
+                near = bool(True)
                 if wp.static(solver):
-                    nearest = float(1.0e9)
-                    for t in range(n):
-                        d = distance(shapes, shape, size, a * xyz(pads.taxel[f, t]) + b)
-                        out.distance[w, f, t] = d
-                        nearest = wp.min(nearest, d)
-                    if wp.static(shared):
-                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, 0, 1, 0.0)
-                        nearest = wp.min(nearest, beside[0])
+                    nearest = float(FAR)
+                    for i in range(first, end):
+                        f = groups.pads[i]
+                        for t in range(pads.count[f]):
+                            d = distance(shapes, shape, size, a * xyz(pads.taxel[f, t]) + b)
+                            out.distance[w, f, t] = d
+                            nearest = wp.min(nearest, d)
                     level = spread_level(nearest, law.reach)
-                    s = wp.vec4(0.0, 0.0, 0.0, 0.0)
-                    for t in range(n):
-                        p = pads.taxel[f, t]
-                        c = spread_weight(out.distance[w, f, t], p[3], level)
-                        s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
-                    whole = s[3]
-                    if wp.static(shared):
-                        whole += beside_object(here, pads, shapes, shape, size, a, b, f, o, 0, 1, level)[1]
-                        pressed = pressed * s[3] / whole
-                    c = here.pair_normal[w, here.pair_column[f, o]] / whole
-                    total += wp.vec4(c * s[0], c * s[1], c * s[2], pressed)
-                    if wp.static(raw):
-                        for t in range(n):
-                            share = spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
-                            out.felt[w, f, t] = out.felt[w, f, t] + c * share
+                    scale = pressed * per_weight(pads, groups, out.distance, w, g, level)
                 else:
-                    if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
-                        for t in range(n):
+                    near = may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3])
+                if near:
+                    for i in range(first, end):
+                        f = groups.pads[i]
+                        stiff = law.scale[w] * law.stiffness[f]
+                        s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                        for t in range(pads.count[f]):
                             p = pads.taxel[f, t]
-                            d = distance(shapes, shape, size, a * xyz(p) + b)
-                            if d < 0.0:
-                                c = taxel_force(wp.static(kind), law, k, -d, p[3], law.threshold[w])
-                                total += wp.vec4(c * p[0], c * p[1], c * p[2], c)
-                                if wp.static(raw):
-                                    out.felt[w, f, t] = out.felt[w, f, t] + c
-        out.force[w, f] = total[3]
-        out.centre[w, f] = here.xmat[w, body] * centre_of(pads, f, total) + here.xpos[w, body]
-        if wp.static(others and selves):
-            other = here.pair_normal[w, here.self_column[f]]
-            if other > 0.0:
-                nearest = float(1.0e9)
-                near, _ = links_near(here, tips, w, body, ball_of(here, pads, w, f), 0)
-                for t in range(n):
-                    point = here.xmat[w, body] * xyz(pads.taxel[f, t]) + here.xpos[w, body]
-                    d = nearest_link(here, tips, w, body, near, point)
-                    out.distance[w, f, t] = d
-                    nearest = wp.min(nearest, d)
-                if wp.static(shared):
-                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, 0, nearest)[0])
-                level = spread_level(nearest, law.reach)
-                own = float(0.0)
-                for t in range(n):
-                    own += spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
-                whole = own
-                if wp.static(shared):
-                    whole += beside_links(here, pads, tips, w, f, 0, level)[1]
-                c = other / whole
-                if wp.static(raw and feel_others):
-                    for t in range(n):
-                        share = spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
-                        out.felt[w, f, t] = out.felt[w, f, t] + c * share
-                if wp.static(shared):
-                    other = c * own
-            out.force_other[w, f] = other
-        elif wp.static(others):
-            other = float(0.0)
-            for g in range(here.link_body.shape[0]):
-                if may_meet(f, g, here, pads, w):
-                    a = turn_in(here.xmat, w, body, here.link_body[g])
-                    b = pose_in(here.xpos, here.xmat, w, body, here.link_body[g])
-                    if not tips_apart(pads, tips, f, g, a, b):
-                        for t in range(n):
-                            p = pads.taxel[f, t]
-                            q = a * xyz(p) + b
-                            if in_box(q, tips.middle[g], tips.half[g]):
-                                d = sd_grid(tips, g, 1.0, q)
+                            c = float(0.0)
+                            if wp.static(solver):
+                                c = scale * spread_weight(out.distance[w, f, t], p[3], level)
+                            else:
+                                d = distance(shapes, shape, size, a * xyz(p) + b)
                                 if d < 0.0:
-                                    c = taxel_force(wp.static(kind), law, k, -d, p[3], law.threshold[w])
-                                    other += c
-                                    if wp.static(raw and feel_others):
-                                        out.felt[w, f, t] = out.felt[w, f, t] + c
-            out.force_other[w, f] = other
+                                    c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
+                            s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
+                            if wp.static(raw):
+                                out.felt[w, f, t] = out.felt[w, f, t] + c
+                        out.force[w, f] = out.force[w, f] + s[3]
+                        out.centre[w, f] = out.centre[w, f] + xyz(s)
+        for i in range(first, end):
+            f = groups.pads[i]
+            moment = out.centre[w, f]
+            at = centre_of(pads, f, wp.vec4(moment[0], moment[1], moment[2], out.force[w, f]))
+            out.centre[w, f] = here.xmat[w, body] * at + here.xpos[w, body]
+        if wp.static(others and selves):
+            other = here.pair_normal[w, here.self_column[g]]
+            if other > 0.0:
+                for i in range(first, end):
+                    f = groups.pads[i]
+                    for t in range(pads.count[f]):
+                        out.distance[w, f, t] = FAR
+                best = int(0)
+                least = float(FAR)
+                for j in range(here.link_body.shape[0]):
+                    gap = link_gap(here, groups, tips, w, g, j)
+                    if gap < least:
+                        least = gap
+                        best = j
+                # the nearest link first: where it is says how near others must be to matter
+                nearest = float(FAR)
+                for k in range(here.link_body.shape[0] + 1):
+                    j = wp.where(k == 0, best, k - 1)
+                    gap = link_gap(here, groups, tips, w, g, j)
+                    if (k == 0 or j != best) and gap < spread_level(nearest, law.reach):
+                        a = turn_in(here.xmat, w, body, here.link_body[j])
+                        b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
+                        for i in range(first, end):
+                            f = groups.pads[i]
+                            for t in range(pads.count[f]):
+                                d = wp.min(out.distance[w, f, t], sd_grid(tips, j, 1.0, a * xyz(pads.taxel[f, t]) + b))
+                                out.distance[w, f, t] = d
+                                nearest = wp.min(nearest, d)
+                level = spread_level(nearest, law.reach)
+                scale = other * per_weight(pads, groups, out.distance, w, g, level)
+                for i in range(first, end):
+                    f = groups.pads[i]
+                    for t in range(pads.count[f]):
+                        c = scale * spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
+                        out.force_other[w, f] = out.force_other[w, f] + c
+                        if wp.static(raw and feel_others):
+                            out.felt[w, f, t] = out.felt[w, f, t] + c
+        elif wp.static(others):
+            for j in range(here.link_body.shape[0]):
+                if may_meet(g, j, here, groups, w):
+                    a = turn_in(here.xmat, w, body, here.link_body[j])
+                    b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
+                    if not tips_apart(groups, tips, g, j, a, b):
+                        for i in range(first, end):
+                            f = groups.pads[i]
+                            stiff = law.scale[w] * law.stiffness[f]
+                            for t in range(pads.count[f]):
+                                p = pads.taxel[f, t]
+                                q = a * xyz(p) + b
+                                if in_box(q, tips.middle[j], tips.half[j]):
+                                    d = sd_grid(tips, j, 1.0, q)
+                                    if d < 0.0:
+                                        c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
+                                        out.force_other[w, f] = out.force_other[w, f] + c
+                                        if wp.static(raw and feel_others):
+                                            out.felt[w, f, t] = out.felt[w, f, t] + c
 
     return serial
 
 
 def _lanes(
-    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
-    links: int, selves: bool, shared: bool, rounds: int,
+    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int,
+    objects: int, feel_others: bool, links: int, selves: bool,
 ) -> Callable:  # fmt: skip
     Reals = wp.types.vector(length=rounds, dtype=float)
-    width = rounds * LANES
-    beside_links = _beside_links(True)
+    blocks = -(-links // LANES)
+    Gaps = wp.types.vector(length=max(blocks, 1), dtype=float)
+    chunk = min(CHUNK, rounds)
 
     @wp.func
-    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, px: Reals, py: Reals, pz: Reals):
-        # The kind is asked once for all, so that a lane's loads are all under way before the first is used.
-        kind = s.kind[i]
-        d = Reals()
-        if kind == wp.static(BOX):
-            for r in range(wp.static(rounds)):
-                d[r] = sd_box(a * wp.vec3(px[r], py[r], pz[r]) + b, size)
-        elif kind == wp.static(SPHERE):
-            for r in range(wp.static(rounds)):
-                d[r] = sd_sphere(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0])
-        elif kind == wp.static(CAPSULE):
-            for r in range(wp.static(rounds)):
-                d[r] = sd_capsule(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0], size[1])
-        elif kind == wp.static(CYLINDER):
-            for r in range(wp.static(rounds)):
-                d[r] = sd_cylinder(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0], size[1])
-        else:
-            offset = s.offset[i]
-            n = s.dims[i]
-            origin = s.origin[i]
-            h = s.spacing[i]
-            for r in range(wp.static(rounds)):
-                d[r] = sd_cells(s.data, offset, n, origin, h, size[0], a * wp.vec3(px[r], py[r], pz[r]) + b)
+    def in_grid(s: Shapes, i: int, scale: float, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
+        """Return distances to a grid of this lane's taxels, in n rounds from flat index `at` on; FAR behind them."""
+        offset = s.offset[i]
+        dims = s.dims[i]
+        origin = s.origin[i]
+        h = s.spacing[i]
+        d = Reals(FAR)
+        for c in range(wp.static(rounds // chunk)):
+            if wp.static(chunk) * c < n:
+                for k in range(wp.static(chunk)):
+                    r = wp.static(chunk) * c + k
+                    q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                    d[r] = sd_cells(s.data, offset, dims, origin, h, scale, q)
         return d
 
-    def lanes(here: Surroundings, pads: Pads, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
+    @wp.func
+    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
+        """Return the same for a shape of any kind, which is asked once for all."""
+        d = Reals(FAR)
+        if s.kind[i] == wp.static(GRID):
+            d = in_grid(s, i, size[0], a, b, groups, n, at)
+        else:
+            for c in range(wp.static(rounds // chunk)):
+                if wp.static(chunk) * c < n:
+                    for k in range(wp.static(chunk)):
+                        r = wp.static(chunk) * c + k
+                        d[r] = primitive(s.kind[i], size, a * xyz(load4(groups.taxel, at + 32 * r)) + b)
+        return d
+
+    @wp.func
+    def least_of(d: Any):
+        least = d[0]
+        for r in range(1, wp.static(rounds)):
+            least = wp.min(least, d[r])
+        return lanes_min(least)
+
+    @wp.func
+    def shares(d: Any, groups: Groups, at: int, reach: float):
+        """Return each taxel's share of a force that is spread over its group, by its distance."""
+        level = spread_level(least_of(d), reach)
+        whole = float(0.0)
+        for r in range(wp.static(rounds)):
+            c = float(0.0)
+            if d[r] < level:
+                c = spread_weight(d[r], load4(groups.taxel, at + 32 * r)[3], level)
+            whole += c
+            d[r] = c
+        return d * (1.0 / lanes_sum(whole))
+
+    @wp.func
+    def to_links(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, at: int, lane: int, reach: float):
+        """Return distances to the nearest of the hand's other links, exact where they are under the level. A lane asks
+        how near its link may be; then the warp measures them, nearest first, until the rest cannot matter."""
+        body = groups.body[g]
+        gap = Gaps()
+        for k in range(wp.static(max(blocks, 1))):
+            gap[k] = link_gap(here, groups, tips, w, g, 32 * k + lane)
+        d = Reals(FAR)
+        level = float(FAR)
+        nearer = bool(True)
+        while nearer:
+            least = gap[0]
+            for k in range(1, wp.static(max(blocks, 1))):
+                least = wp.min(least, gap[k])
+            least = lanes_min(least)
+            nearer = least < level
+            if nearer:
+                j = int(0)
+                for k in range(wp.static(max(blocks, 1))):
+                    bits = lane_ballot(gap[k] == least)
+                    if bits != 0:
+                        j = 32 * k + lowest_bit(bits)
+                for k in range(wp.static(max(blocks, 1))):
+                    if j == 32 * k + lane:
+                        gap[k] = FAR
+                a = turn_in(here.xmat, w, body, here.link_body[j])
+                b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
+                e = in_grid(tips, j, 1.0, a, b, groups, groups.rounds[g], at)
+                for r in range(wp.static(rounds)):
+                    d[r] = wp.min(d[r], e[r])
+                level = spread_level(least_of(d), reach)
+        return d
+
+    def lanes(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
         # Every branch around an exchange of lanes is the same for the whole warp.
         i = wp.tid()
         lane = i & 31
-        pad = i >> 5
-        w = pad // wp.static(pad_count)
-        f = pad - w * wp.static(pad_count)
-        body = pads.body[f]
+        w = (i >> 5) // wp.static(group_count)
+        g = (i >> 5) - w * wp.static(group_count)
+        body = groups.body[g]
         rot = here.xmat[w, body]
         pos = here.xpos[w, body]
-        px = Reals()
-        py = Reals()
-        pz = Reals()
-        area = Reals()
-        wanted = bool(wp.static(not solver or (others and not selves)))
-        if wp.static(solver):  # a pad that nothing presses asks for none of its taxels
-            for o in range(wp.static(objects)):
-                wanted = wanted or here.pair_normal[w, here.pair_column[f, o]] > 0.0
-            if wp.static(others and selves):
-                wanted = wanted or here.pair_normal[w, here.self_column[f]] > 0.0
-        if wanted:
-            for r in range(wp.static(rounds)):
-                v = load4(pads.taxel, f * wp.static(width) + 32 * r + lane)
-                px[r] = v[0]
-                py[r] = v[1]
-                pz[r] = v[2]
-                area[r] = v[3]
-        total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force; the same in all lanes
-        mine = Reals()  # forces of this lane's taxels
+        n = groups.rounds[g]
+        at = g * wp.static(rounds * LANES) + lane
+        k = law.scale[w]
+        quiet = law.threshold[w]
+        busy = bool(False)
+        mine = Reals()  # N, of the object on this lane's taxels
+        theirs = Reals()  # N, of the hand itself
         for o in range(wp.static(objects)):
             shape = here.shape_id[w, o]
             size = here.shape_size[w, o]
@@ -527,121 +524,91 @@ def _lanes(
             a = turn * rot
             b = turn * (pos - here.xpos[w, here.object_body[o]])
             if wp.static(solver):
-                pressed = here.pair_normal[w, here.pair_column[f, o]]
+                pressed = here.pair_normal[w, here.pair_column[g, o]]
                 if shape >= 0 and pressed > 0.0:
-                    d = distances(shapes, shape, size, a, b, px, py, pz)
-                    nearest = d[0]
-                    for r in range(1, wp.static(rounds)):
-                        nearest = wp.min(nearest, d[r])
-                    if wp.static(shared):
-                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, lane, 32, 0.0)
-                        nearest = wp.min(nearest, beside[0])
-                    level = spread_level(lanes_min(nearest), law.reach)
-                    s = wp.vec4(0.0, 0.0, 0.0, 0.0)
-                    for r in range(wp.static(rounds)):
-                        c = spread_weight(d[r], area[r], level)
-                        s += wp.vec4(c * px[r], c * py[r], c * pz[r], c)
-                        d[r] = c
-                    s = lanes_sum4(s, lane)
-                    whole = s[3]
-                    scale = pressed / whole
-                    if wp.static(shared):
-                        beside = beside_object(here, pads, shapes, shape, size, a, b, f, o, lane, 32, level)
-                        whole += lanes_sum(beside[1])
-                        scale = pressed / whole
-                        pressed = scale * s[3]
-                    total += wp.vec4(scale * s[0], scale * s[1], scale * s[2], pressed)
-                    mine += scale * d
+                    busy = True
+                    d = distances(shapes, shape, size, a, b, groups, n, at)
+                    mine += pressed * shares(d, groups, at, law.reach)
             else:
                 if shape >= 0:
-                    bound = pads.bound[f]
+                    bound = groups.bound[g]
                     if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
-                        k = law.scale[w] * law.stiffness[f]
-                        quiet = law.threshold[w]
-                        d = distances(shapes, shape, size, a, b, px, py, pz)
-                        s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                        busy = True
+                        d = distances(shapes, shape, size, a, b, groups, n, at)
                         for r in range(wp.static(rounds)):
-                            c = float(0.0)
                             if d[r] < 0.0:
-                                c = taxel_force(wp.static(kind), law, k, -d[r], area[r], quiet)
-                            s += wp.vec4(c * px[r], c * py[r], c * pz[r], c)
-                            d[r] = c
-                        total += lanes_sum4(s, lane)
-                        mine += d
-        if lane == 0:
-            out.force[pad] = total[3]
-            out.centre[pad] = rot * centre_of(pads, f, total) + pos
+                                stiff = k * law.stiffness[groups.round[g, r][0]]
+                                area = load4(groups.taxel, at + 32 * r)[3]
+                                mine[r] += taxel_force(wp.static(kind), law, stiff, -d[r], area, quiet)
         if wp.static(others and selves):
-            other = here.pair_normal[w, here.self_column[f]]
+            other = here.pair_normal[w, here.self_column[g]]
             if other > 0.0:
-                d = Reals()
-                near, _ = links_near_lanes(here, tips, w, body, ball_of(here, pads, w, f), lane)
-                for r in range(wp.static(rounds)):
-                    d[r] = FAR
-                    if wp.static(32) * r < pads.count[f]:
-                        d[r] = nearest_link(here, tips, w, body, near, rot * wp.vec3(px[r], py[r], pz[r]) + pos)
-                nearest = d[0]
-                for r in range(1, wp.static(rounds)):
-                    nearest = wp.min(nearest, d[r])
-                if wp.static(shared):
-                    nearest = wp.min(nearest, beside_links(here, pads, tips, w, f, lane, nearest)[0])
-                level = spread_level(lanes_min(nearest), law.reach)
-                own = float(0.0)
-                for r in range(wp.static(rounds)):
-                    d[r] = spread_weight(d[r], area[r], level)
-                    own += d[r]
-                own = lanes_sum(own)
-                whole = own
-                if wp.static(shared):
-                    whole += lanes_sum(beside_links(here, pads, tips, w, f, lane, level)[1])
-                if wp.static(raw and feel_others):
-                    mine += other / whole * d
-                if wp.static(shared):
-                    other = other / whole * own
-            if lane == 0:
-                out.force_other[pad] = other
+                busy = True
+                d = to_links(here, groups, tips, w, g, at, lane, law.reach)
+                theirs = other * shares(d, groups, at, law.reach)
         elif wp.static(others):
             # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
-            other = float(0.0)
-            for block in range(wp.static(-(-links // LANES))):
+            for block in range(wp.static(blocks)):
                 j = wp.static(32) * block + lane
                 near = j < wp.static(links)
                 if near:
-                    near = may_meet(f, j, here, pads, w)
+                    near = may_meet(g, j, here, groups, w)
                 if near:
                     turn = wp.transpose(here.xmat[w, here.link_body[j]])
-                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - here.xpos[w, here.link_body[j]]))
+                    near = not tips_apart(
+                        groups, tips, g, j, turn * rot, turn * (pos - here.xpos[w, here.link_body[j]])
+                    )
                 left = lane_ballot(near)
                 while left != 0:
-                    g = 32 * block + lowest_bit(left)
+                    busy = True
+                    one = 32 * block + lowest_bit(left)
                     left = left & (left - 1)
-                    turn = wp.transpose(here.xmat[w, here.link_body[g]])
+                    turn = wp.transpose(here.xmat[w, here.link_body[one]])
                     a = turn * rot
-                    b = turn * (pos - here.xpos[w, here.link_body[g]])
-                    middle = tips.middle[g]
-                    half = tips.half[g]
-                    offset = tips.offset[g]
-                    n = tips.dims[g]
-                    origin = tips.origin[g]
-                    h = tips.spacing[g]
-                    k = law.scale[w] * law.stiffness[f]
-                    quiet = law.threshold[w]
+                    b = turn * (pos - here.xpos[w, here.link_body[one]])
+                    middle = tips.middle[one]
+                    half = tips.half[one]
+                    offset = tips.offset[one]
+                    dims = tips.dims[one]
+                    origin = tips.origin[one]
+                    h = tips.spacing[one]
                     for r in range(wp.static(rounds)):
-                        q = a * wp.vec3(px[r], py[r], pz[r]) + b
+                        p = load4(groups.taxel, at + 32 * r)
+                        q = a * xyz(p) + b
                         if in_box(q, middle, half):
-                            gap = sd_cells(tips.data, offset, n, origin, h, 1.0, q)
+                            gap = sd_cells(tips.data, offset, dims, origin, h, 1.0, q)
                             if gap < 0.0:
-                                c = taxel_force(wp.static(kind), law, k, -gap, area[r], quiet)
-                                other += c
-                                if wp.static(raw and feel_others):
-                                    mine[r] += c
-            other = lanes_sum(other)
-            if lane == 0:
-                out.force_other[pad] = other
-        if wp.static(raw):
-            for r in range(wp.static(rounds)):
-                t = 32 * r + lane
-                if t < wp.static(taxels):
-                    out.felt[pad * wp.static(taxels) + t] = mine[r]
+                                stiff = k * law.stiffness[groups.round[g, r][0]]
+                                theirs[r] += taxel_force(wp.static(kind), law, stiff, -gap, p[3], quiet)
+        s = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force: of a pad
+        other = float(0.0)
+        for r in range(wp.static(rounds)):
+            if r < n:
+                this = groups.round[g, r]
+                pad = w * wp.static(pad_count) + this[0]
+                if busy:
+                    p = load4(groups.taxel, at + 32 * r)
+                    s += wp.vec4(mine[r] * p[0], mine[r] * p[1], mine[r] * p[2], mine[r])
+                    other += theirs[r]
+                t = this[1] + lane
+                if wp.static(raw):
+                    if t < wp.static(taxels):
+                        out.felt[pad * wp.static(taxels) + t] = mine[r] + wp.static(float(feel_others)) * theirs[r]
+                if this[2] != 0:
+                    if busy:
+                        s = lanes_sum4(s, lane)
+                        other = lanes_sum(other)
+                    if lane == 0:
+                        out.force[pad] = s[3]
+                        out.centre[pad] = rot * centre_of(pads, this[0], s) + pos
+                        if wp.static(others):
+                            out.force_other[pad] = other
+                    s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                    other = 0.0
+                    if wp.static(raw):
+                        t += 32
+                        while t < wp.static(taxels):
+                            out.felt[pad * wp.static(taxels) + t] = 0.0
+                            t += 32
 
     return lanes

@@ -71,15 +71,6 @@ class TaxelLayout:
             n, 4
         )
 
-    def bound(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centre [F, 3] and radius [F] of a sphere around each pad's taxels [m], body frame."""
-        centre, radius = np.zeros((self.pads, 3)), np.zeros(self.pads)
-        for f in range(self.pads):
-            p = self.point[f, : self.count[f]]
-            centre[f] = 0.5 * (p.min(0) + p.max(0))
-            radius[f] = np.linalg.norm(p - centre[f], axis=1).max()
-        return centre, radius
-
     def lifted(self, tips: Sequence[np.ndarray], limit: float = 1e-3) -> TaxelLayout:
         """Return the taxels moved along their normals onto the convex hulls of `tips` ([V, 3] m each, body frames), the
         surfaces that the physics presses, so that a taxel is in an object where that surface is. Fails if one would

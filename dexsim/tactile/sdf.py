@@ -123,9 +123,8 @@ def sd_grid(s: Shapes, i: int, scale: float, q: wp.vec3):
 
 
 @wp.func
-def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
-    """Signed distance [m] of q to shape i of the set, at this world's size."""
-    kind = s.kind[i]
+def primitive(kind: int, size: wp.vec3, q: wp.vec3):
+    """Signed distance [m] of q to a primitive of this size."""
     d = float(0.0)
     if kind == wp.static(BOX):
         d = sd_box(q, size)
@@ -133,10 +132,19 @@ def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
         d = sd_sphere(q, size[0])
     elif kind == wp.static(CAPSULE):
         d = sd_capsule(q, size[0], size[1])
-    elif kind == wp.static(CYLINDER):
-        d = sd_cylinder(q, size[0], size[1])
     else:
+        d = sd_cylinder(q, size[0], size[1])
+    return d
+
+
+@wp.func
+def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
+    """Signed distance [m] of q to shape i of the set, at this world's size."""
+    d = float(0.0)
+    if s.kind[i] == wp.static(GRID):
         d = sd_grid(s, i, size[0], q)
+    else:
+        d = primitive(s.kind[i], size, q)
     return d
 
 

@@ -15,14 +15,14 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import MAX_ROUNDS, Felt, FlatFelt, Law, Pads, Surroundings, touch_kernel
+from dexsim.tactile.kernel import CHUNK, MAX_ROUNDS, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernel
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, Measured, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
 from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 BLOCK_DIM = 128
-"""Threads a block of the touch kernel on CUDA: 4 warps, each a pad of its own."""
+"""Threads a block of the touch kernel on CUDA: 4 warps, each a group of pads of its own."""
 REGISTERS = 80
 """Most registers of its threads: 3 to 10 % faster on an H200 than as many as the compiler likes."""
 
@@ -49,12 +49,12 @@ class Tactile:
     tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
     other pads feel (others=true); pads beyond them lie where they are.
     other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
-    Pads whose pairs have one name share its force, whole.
+    Pads of one body whose pairs have one name share its force, whole.
     links: in place of the tips, (body, points [V, 3] m of its surface) of all that pads may feel of the hand itself;
     selves: with sum=solver, name of the contact pair of each pad's body and the rest of the hand [F]: what pads on one
     body feel of the hand is then this force, spread by the distance to the nearest link.
-    lanes: a warp for each pad, on CUDA with at most 512 taxels a pad (default), else a thread; block_dim, registers:
-    threads of its blocks and most registers of a thread (0: free), for CUDA only.
+    lanes: a warp for each pad, or pads that share a force, on CUDA with at most 512 taxels in it (default), else a
+    thread; block_dim, registers: threads of its blocks and most registers of a thread (0: free), for CUDA only.
 
     Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform
     scale first for grids); with O objects [N, O], [N, O, 3].
@@ -86,8 +86,6 @@ class Tactile:
         self.device, n, f, t = engine.device, engine.n, layout.pads, layout.taxels
         bodies = [object_body] if isinstance(object_body, str) else list(object_body)
         o = len(bodies)
-        fits = t <= MAX_ROUNDS * LANES
-        self.lanes = (self.device != "cpu" and fits) if lanes is None else lanes and fits
         self.block_dim = block_dim if self.device != "cpu" else LANES
         if links is None and tips is not None:
             links = list(zip(layout.bodies, tips, strict=True))
@@ -106,31 +104,40 @@ class Tactile:
                     raise UserError(f"contact pairs of pad '{layout.names[i]}': {len(names)} given for {o} objects")
                 columns[i] = [engine.pair(name) for name in names]
         selves = selves if solver and others else None
-        self_columns = np.array([engine.pair(name) for name in selves or []], dtype=np.int32)
-        shared = len({tuple(row) for row in columns}) < f if solver else False
-        shared |= selves is not None and len(set(layout.bodies)) < f
+        self_columns = np.array([engine.pair(name) for name in selves] if selves else [-1] * f, dtype=np.int32)
         tip_columns = np.full((f, max(f, len(near))), -1, dtype=np.int32)
         if other_pairs is not None:
             for i in range(f):
                 for j in range(f):
                     if i != j and other_pairs[i][j]:
                         tip_columns[i, j] = engine.pair(other_pairs[i][j])
+        pressed = zip(layout.bodies, columns.tolist(), tip_columns.tolist(), self_columns.tolist(), strict=True)
+        alike = [str(x) for x in pressed]
+        members = [[i for i in range(f) if alike[i] == x] for x in dict.fromkeys(alike)]
+        if selves is not None and len(members) > len(set(layout.bodies)):
+            raise UserError("touch of a hand on itself: pads of one body must name the same contact pairs")
+        firsts = [m[0] for m in members]
+        rounds = max(int((-(-layout.count[m] // LANES)).sum()) for m in members)
+        rounds = rounds if rounds < CHUNK else CHUNK * -(-rounds // CHUNK)
+        self.lanes = rounds <= MAX_ROUNDS and (self.device != "cpu" if lanes is None else lanes)
         measured = cfg.measured
         store = cfg.raw or measured
         self.columns = tuple(COLUMNS)
 
         with wp.ScopedDevice(self.device):
-            self._pads = _pads(engine, layout, layout.lifted(tips) if cfg.lift and tips is not None else layout)
+            felt = layout.lifted(tips) if cfg.lift and tips is not None else layout
+            self._pads = _pads(engine, layout, felt)
+            self._groups = _groups(engine, layout, felt, members, rounds)
             self._law = _law(cfg, layout, needed=not solver or (others and selves is None))
             self.tips = ShapeSet(_link_shapes(near), self.device)
             a = SimpleNamespace(
                 object_body=wp.array([engine.body(b) for b in bodies], dtype=int),
                 shape_id=wp.full((n, o), -1, dtype=int),
                 shape_size=wp.zeros((n, o), dtype=wp.vec3),
-                pair_column=wp.array(columns, dtype=int),
+                pair_column=wp.array(columns[firsts], dtype=int),
                 link_body=wp.array([engine.body(body) for body, _ in near], dtype=int),
-                tip_column=wp.array(tip_columns, dtype=int),
-                self_column=wp.array(self_columns, dtype=int),
+                tip_column=wp.array(tip_columns[firsts], dtype=int),
+                self_column=wp.array(self_columns[firsts], dtype=int),
                 params=wp.zeros((len(COLUMNS), n), dtype=float),
                 force=wp.zeros((n, f), dtype=float),
                 centre=wp.zeros((n, f), dtype=wp.vec3),
@@ -154,11 +161,11 @@ class Tactile:
         self._fixed = torch.tensor(low, dtype=torch.float32, device=self.device)  # [C, 1], what is not drawn
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
-        options |= {"links": len(near), "selves": selves is not None, "shared": shared}
+        options |= {"links": len(near), "selves": selves is not None, "groups": len(members), "rounds": rounds}
         self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
-        felt: Any = FlatFelt if self.lanes else Felt
-        self._out = felt()
-        for name in felt.vars:
+        kind: Any = FlatFelt if self.lanes else Felt
+        self._out = kind()
+        for name in kind.vars:
             setattr(self._out, name, getattr(a, name).flatten() if self.lanes else getattr(a, name))
         self._law.scale, self._law.threshold = self._row["stiffness_scale"], self._row["threshold"]
         contacts = solver or bool((tip_columns >= 0).any())
@@ -173,7 +180,7 @@ class Tactile:
             self.by_pad = (
                 ByPad(cfg, layout, n, self.device, seed, {k: self.column(k) for k in OF_WORLD}) if cfg.pads else None
             )
-            if self.by_pad is not None and self.by_pad.rubber and (o != 1 or shared):
+            if self.by_pad is not None and self.by_pad.rubber and (o != 1 or (solver and len(members) < f)):
                 raise UserError(
                     f"tactile.pads: rubber works with one object and one pad a link; {o} objects, {f} pads on"
                     f" {len(set(layout.bodies))} links were given"
@@ -292,12 +299,12 @@ class Tactile:
     def launch(self) -> None:
         """Feel: only launches, so it can be recorded in a graph."""
         a, n = self._a, self.engine.n
-        args = [self._around, self._pads, self._law, self.shapes.wp, self.tips.wp, self._out]
+        args = [self._around, self._pads, self._groups, self._law, self.shapes.wp, self.tips.wp, self._out]
+        g = self._groups.body.shape[0]
         if self.lanes:
-            dim = n * self.layout.pads * LANES
-            wp.launch(self._kernel, dim=dim, inputs=args, block_dim=self.block_dim, device=self.device)
+            wp.launch(self._kernel, dim=n * g * LANES, inputs=args, block_dim=self.block_dim, device=self.device)
         else:
-            wp.launch(self._kernel, dim=(n, self.layout.pads), inputs=args, device=self.device)
+            wp.launch(self._kernel, dim=(n, g), inputs=args, device=self.device)
         m = self._m
         if m is None:
             return
@@ -334,25 +341,52 @@ def _link_shapes(links: Sequence[tuple[str, np.ndarray]]) -> list[TouchShape]:
     return [TouchShape(body, "grid", _baked(np.ascontiguousarray(x, dtype=float).tobytes())) for body, x in links]
 
 
+def _rows(layout: TaxelLayout, felt: TaxelLayout, f: int, rounds: int) -> np.ndarray:
+    """Return pad f's taxels, where `felt` has them, in rounds of 32 [32 rounds, 4]; see `Pads.taxel`."""
+    n = int(layout.count[f])
+    out = np.zeros((LANES * rounds, 4), dtype=np.float32)
+    out[:, :3] = felt.point[f, 0]
+    out[:n, :3], out[:n, 3] = felt.point[f, :n], layout.area[f, :n]
+    return out
+
+
 def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
     """Return the layout on the device, with its taxels where `felt` has them."""
-    centre, radius = felt.bound()
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
     out.count = wp.array(layout.count, dtype=int)
-    width = LANES * -(-layout.taxels // LANES)
-    taxel = np.zeros((layout.pads, width, 4))
-    box = np.zeros((layout.pads, 2, 3))
-    for f, n in enumerate(layout.count):
-        taxel[f, :, :3] = felt.point[f, 0]
-        taxel[f, :n, :3], taxel[f, :n, 3] = felt.point[f, :n], layout.area[f, :n]
-        box[f] = felt.point[f, :n].min(0), felt.point[f, :n].max(0)
-    out.taxel = wp.array(taxel.astype(np.float32), dtype=wp.vec4)
+    width = -(-layout.taxels // LANES)
+    out.taxel = wp.array(np.stack([_rows(layout, felt, f, width) for f in range(layout.pads)]), dtype=wp.vec4)
+    out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
+    return out
+
+
+def _groups(engine: Posed, layout: TaxelLayout, felt: TaxelLayout, members: list[list[int]], most: int) -> Groups:
+    """Return groups of pads on the device, up to `most` rounds each."""
+    taxel = np.zeros((len(members), LANES * most, 4), dtype=np.float32)
+    round_ = np.zeros((len(members), most, 3), dtype=np.int32)
+    box, bound, rounds = np.zeros((len(members), 2, 3)), np.zeros((len(members), 4)), []
+    for g, pads in enumerate(members):
+        parts = [_rows(layout, felt, f, -(-int(layout.count[f]) // LANES)) for f in pads]
+        rows = np.concatenate(parts)
+        taxel[g, :, :3], taxel[g, : len(rows)] = rows[0, :3], rows
+        each = zip(pads, parts, strict=True)
+        of = [(f, t, int(t + LANES == len(x))) for f, x in each for t in range(0, len(x), LANES)]
+        round_[g], round_[g, : len(of)] = of[0], of
+        rounds.append(len(of))
+        box[g] = rows[:, :3].min(0), rows[:, :3].max(0)
+        bound[g, :3] = box[g].mean(0)
+        bound[g, 3] = np.linalg.norm(rows[:, :3] - bound[g, :3], axis=1).max()
+    out = Groups()
+    out.body = wp.array([engine.body(layout.bodies[pads[0]]) for pads in members], dtype=int)
+    out.pads = wp.array(sum(members, []), dtype=int)
+    out.first = wp.array(np.cumsum([0, *map(len, members)]), dtype=int)
+    out.rounds, out.round = wp.array(rounds, dtype=int), wp.array(round_, dtype=wp.vec3i)
+    out.taxel = wp.array(taxel, dtype=wp.vec4)
     # a micrometre for rounding
     out.middle = wp.array(box.mean(1).astype(np.float32), dtype=wp.vec3)
     out.half = wp.array((0.5 * (box[:, 1] - box[:, 0]) + 1e-6).astype(np.float32), dtype=wp.vec3)
-    out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
-    out.bound = wp.array(np.concatenate([centre, radius[:, None]], axis=1).astype(np.float32), dtype=wp.vec4)
+    out.bound = wp.array(bound.astype(np.float32), dtype=wp.vec4)
     return out
 
 
