@@ -188,12 +188,14 @@ def signed(hand, geom: str, points: np.ndarray, corners: np.ndarray, box: bool) 
 
 
 @pytest.mark.slow
-def test_two_thousand_taxels_feel(tmp_path):
+def test_two_thousand_taxels_feel(tmp_path, monkeypatch):
+    """By a GPU's kernel: more of a link than its registers hold."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     made_hand(tmp_path)
     done = skin.add(tmp_path, "palm:1400/4,links:150")
     layout = hand_layout(done)
     assert int(layout.count[3:].sum()) == 1400 + 3 * 150 and layout.pads == 3 + 4 + 3
-    engine, touch = feeling(done, layout, 2)
+    engine, touch = feeling(done, layout, 2, True)
     drop_in(engine, touch, 4)
     touch.launch()
     torch.testing.assert_close(touch.raw_clean.sum(-1), touch.force_clean + touch.force_other, rtol=1e-4, atol=1e-4)

@@ -1,10 +1,10 @@
 """The touch kernel: transform, distance, force and reduction of all taxels in one launch.
 
 Pads that share one force form a group, and each taxel's distance is measured once. Two variants share every line of
-the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per (world, group), for the CPU and for
-groups of more than 512 taxels; `lanes`, one warp per (world, group), for CUDA: each lane keeps the distances of every
-32nd taxel in registers, sums are shuffles, and there is no barrier and no shared memory. Both compose the two poses
-once a group and reduce in the frame of its body.
+the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per (world, group), for the CPU; `lanes`,
+one warp per (world, group), for CUDA: each lane keeps the distances of every 32nd taxel, in registers up to 512 taxels,
+sums are shuffles, and there is no barrier and no shared memory. Both compose the two poses once a group and reduce in
+the frame of its body.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from dexsim.tactile.sdf import (
     sd_grid,
 )
 
-MAX_ROUNDS = 16
-"""Taxels a lane may keep, in steps of 32 lanes."""
+MAX_UNROLL = 16
+"""Rounds of 32 taxels, a taxel a lane, whose distances are kept in registers; more go through a thread's memory."""
 CHUNK = 4
 """Rounds of 32 taxels that are measured at a time: all their loads are under way before the first is used."""
 LINEAR = 0
@@ -269,7 +269,7 @@ def touch_kernel(
         module="unique",
         grid_stride=False,
         cuda_max_registers=registers or None,
-        module_options={"fast_math": lanes},
+        module_options={"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK},
     )
 
 

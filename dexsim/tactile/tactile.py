@@ -15,7 +15,7 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import CHUNK, MAX_ROUNDS, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernel
+from dexsim.tactile.kernel import CHUNK, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernel
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, Measured, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
@@ -53,8 +53,8 @@ class Tactile:
     links: in place of the tips, (body, points [V, 3] m of its surface) of all that pads may feel of the hand itself;
     selves: with sum=solver, name of the contact pair of each pad's body and the rest of the hand [F]: what pads on one
     body feel of the hand is then this force, spread by the distance to the nearest link.
-    lanes: a warp for each pad, or pads that share a force, on CUDA with at most 512 taxels in it (default), else a
-    thread; block_dim, registers: threads of its blocks and most registers of a thread (0: free), for CUDA only.
+    lanes: a warp for each pad, or pads that share a force (default: on CUDA), else a thread; block_dim, registers:
+    threads of its blocks and most registers of a thread (0: free), for CUDA only.
 
     Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform
     scale first for grids); with O objects [N, O], [N, O, 3].
@@ -119,7 +119,7 @@ class Tactile:
         firsts = [m[0] for m in members]
         rounds = max(int((-(-layout.count[m] // LANES)).sum()) for m in members)
         rounds = rounds if rounds < CHUNK else CHUNK * -(-rounds // CHUNK)
-        self.lanes = rounds <= MAX_ROUNDS and (self.device != "cpu" if lanes is None else lanes)
+        self.lanes = self.device != "cpu" if lanes is None else lanes
         measured = cfg.measured
         store = cfg.raw or measured
         self.columns = tuple(COLUMNS)
