@@ -79,7 +79,7 @@ def make(
         .replace('<geom name="bob"', f'{LINK}<geom name="bob"')
     )
     model.write_text(drawn, encoding="utf-8")
-    believed = BELIEVED | ({"loop_encoder": "motor"} if effect in EFFECTS and EFFECTS[effect].demo_on_motor else {})
+    believed = BELIEVED | ({"loop_encoder": "motor"} if effect in EFFECTS and EFFECTS[effect].parts_motor else {})
     servo.write_text(yaml.safe_dump(believed, sort_keys=False), encoding="utf-8")
     true = yaml.safe_load(yaml.safe_dump(believed))
     # as real machines are: a little off

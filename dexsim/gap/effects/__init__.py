@@ -206,7 +206,6 @@ class Effect:
     every_kind: ClassVar[bool] = False  # listed with one of its kinds, all are: the scan's slopes rank them badly
     fitted_anyway: ClassVar[dict[str, str]] = {}  # servo column that may be unknown -> the parameter that it is
     demo: ClassVar[dict[str, float]] = {}  # servo columns of a drive that hides it, for `demo=`
-    demo_on_motor: ClassVar[bool] = False  # hidden behind a loop whose encoder sits on the motor
     plain: ClassVar[tuple[str, ...]] = ()  # servo columns of it that the plain model (`search.baseline`) fits
     misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
@@ -231,7 +230,6 @@ class Effect:
     # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
     approximated: ClassVar[tuple[str, ...]] = ()
     by_warmth: ClassVar[tuple[str, ...]] = ()  # columns with which training is given the recorded temperatures
-    on_rotor: ClassVar[tuple[str, ...]] = ()  # columns with which it is given the rotor's inertia, if no model has one
 
     def variants(self, s: Scales) -> list[Variant]:
         """Return the ways in which it may be there on a joint of these scales; none where its motion cannot show it."""

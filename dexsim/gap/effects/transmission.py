@@ -21,7 +21,6 @@ class Backlash(Effect):
 
     id = "backlash"
     words = "has free play between motor and joint"
-    on_rotor = ("backlash",)
     shows = "when the load changes sign"
     experiment = "small steps about a pose without load, both encoders logged if there are two"
     classes = ("friction or play", "about a reversal")
@@ -29,7 +28,6 @@ class Backlash(Effect):
     parts_motor = True
     rings = True
     demo = {"backlash": 0.06}
-    demo_on_motor = True
 
     def variants(self, s: Scales) -> list[Variant]:
         top = min(0.5 * s.span, 60 * s.error + 30 * s.sigma)
@@ -72,13 +70,11 @@ class Compliance(Effect):
 
     id = "compliance"
     words = "has an elastic transmission"
-    on_rotor = ("softness",)
     shows = "at high load and at 5-30 Hz"
     experiment = "a chirp of 1-30 Hz"
     parts_motor = True
     rings = True
     demo = {"softness": 0.5}
-    demo_on_motor = True
 
     def variants(self, s: Scales) -> list[Variant]:
         # not stiffer than a tenth of the loop's own spring is softness that leaves no trace

@@ -69,7 +69,6 @@ def undamped(trial: Trial, kp: float) -> float:
 
 
 APPROXIMATED = frozenset(name for e in CATALOGUE for name in e.approximated)
-ON_ROTOR = frozenset(name for e in CATALOGUE for name in e.on_rotor)
 BY_WARMTH = frozenset(name for e in CATALOGUE for name in e.by_warmth)
 
 
@@ -94,7 +93,7 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
     for x in trial.members:
         out |= x.effect.columns_beside(x.variant, joints)
     out |= approximate_columns(case, trial)
-    if fitted & ON_ROTOR and "rotor" not in fitted and case.constants.armature <= 0:
+    if fitted & {*FEATURES["play"]} and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out
 
