@@ -418,19 +418,27 @@ def _lanes(
     chunk = min(CHUNK, rounds)
 
     @wp.func
-    def in_grid(s: Shapes, i: int, scale: float, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
-        """Return distances to a grid of this lane's taxels, in n rounds from flat index `at` on; FAR behind them."""
+    def in_grid(
+        s: Shapes, i: int, scale: float, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float
+    ):
+        """Return distances to a grid of this lane's taxels, in n rounds from flat index `at` on; FAR behind them, and
+        where a taxel is `level` [m] or more from the grid's box, as it then is from the shape."""
         offset = s.offset[i]
         dims = s.dims[i]
-        origin = s.origin[i]
+        low = s.origin[i]
         h = s.spacing[i]
+        high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
         d = Reals(FAR)
         for c in range(wp.static(rounds // chunk)):
             if wp.static(chunk) * c < n:
                 for k in range(wp.static(chunk)):
                     r = wp.static(chunk) * c + k
                     q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
-                    d[r] = sd_cells(s.data, offset, dims, origin, h, scale, q)
+                    # those that are far read one cell, all the same, without a branch that others would wait at
+                    off = q - wp.max(scale * low, wp.min(q, scale * high))
+                    near = wp.dot(off, off) <= level * level
+                    e = sd_cells(s.data, offset, dims, low, h, scale, wp.where(near, q, scale * low))
+                    d[r] = wp.where(near, e, FAR)
         return d
 
     @wp.func
@@ -438,7 +446,7 @@ def _lanes(
         """Return the same for a shape of any kind, which is asked once for all."""
         d = Reals(FAR)
         if s.kind[i] == wp.static(GRID):
-            d = in_grid(s, i, size[0], a, b, groups, n, at)
+            d = in_grid(s, i, size[0], a, b, groups, n, at, FAR)
         else:
             for c in range(wp.static(rounds // chunk)):
                 if wp.static(chunk) * c < n:
@@ -495,7 +503,7 @@ def _lanes(
                         gap[k] = FAR
                 a = turn_in(here.xmat, w, body, here.link_body[j])
                 b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
-                e = in_grid(tips, j, 1.0, a, b, groups, groups.rounds[g], at)
+                e = in_grid(tips, j, 1.0, a, b, groups, groups.rounds[g], at, level)
                 for r in range(wp.static(rounds)):
                     d[r] = wp.min(d[r], e[r])
                 level = spread_level(least_of(d), reach)
