@@ -5,26 +5,29 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from itertools import chain, zip_longest
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from benchmarks.options import options
+from dexsim.console import jobs
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
 LEFT = re.compile(r"([0-9.]+) % done, about ([0-9.]+) s left")
+SURE = 0.8  # a name is confident from here, when it stands alone
 OVER = 1.5
 """x its limit, after which a diagnosis that has not ended itself is ended."""
+PROGRAM = (sys.executable, "-c", "import sys; from benchmarks.answers import answer; from dexsim.console.ending import"
+           " guard; sys.exit(guard(answer, sys.argv[1:]))")  # fmt: skip
 Row = dict[str, Any]
 Key = tuple[str, int]  # set and number of a case
 
@@ -45,27 +48,69 @@ def seed_of(text: str) -> int:
     return seed_of_sources() if text == "source" else int(text)
 
 
+def asked(
+    argv: Sequence[str], defaults: dict[str, Any], **choices: Sequence[str]
+) -> tuple[dict[str, Any], jobs.Engine]:
+    """Return the settings of a benchmark, its seed as a number, and where its jobs run: `jobs` of them at a time, on=
+    and slurm.NAME= as everywhere."""
+    engine, rest = jobs.taken(argv)
+    s = options(rest, defaults, **choices)
+    engine.at_once = engine.at_once or max(s["jobs"], 1)
+    if isinstance(s.get("seed"), str):
+        s["seed"] = seed_of(s["seed"])
+    return s, engine
+
+
 def turns(counts: dict[str, int]) -> list[Key]:
     """Return the cases of several sets in turn, so that what is done where a run ends early is a fair sample."""
     every = chain.from_iterable(zip_longest(*([(which, k) for k in range(n)] for which, n in counts.items())))
     return [key for key in every if key is not None]
 
 
-def each(work: Callable[[Any], Row | None], jobs: dict[Key, Any], log: Path, workers: int) -> list[Row]:
-    """Return the rows of the log, and those of work(job) of the cases that are not in it, as they come: each is added
-    to the log at once. A row states its `set` and `number`; None: there was no time for it."""
+def each(work: Callable[[Any], Row | None], cases: dict[Key, Any], log: Path, engine: jobs.Engine) -> list[Row]:
+    """Return the rows of the log, and those of work(case) of the cases that are not in it, which are added to the log.
+    A row states its `set` and `number`; None: there was no time for it."""
     log.parent.mkdir(parents=True, exist_ok=True)
     rows = [json.loads(x) for x in log.read_text(encoding="utf-8").splitlines()] if log.is_file() else []
     done = {(r["set"], r["number"]) for r in rows}
-    with ProcessPoolExecutor(max(workers, 1), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(work, job) for key, job in jobs.items() if key not in done]
-        for finished in tqdm(as_completed(waiting), "cases", len(waiting)):
-            row = finished.result()
-            if row is not None:
-                rows.append(row)
-                with log.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(row) + "\n")
+    with log.open("a", encoding="utf-8") as file:
+        for row in at_once(work, {f"{k[0]}_{k[1]}": x for k, x in cases.items() if k not in done}, log.parent, engine):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
     return rows
+
+
+def at_once(work: Callable[[Any], Any], given: dict[str, Any], out: Path, engine: jobs.Engine) -> Iterator[Any]:
+    """Yield what work(x) returned for each x of `given`, which are named; None is left out. Each is a job of its own,
+    with its folder in out/work. Where the run is ended early, those that were done still come. Raises UserError for
+    one that failed, when all have ended."""
+    module = sys.modules[work.__module__]
+    name = f"{module.__spec__.name if module.__spec__ else module.__name__}:{work.__name__}"
+    todo, place = [], out.resolve() / "work"
+    (place / "jobs").mkdir(parents=True, exist_ok=True)
+    for key, x in given.items():
+        asked, answer = place / "jobs" / f"{key}.pickle", place / key / "answer.json"
+        asked.write_bytes(pickle.dumps(x))
+        answer.unlink(missing_ok=True)
+        todo.append(jobs.Job(((name, str(asked), str(answer)),), place / key, PROGRAM))
+        todo[-1].note.unlink(missing_ok=True)  # where it was asked before, it is asked again
+    try:
+        status = jobs.run(todo, engine) if todo else []
+    finally:
+        answers = [job.folder / "answer.json" for job in todo]
+        found = [json.loads(path.read_text(encoding="utf-8")) for path in answers if path.is_file()]
+        yield from (x for x in found if x is not None)
+    for job, ended in zip(todo, status, strict=True):
+        if ended:
+            raise UserError(f"{job.folder.name} ended with status {ended}: see {job.note.with_suffix('.txt')}")
+
+
+def answer(argv: Sequence[str]) -> int:
+    """Run one job of `at_once`: function, file of what it is given, file for what it returns."""
+    module, _, name = argv[0].partition(":")
+    said = getattr(import_module(module), name)(pickle.loads(Path(argv[1]).read_bytes()))
+    Path(argv[2]).write_text(json.dumps(said, default=float), encoding="utf-8")
+    return 0
 
 
 def ask(
@@ -110,6 +155,11 @@ def diagnosed(code: Path, words: Sequence[str], out: Path, limit: float, ends: f
         for f in said["findings"]
     ]
     return {"verdict": said["verdict"], "findings": named, "seconds": took, "times": times_of(lines)}
+
+
+def sure_and_wrong(said: Row, hidden: Sequence[str]) -> bool:
+    """Return whether an answer names an effect that is not hidden, alone and confidently."""
+    return any(f[2] >= SURE and len(f[3]) < 2 and f[0] not in hidden for f in said["findings"])
 
 
 def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, float]]:

@@ -20,17 +20,8 @@ import numpy as np
 from benchmarks.options import options
 from dexsim.console.ending import guard
 
-DEFAULTS = {
-    "joints": "12",
-    "seconds": "60",
-    "device": "cpu",
-    "hidden": "true",
-    "recordings": "4",
-    "seed": "0",
-    "next": "false",
-    "replay": "mujoco",
-    "out": "",
-}
+DEFAULTS = {"joints": 12, "seconds": 60, "device": "cpu", "hidden": True, "recordings": 4, "seed": 0, "next": False,
+            "replay": "mujoco", "out": ""}  # fmt: skip
 
 
 def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool, seed: int) -> tuple[list[Path], str]:
@@ -91,9 +82,7 @@ def main(argv: list[str]) -> int:
         folder = Path(s["out"] or scratch)
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
-        paths, where = make(
-            folder, int(s["joints"]), float(s["seconds"]), int(s["recordings"]), s["hidden"] == "true", int(s["seed"])
-        )
+        paths, where = make(folder, s["joints"], s["seconds"], s["recordings"], s["hidden"], s["seed"])
         print(f"recordings made in {time.perf_counter() - start:.1f} s", flush=True)
         small, model, servo, _ = demo.make(folder / "warm", seconds=2.0)
         same = {"device": device, "replay": s["replay"]}
@@ -103,7 +92,7 @@ def main(argv: list[str]) -> int:
         diagnose(warm, say=lambda _: None)
         print(f"{device}: kernels ready in {time.perf_counter() - start:.1f} s", flush=True)
         start = time.perf_counter()
-        d = diagnose(Settings(paths, folder / "out", None, next_recording=s["next"] == "true", **same),
+        d = diagnose(Settings(paths, folder / "out", None, next_recording=s["next"], **same),
                      say=lambda text: print(text, flush=True))  # fmt: skip
         save(d, folder / "out")
         took = time.perf_counter() - start
@@ -111,11 +100,11 @@ def main(argv: list[str]) -> int:
     for stage, seconds in sorted(d.shares.items(), key=lambda x: -x[1]):
         print(f"{stage:<28}{seconds:8.2f} s {100 * seconds / total:6.1f} %")
     print(json.dumps({
-        "benchmark": "diagnose", "joints": int(s["joints"]), "recorded_s": float(s["seconds"]), "device": device,
+        "benchmark": "diagnose", "joints": s["joints"], "recorded_s": float(s["seconds"]), "device": device,
         "seconds": round(took, 2), "shares": {k: round(v / total, 4) for k, v in d.shares.items()},
         "verdict": d.data["verdict"],
         "found": [(f["effect"], f["where"]["joints"], f["confidence"]) for f in d.data["findings"]],
-        "hidden": ["coulomb_friction", where] if s["hidden"] == "true" else None,
+        "hidden": ["coulomb_friction", where] if s["hidden"] else None,
         "cpu": platform.processor() or platform.machine(), "cores": len(os.sched_getaffinity(0)),
     }), flush=True)  # fmt: skip
     return 0

@@ -20,14 +20,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import answers
-from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -45,10 +42,9 @@ def generate(plant: Path, wanted: Sequence[tuple[int, Sequence[int]]], out: Path
         shutil.copytree(plant, code, ignore=shutil.ignore_patterns("cases", "truth", "results"))
         # one case alone compiles the plant: every other process, of every seed, reads that from the cache
         _generate(code, wanted[0][0], [NULLS[0]], Path(scratch) / "compiled", 1)
-        folders = [Path(scratch) / f"seed_{seed}" for seed, _ in wanted]
-        with ThreadPoolExecutor(len(wanted)) as pool:
-            list(pool.map(lambda job: _generate(code, *job[0], job[1], jobs), zip(wanted, folders, strict=True)))
-        for folder in folders:
+        for seed, only in wanted:
+            folder = Path(scratch) / f"seed_{seed}"
+            _generate(code, seed, only, folder, jobs)
             for part in ("cases", "truth"):
                 (out / part).mkdir(parents=True, exist_ok=True)
                 for item in (folder / part).iterdir():
@@ -69,11 +65,10 @@ def _generate(code: Path, seed: int, only: Sequence[int], out: Path, jobs: int) 
         raise UserError(f"the plant's generator (seed {seed}) ended with {done.returncode}: {last}")
 
 
-def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
+def diagnose(job: tuple[Path, Path, int, int]) -> None:
     """Diagnose one case as a user would run it: without the recordings that the scorer keeps, from files that tell
-    nothing of the case."""
-    if (out / "run.json").is_file():
-        return
+    nothing of the case. job: folders of the case and of the answer, limit [s], threads."""
+    case, out, limit, threads = job
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
@@ -116,7 +111,6 @@ def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:
 
 
 def _names(truth: dict) -> set[str]:
-    """Return the effects that are a right name: the hidden ones, and what the scorer takes as well."""
     return {e["effect"] for e in truth["effects"]}
 
 
@@ -169,7 +163,7 @@ def table(truths: Sequence[dict], answers: dict[str, dict | None], seconds: dict
 
 def main(argv: Sequence[str]) -> dict | None:
     """Runs the benchmark; returns what the JSON line says, None where it is skipped."""
-    s = options(argv, SETTINGS)
+    s, engine = answers.asked(argv, SETTINGS)
     plant = Path(s["plant"]).expanduser().resolve()
     if not (plant / "generate.py").is_file():
         print(f"skipped: plant={plant} is not there (a plant by other hands, which is not part of dexsim)")
@@ -177,25 +171,21 @@ def main(argv: Sequence[str]) -> dict | None:
     if importlib.util.find_spec("numba") is None:
         print("skipped: the plant is compiled by numba, which is not installed (pip install numba)")
         return None
-    seed = answers.seed_of(s["seed"])
-    out, jobs = Path(s["out"]).expanduser().resolve() / f"seed_{seed}", s["jobs"]
+    seed = s["seed"]
+    out = Path(s["out"]).expanduser().resolve() / f"seed_{seed}"
     only = [int(x) for x in s["cases"].strip("[]").split(",") if x]
     if not (out / "made").is_file():
         print(f"making the cases of seed {seed} ...", flush=True)
         wanted: list[tuple[int, Sequence[int]]] = [(seed, only)]
         for k in range(0, s["nulls"], len(NULLS)):
             wanted.append((seed + 1 + k // len(NULLS), list(NULLS)[: s["nulls"] - k]))
-        generate(plant, wanted, out, jobs)
+        generate(plant, wanted, out, s["jobs"])
         (out / "made").write_text("", encoding="utf-8")
     ids = sorted(p.name for p in (out / "cases").iterdir())
     np.random.default_rng(seed).shuffle(ids)  # where it is ended early, what was done is a fair sample
-    with ThreadPoolExecutor(max(jobs, 1)) as pool:
-        work = [
-            pool.submit(diagnose, out / "cases" / i, out / "diagnoses" / i, s["limit"], s["threads"])
-            for i in ids
-        ]
-        for done in tqdm(as_completed(work), "diagnosed", len(work)):
-            done.result()
+    todo = [i for i in ids if not (out / "diagnoses" / i / "run.json").is_file()]
+    given = {i: (out / "cases" / i, out / "diagnoses" / i, s["limit"], s["threads"]) for i in todo}
+    list(answers.at_once(diagnose, given, out, engine))
     return report(plant, out)
 
 
@@ -213,22 +203,9 @@ def report(plant: Path, out: Path) -> dict:
     answers = {t["id"]: read(t["id"]) for t in truths}
     seconds = {t["id"]: json.loads((out / "diagnoses" / t["id"] / "run.json").read_text())["seconds"] for t in truths}
     (out / "table.md").write_text(table(truths, answers, seconds), encoding="utf-8")
-    score = subprocess.run(
-        [
-            sys.executable,
-            str(plant / "score.py"),
-            str(out / "truth"),
-            str(out / "diagnoses"),
-            "--cases",
-            str(out / "cases"),
-            "--ids",
-            ",".join(t["id"] for t in truths),
-            "--json",
-            str(out / "score.json"),
-        ],
-        capture_output=True,
-        text=True,
-    )
+    argv = [sys.executable, str(plant / "score.py"), str(out / "truth"), str(out / "diagnoses"), "--cases",
+            str(out / "cases"), "--json", str(out / "score.json"), "--ids", ",".join(t["id"] for t in truths)]
+    score = subprocess.run(argv, capture_output=True, text=True)
     (out / "score.txt").write_text(score.stdout + score.stderr, encoding="utf-8")
     print(score.stdout)
     line = {"benchmark": "foreign", "seed": truths[0]["seed"] if truths else None, **summary(truths, answers),

@@ -23,14 +23,12 @@ import sys
 import tarfile
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import hidden_drives
-from benchmarks.options import options
+from benchmarks import answers, hidden_drives
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -81,8 +79,9 @@ def name_of(model: Path) -> str:
     return re.sub(r"\W+", "_", f"{model.parent.name}_{model.stem}")
 
 
-def one(model: Path, s: dict[str, Any]) -> dict[str, Any]:
-    """Return what becomes of one hand: a row."""
+def one(job: tuple[Path, dict[str, Any]]) -> dict[str, Any]:
+    """Return what becomes of one hand: a row. job: its file, settings."""
+    model, s = job
     place = Path(s["out"]) / name_of(model)
     hand, file = place / "hand", place / "row.json"
     row: dict[str, Any] = {"hand": place.name, "file": model.name}
@@ -194,35 +193,24 @@ def sheet(rows: Sequence[dict[str, Any]], out: Path, path: Path) -> None:
 
 def main(argv: Sequence[str]) -> int:
     """Try every hand; print the table."""
-    s = options(argv, SETTINGS)
-    out, folder = Path(s["out"]), Path(s["folder"])
+    s, engine = answers.asked(argv, SETTINGS)
+    out, folder = Path(s["out"]).resolve(), Path(s["folder"])
+    s["out"] = str(out)
     out.mkdir(parents=True, exist_ok=True)
     models = [Path(p) for p in s["models"].split(",") if p]
     if not models and not folder.is_dir():
         raise UserError(f"folder={folder}: no such folder; folder=FOLDER of hands, or models=FILE,FILE")
     if unknown := set(s["steps"].split(",")) - set(STEPS):
         raise UserError(f"steps={s['steps']}: {', '.join(sorted(unknown))} is none of {', '.join(STEPS)}")
-    rows = []
-    with ThreadPoolExecutor(max(1, s["jobs"])) as pool:
-        for row in pool.map(lambda m: _alone(m, s), models or list(found(folder, out))):
-            rows.append(row)
-            print(table(rows[-1:]).splitlines()[2], flush=True)
-            (out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-            (out / "table.md").write_text(table(rows), encoding="utf-8")
+    given = {name_of(m): (m.resolve(), s) for m in models or found(folder, out)}
+    rows = list(answers.at_once(one, given, out, engine))
+    (out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    (out / "table.md").write_text(table(rows), encoding="utf-8")
     (out / "measurement.json").write_text(json.dumps(measurement(rows, argv), indent=1), encoding="utf-8")
     print("\n" + table(rows), end="")
     if s["page"]:
         page(rows, out, Path(s["page"]))
     return 0
-
-
-def _alone(model: Path, s: dict[str, Any]) -> dict[str, Any]:
-    """Return the row of a hand, made in another process where several are at once."""
-    if s["jobs"] > 1:
-        words = [f"{k}={s[k]}" for k in ("steps", "drops", "limit", "seed", "out")]
-        subprocess.run([sys.executable, "-m", "benchmarks.hands", f"models={model}", *words], stdout=subprocess.DEVNULL,
-                       check=False)  # fmt: skip
-    return one(model, s)
 
 
 PAGE = """\

@@ -18,19 +18,14 @@ and one of JSON.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
-import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from benchmarks.answers import seed_of_sources
-from benchmarks.options import options
+from benchmarks import answers
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -143,13 +138,10 @@ def score(truth: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
     return {"right": right, "verdict": diagnosis["verdict"], "said": said}
 
 
-def case(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
-    """Return a case's row: made, diagnosed in a process of its own, and scored; or read, where that was done."""
-    folder = out / str(number)
-    done = folder / "result.json"
-    if done.is_file():
-        return json.loads(done.read_text(encoding="utf-8"))
-    rng = np.random.default_rng([seed, number])
+def case(job: tuple[int, list[Path], int, int, Path]) -> dict[str, Any]:
+    """Return a case's row: made, diagnosed and scored. job: number, hands, seed, limit [s], folder."""
+    number, hands, seed, limit, out = job
+    folder, rng = out / str(number), np.random.default_rng([seed, number])
     for more in reversed(range(DRAWS)):
         try:
             truth = make(folder, hands[int(rng.integers(len(hands)))], rng)
@@ -158,62 +150,40 @@ def case(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> di
             if not more:
                 raise
             print(f"{number:>3} drawn again: {error}", flush=True)
-    row = {"number": number, **truth, **diagnosed(folder, truth, limit)}
-    done.write_text(json.dumps(row), encoding="utf-8")
-    return row
+    return {"set": "hidden_drives", "number": number, **truth, **diagnosed(folder, truth, limit)}
 
 
 def diagnosed(folder: Path, truth: dict[str, Any], limit: int) -> dict[str, Any]:
     """Return the score of `dexsim diagnose` on a folder of recordings, as a user would run it."""
-    fit, held = [[str(folder / f"{n}.mcap") for n in names] for names in (list(RECORDINGS)[:-1], list(RECORDINGS)[-1:])]
-    words = [f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", f"hand={truth['hand']}",
-             f"joints=[{','.join(truth['moved'])}]", f"servo={folder / 'servo.yaml'}", f"limit={limit}",
-             f"out={folder / 'diagnosis'}", "next=false"]  # fmt: skip
-    began = time.perf_counter()
-    with open(folder / "log.txt", "w", encoding="utf-8") as log:
-        subprocess.run([sys.executable, "-m", "dexsim", "diagnose", *words], stdout=log, stderr=subprocess.STDOUT,
-                       env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False)  # fmt: skip
-    file = folder / "diagnosis" / "diagnosis.json"
-    answer = {"verdict": "failed", "findings": []}  # counted, not dropped: no answer is a wrong one
-    if file.is_file():
-        answer = json.loads(file.read_text(encoding="utf-8"))
-    return {**score(truth, answer), "diagnosis_s": round(time.perf_counter() - began, 1)}
+    *fit, held = (str(folder / f"{n}.mcap") for n in RECORDINGS)
+    words = [f"recordings=[{','.join(fit)}]", f"held_out=[{held}]", f"hand={truth['hand']}",
+             f"joints=[{','.join(truth['moved'])}]", f"servo={folder / 'servo.yaml'}"]  # fmt: skip
+    took = answers.ask(words, folder / "diagnosis", limit)[1]
+    said = {"verdict": "failed", "findings": []}  # counted, not dropped: no answer is a wrong one
+    if (file := folder / "diagnosis" / "diagnosis.json").is_file():
+        said = json.loads(file.read_text(encoding="utf-8"))
+    return {**score(truth, said), "diagnosis_s": round(took, 1)}
 
 
 def main(argv: list[str]) -> int:
     """Run the cases; print a line of each, and how many were named."""
-    s = options(argv, SETTINGS)
+    s, engine = answers.asked(argv, SETTINGS)
     hands = [Path(h).resolve() for h in s["hands"].split(",") if h]
     if not hands:
         raise UserError("say which hands: hands=FOLDER,FOLDER (of dexsim import-hand)")
-    seed = seed_of_sources() if s["seed"] == "source" else int(s["seed"])
-    out = Path(s["out"]).resolve() / f"seed_{seed}"
-    rows = []
-    with ThreadPoolExecutor(max(1, s["jobs"])) as pool:
-        if s["jobs"] > 1:  # each case in a process of its own, to be made beside the others
-            ask = lambda n: _alone(n, hands, seed, s["limit"], out)  # noqa: E731
-        else:
-            ask = lambda n: case(n, hands, seed, s["limit"], out)  # noqa: E731
-        for row in pool.map(ask, range(s["cases"])):
-            rows.append(row)
-            print(f"{row['number']:>3} {'right' if row['right'] else 'WRONG'} {Path(row['hand']).name:<16}{row['kind']}"
-                  f" of {row['joint']}: {'; '.join(row['said']) or row['verdict']} ({row['diagnosis_s']:.0f} s)",
-                  flush=True)  # fmt: skip
+    seed, out = s["seed"], Path(s["out"]).resolve() / f"seed_{s['seed']}"
+    given = {("hidden_drives", n): (n, hands, seed, s["limit"], out) for n in range(s["cases"])}
+    rows = answers.each(case, given, out / "cases.jsonl", engine)
+    for row in rows:
+        print(f"{row['number']:>3} {'right' if row['right'] else 'WRONG'} {Path(row['hand']).name:<16}{row['kind']}"
+              f" of {row['joint']}: {'; '.join(row['said']) or row['verdict']} ({row['diagnosis_s']:.0f} s)",
+              flush=True)  # fmt: skip
     line = {"benchmark": "hidden_drives", "seed": seed, "cases": len(rows), "right": sum(r["right"] for r in rows)}
     line |= {kind: f"{sum(r['right'] for r in mine)} of {len(mine)}" for kind in KINDS
              if (mine := [r for r in rows if r["kind"] == kind])}  # fmt: skip
     print(json.dumps(line))
     (out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
     return 0
-
-
-def _alone(number: int, hands: list[Path], seed: int, limit: int, out: Path) -> dict[str, Any]:
-    """Return the same as `case`, made in another process."""
-    code = (f"from pathlib import Path; from benchmarks.hidden_drives import case; case({number},"
-            f" [Path(h) for h in {[str(h) for h in hands]!r}], {seed}, {limit},"
-            f" Path({str(out)!r}))")  # fmt: skip
-    subprocess.run([sys.executable, "-c", code], check=True)
-    return case(number, hands, seed, limit, out)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Any
 import torch
 
 from benchmarks import tools
+from benchmarks.options import options
 from benchmarks.tape import Tape
 from dexsim.cli import machine
 from dexsim.learning import checkpoint
@@ -173,21 +174,15 @@ def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict) -
 
 def main(argv: list[str]) -> dict:
     cuda = torch.cuda.is_available() and "device=cpu" not in argv
-    own, rest = tools.split(
-        argv,
-        {
-            "worlds": "4096,8192,16384,32768" if cuda else "64,128",
-            "iterations": "6" if cuda else "3",
-            "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"),
-            "settle": "120" if cuda else "40",
-        },
-    )
+    rest: list[str] = []
+    own = options(argv, {"worlds": "4096,8192,16384,32768" if cuda else "64,128", "iterations": 6 if cuda else 3,
+                         "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"), "settle": 120 if cuda else 40},
+                  rest)  # fmt: skip
     cfg = tools.config(rest)
     data = checkpoint.load(own["policy"], cfg["device"])
-    iterations, settle = tools.numbers(own["iterations"], "iterations")[0], tools.numbers(own["settle"], "settle")[0]
     out: dict = {"benchmark": "learning", **tools.about(cfg["device"]), "rows": []}
     for worlds in tools.numbers(own["worlds"], "worlds"):
-        row = measure(cfg, worlds, iterations, settle, data["actor"])
+        row = measure(cfg, worlds, own["iterations"], own["settle"], data["actor"])
         out["rows"].append(row)
         share = {k: row[f"{k}_s"] / row["iteration_s"] for k in ("physics", "rest_of_step", "inference", "update")}
         print(

@@ -26,10 +26,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
-DEFAULTS = {"gpus": "4", "nodes": "2", "gbit": ",10", "iterations": "20", "seconds": "150", "out": "out/machines"}
+DEFAULTS = {"gpus": 4, "nodes": 2, "gbit": ",10", "iterations": 20, "seconds": 150, "out": "out/machines"}
 PORT = 29471
 FIRST = 5
 """Iterations that are left out of rates: kernels and graphs are made."""
@@ -192,14 +193,14 @@ def computed(one: dict, free: dict, gbit: float) -> dict[str, object]:
 
 def main(argv: list[str]) -> int:
     """Run all, print and write out/machines.json."""
-    own = DEFAULTS | {a.partition("=")[0]: a.partition("=")[2] for a in argv if a.partition("=")[0] in DEFAULTS}
-    rest = [a for a in argv if a.partition("=")[0] not in DEFAULTS]
-    ranks, count = int(own["gpus"]), int(own["nodes"])
+    rest: list[str] = []
+    own = options(argv, DEFAULTS, rest)
+    ranks, count = own["gpus"], own["nodes"]
     if ranks % count:
         raise UserError(f"gpus={ranks}: must be a multiple of nodes={count}")
     devices = [] if "device=cpu" in rest else [str(k) for k in range(ranks)]
     settings = ["task=grasp", f"iterations={own['iterations']}", "final_episodes=0", "out=run", *rest]
-    out, end = Path(own["out"]).resolve(), time.perf_counter() + float(own["seconds"])
+    out, end = Path(own["out"]).resolve(), time.perf_counter() + own["seconds"]
     rates = [None if text == "" else float(text) for text in own["gbit"].split(",")]
     rows = []
     env = {"PYTHONPATH": os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p or p == "")}

@@ -8,14 +8,20 @@ from typing import Any
 from dexsim.errors import UserError
 
 
-def options(argv: Sequence[str], defaults: dict[str, Any], **choices: Sequence[str]) -> dict[str, Any]:
+def options(
+    argv: Sequence[str], defaults: dict[str, Any], others: list[str] | None = None, **choices: Sequence[str]
+) -> dict[str, Any]:
     """Return key=value arguments over their defaults, with the defaults' types; raises UserError naming the setting.
 
+    others: a list that takes what is no setting of the benchmark, for the command behind it (None: there is none).
     choices: by key, the texts that are allowed.
     """
     given = dict(defaults)
     for argument in argv:
         key, equals, text = argument.partition("=")
+        if others is not None and not (equals and key in defaults):
+            others.append(argument)
+            continue
         if not equals or key not in defaults:
             raise UserError(f"'{argument}' is not a setting; valid: {', '.join(defaults)} (key=value)")
         if isinstance(defaults[key], bool):

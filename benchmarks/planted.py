@@ -24,8 +24,7 @@ import numpy as np
 import yaml
 
 from benchmarks import answers
-from benchmarks.concealed import score
-from benchmarks.options import options
+from benchmarks.concealed import generate, score
 from dexsim.console.ending import guard
 
 TIERS = {"large": 16.0, "medium": 8.0, "small": 4.0}  # x the noise
@@ -105,15 +104,8 @@ def servo(b: Figures, effect: str) -> dict[str, Any]:
 def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
     """Return the targets sent at 100 Hz [K]: steps, ramps and a chirp, in another order by `kind`."""
     t = np.arange(0.0, SECONDS, 0.01)
-    knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 40)])
-    levels = np.r_[0.0, rng.uniform(-0.9, 0.9, len(knots) - 1)]
-    ramp, rise = np.interp(t, knots[::2], levels[::2]), rng.uniform(0.12, 0.3)
-    ends = np.sort(np.r_[knots[1:], knots[1:] + rise])
-    step = np.interp(t, ends, np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
-    f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.5, 3.0), len(t))
-    chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
-    parts = [[ramp, step, chirp], [chirp, ramp, step], [step, chirp, ramp], [ramp, chirp, step]][kind]
-    return np.choose(np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2), parts)
+    ramp, step, chirp = generate.courses(rng, t, 40, 0.9, (0.12, 0.3), (1.5, 3.0))
+    return generate.in_turn([[ramp, step, chirp], [chirp, ramp, step], [step, chirp, ramp], [ramp, chirp, step]][kind])
 
 
 def driven(folder: Path, b: Figures, effect: str, commands: Any) -> tuple[Any, Any]:
@@ -182,8 +174,8 @@ def case(job: tuple[int, dict[str, Any], Path, float]) -> dict[str, Any] | None:
         return None
     first = next(({"effect": f[0], "indistinguishable": f[3]} for f in said["findings"]), None)
     hidden = truth["effect"] != "none"
-    wrong = [f for f in said["findings"] if f[2] >= score.SURE and len(f[3]) < 2 and f[0] != truth["effect"]]
-    return {"set": "planted", "number": number, **truth, **said, "sure_and_wrong": bool(wrong),
+    return {"set": "planted", "number": number, **truth, **said,
+            "sure_and_wrong": answers.sure_and_wrong(said, [truth["effect"]]),
             "right": score.named_right(first, truth["effect"]) if hidden else first is None}  # fmt: skip
 
 
@@ -204,11 +196,11 @@ def table(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
 
 def main(argv: Sequence[str]) -> int:
     """Run the cases and print them; return the exit status."""
-    s = options(argv, SETTINGS)
-    s["seed"], ends = answers.seed_of(s["seed"]), time.time() + (s["until"] or 1e9)
+    s, engine = answers.asked(argv, SETTINGS)
+    ends = time.time() + (s["until"] or 1e9)
     out = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
     jobs = {("planted", k): (k, s, out, ends) for k in range(s["cases"])}
-    rows = answers.each(case, jobs, out / "cases.jsonl", s["jobs"])
+    rows = answers.each(case, jobs, out / "cases.jsonl", engine)
     for r in sorted(rows, key=lambda r: (r["effect"], r["times_noise"])):
         found = ", ".join(f"{f[0]} {f[2]:.2f}" for f in r["findings"][:3]) or "-"
         print(f"{r['number']:>4} {r['effect']:<20}{r['tier']:<8}{r['times_noise']:>6.1f} {' ' if r['right'] else '*'}"

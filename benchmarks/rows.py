@@ -24,9 +24,11 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import tools
+from benchmarks.options import options
 from dexsim.console import jobs
 from dexsim.errors import UserError
 
+SETTINGS = {"table": "", "rows": "", "seeds": "1,2", "gpus": "", "out": "out/rows", "judge": ""}
 OBSERVE, REWARD = "task.observe", "task.rewards"
 
 
@@ -159,9 +161,8 @@ def show(table: Table, found: dict[str, list[float]]) -> str:
 
 
 def main(argv: list[str]) -> dict[str, Any]:
-    own, settings = tools.split(
-        argv, {"table": "", "rows": "", "seeds": "1,2", "gpus": "", "out": "out/rows", "judge": ""}
-    )
+    settings: list[str] = []
+    own = options(argv, SETTINGS, settings)
     if own["table"] not in TABLES:
         raise UserError(f"table={own['table']}: must be {', '.join(TABLES)}")
     table = TABLES[own["table"]]

@@ -22,8 +22,8 @@ from typing import Any
 
 from benchmarks import answers
 from benchmarks.concealed import score
-from benchmarks.options import options
 from dexsim.console.ending import guard
+from dexsim.console.jobs import Engine
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
@@ -103,19 +103,12 @@ def right(row: dict[str, Any], version: str) -> bool:
     """Return whether the first name is a hidden effect or a set that holds one; where nothing is hidden, whether
     nothing is named; where what is hidden has no name in the catalogue, whether none is named confidently."""
     if row["kind"] == "outside":
-        return not sure_and_wrong(row, version)
+        return not answers.sure_and_wrong(row[version], row["hidden"])
     found = next((f for f in row[version]["findings"] if f[2] >= NAMED), None)
     if not row["hidden"]:
         return found is None
     finding = None if found is None else {"effect": found[0], "indistinguishable": found[3]}
     return any(score.named_right(finding, effect) for effect in row["hidden"])
-
-
-def sure_and_wrong(row: dict[str, Any], version: str) -> bool:
-    """Return whether an effect that is not hidden is named alone and confidently."""
-    return any(
-        f[2] >= score.SURE and len(f[3]) < 2 and f[0] not in row["hidden"] for f in row[version]["findings"]
-    )
 
 
 def told_right(rows: Sequence[dict[str, Any]], version: str) -> str:
@@ -140,9 +133,10 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
         n = len(these)
         same = sum(first(r["before"]) == first(r["after"]) for r in these)
         of = lambda test: [f"{sum(test(r, v) for r in these)} of {n}" for v in ("before", "after")]  # noqa: B023, E731
+        wrong = lambda r, v: answers.sure_and_wrong(r[v], r["hidden"])  # noqa: E731
         took = [f"{sorted(r[v]['seconds'] for r in these)[n // 2]:.0f}" for v in ("before", "after")]
         said = [told_right(these, v) for v in ("before", "after")]
-        lines.append((which, n, same, *of(right), *of(sure_and_wrong), *took, *said))
+        lines.append((which, n, same, *of(right), *of(wrong), *took, *said))
     head = ("set", "cases", "same first name", "right before", "after", "sure and wrong before", "after",
             "median s before", "after", "time left within a third before", "after")  # fmt: skip
     other = [r for r in rows if first(r["before"]) != first(r["after"])]
@@ -159,24 +153,24 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def run(work: Callable[[Any], dict[str, Any] | None], s: dict[str, Any], sets: Sequence[str], log: str) -> list:
+def run(work: Callable, s: dict[str, Any], engine: Engine, sets: Sequence[str], log: str) -> list[dict[str, Any]]:
     """Return the rows of work((set, number, settings, folder, end)) of the cases of several sets; see `answers.each`.
     Raises UserError for a setting that is none."""
     if s["foreign"] and not (Path(s["foreign"]) / "truth").is_dir():
         raise UserError(f"foreign={s['foreign']}: must be a folder with cases/ and truth/")
-    s["seed"], ends = answers.seed_of(s["seed"]), time.time() + (s["until"] or 1e9)
+    ends = time.time() + (s["until"] or 1e9)
     out = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
     there = len(list(Path(s["foreign"]).glob("truth/*.json"))) if s["foreign"] else 0
     turns = answers.turns({k: there if k == "foreign" else s[k] for k in sets})
-    return answers.each(work, {key: (*key, s, out, ends) for key in turns}, out / f"{log}.jsonl", s["jobs"])
+    return answers.each(work, {key: (*key, s, out, ends) for key in turns}, out / f"{log}.jsonl", engine)
 
 
 def main(argv: Sequence[str]) -> int:
     """Run both versions; return the exit status."""
-    s = options(argv, SETTINGS)
+    s, engine = answers.asked(argv, SETTINGS)
     if not (Path(s["before"]) / "diagnose.py").is_file():
         raise UserError(f"before={s['before']}: must be a folder of code (git worktree add FOLDER COMMIT)")
-    print("\n" + text_of(run(pair, s, SETS, "pairs")))
+    print("\n" + text_of(run(pair, s, engine, SETS, "pairs")))
     return 0
 
 

@@ -26,7 +26,6 @@ import numpy as np
 
 from benchmarks import answers, same_names
 from benchmarks.concealed import score
-from benchmarks.options import options
 from dexsim.console.ending import guard
 from dexsim.console.tables import table
 from dexsim.gap import posterior
@@ -154,7 +153,7 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Diagnose the cases, and print the table; return the exit status."""
-    print("\n" + text_of(same_names.run(case, options(argv, SETTINGS), SETS, "cases")))
+    print("\n" + text_of(same_names.run(case, *answers.asked(argv, SETTINGS), SETS, "cases")))
     return 0
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 
 from benchmarks import tools
+from benchmarks.options import options
 from benchmarks.tape import Tape
 from dexsim.tasks import make_env
 
@@ -61,11 +62,11 @@ def measure(env: Any, steps: int, rounds: int) -> dict[str, list[float]]:
 
 
 def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"steps": "", "rounds": "3"})
+    rest: list[str] = []
+    own = options(argv, {"steps": 0, "rounds": 3}, rest)
     cfg = tools.config(rest)
     device, worlds = cfg["device"], cfg["worlds"]
-    steps = tools.numbers(own["steps"] or ("40" if device.startswith("cuda") else "20"), "steps")[0]
-    rounds = tools.numbers(own["rounds"], "rounds")[0]
+    steps = own["steps"] or (40 if device.startswith("cuda") else 20)
     begin = time.perf_counter()
     env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
     action = torch.zeros(worlds, env.num_actions, device=device)
@@ -73,7 +74,7 @@ def main(argv: list[str]) -> dict:
     env.step(action)
     ready = time.perf_counter() - begin
     tools.close_hand(env)
-    times = measure(env, steps, rounds)
+    times = measure(env, steps, own["rounds"])
     bare, driven, touched, full, feel = (1e3 * statistics.median(t) for t in times.values())
     e, k = env.engine, env.decimation
     peaks = e.peaks()

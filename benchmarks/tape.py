@@ -19,7 +19,7 @@ class Tape:
         with wp.ScopedDevice(engine.device):
             self._tape = wp.zeros((length, 3, engine.n, engine.mjm.nv), dtype=engine.real)
             self._at = wp.zeros(1, dtype=int)
-        self._record, self._play, self._advance = _kernels(engine.real)
+        self._copy, self._advance = _kernels(engine.real)
         fields = (engine.wp_field("dof_damping"), engine.wp_field("dof_frictionloss"))
         self._args = [self._at, self._tape, engine.wp.qfrc_applied, *fields]
 
@@ -30,24 +30,25 @@ class Tape:
     def record(self) -> None:
         """Run the servo and keep what it wrote."""
         self._drive()
-        self._launch(self._record)
+        self._launch(False)
 
     def play(self) -> None:
         """Write what the servo wrote then."""
-        self._launch(self._play)
+        self._launch(True)
 
-    def _launch(self, kernel) -> None:
+    def _launch(self, playing: bool) -> None:
         e = self.engine
-        wp.launch(kernel, dim=(e.n, e.mjm.nv), inputs=self._args, device=e.device)
+        wp.launch(self._copy, dim=(e.n, e.mjm.nv), inputs=[playing, *self._args], device=e.device)
         wp.launch(self._advance, dim=1, inputs=[self._at], device=e.device)
 
 
 @cache
 def _kernels(real):
-    """(record, play, advance) for the engine's scalar type."""
+    """(copy, advance) for the engine's scalar type."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def record(
+    def copy(
+        playing: bool,
         at: wp.array(dtype=int),
         tape: wp.array4d(dtype=real),
         applied: wp.array2d(dtype=real),
@@ -56,26 +57,17 @@ def _kernels(real):
     ):
         w, d = wp.tid()
         t = wp.min(at[0], tape.shape[0] - 1)
-        tape[t, 0, w, d] = applied[w, d]
-        tape[t, 1, w, d] = damping[w, d]
-        tape[t, 2, w, d] = friction[w, d]
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def play(
-        at: wp.array(dtype=int),
-        tape: wp.array4d(dtype=real),
-        applied: wp.array2d(dtype=real),
-        damping: wp.array2d(dtype=real),
-        friction: wp.array2d(dtype=real),
-    ):
-        w, d = wp.tid()
-        t = wp.min(at[0], tape.shape[0] - 1)
-        applied[w, d] = tape[t, 0, w, d]
-        damping[w, d] = tape[t, 1, w, d]
-        friction[w, d] = tape[t, 2, w, d]
+        if playing:
+            applied[w, d] = tape[t, 0, w, d]
+            damping[w, d] = tape[t, 1, w, d]
+            friction[w, d] = tape[t, 2, w, d]
+        else:
+            tape[t, 0, w, d] = applied[w, d]
+            tape[t, 1, w, d] = damping[w, d]
+            tape[t, 2, w, d] = friction[w, d]
 
     @wp.kernel(module="unique", enable_backward=False)
     def advance(at: wp.array(dtype=int)):
         at[0] = at[0] + 1
 
-    return record, play, advance
+    return copy, advance

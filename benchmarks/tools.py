@@ -36,18 +36,6 @@ def command(main: Callable[[list[str]], object], about: str | None = None) -> No
     sys.exit(guard(run, sys.argv[1:], about))
 
 
-def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], list[str]]:
-    """Return (the benchmark's own settings, `own` being their defaults; what is left for train.py)."""
-    rest, values = [], dict(own)
-    for a in argv:
-        key, equals, value = a.partition("=")
-        if equals and key in own:
-            values[key] = value
-        else:
-            rest.append(a)
-    return values, rest
-
-
 def numbers(text: str, name: str) -> list[int]:
     """Return the whole numbers from "8192,16384"; raises UserError naming the setting."""
     try:
@@ -84,11 +72,6 @@ def about(device: str) -> dict[str, Any]:
         else f"{platform.machine()} CPU, {len(os.sched_getaffinity(0))} cores"
     )
     return {"device": name, "versions": machine.versions()}
-
-
-def load() -> float | None:
-    """Return programs that wanted a processor in the last minute, on average; None where the system does not say."""
-    return round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
 
 
 def wait(device: str) -> None:

@@ -21,9 +21,10 @@ import numpy as np
 import trimesh
 
 from benchmarks import tools
+from benchmarks.options import options
 from dexsim.errors import UserError
 
-OWN = {"checkpoint": "checkpoints/grasp.pt", "count": "16", "episodes": "512", "out": "out/unseen_shapes"}
+OWN = {"checkpoint": "checkpoints/grasp.pt", "count": 16, "episodes": 512, "out": "out/unseen_shapes"}
 LONGEST = (0.075, 0.090)  # m: 60 mm by the scales 1.25 to 1.5, as the library's are in training
 RATIO = (0.55, 1.0)  # of the other two extents to it: wedge 0.57, sphere 1
 EXPONENT = (0.2, 1.8)  # of a superellipsoid: 0 a box, 1 an ellipsoid, 2 an octahedron
@@ -87,9 +88,10 @@ def said(metrics: dict, key: str) -> str:
 
 
 def main(argv: list[str]) -> None:
-    own, extra = tools.split(argv, OWN)
+    extra: list[str] = []
+    own = options(argv, OWN, extra)
     checkpoint, out = Path(own["checkpoint"]).expanduser().absolute(), Path(own["out"]).expanduser().absolute()
-    seed, count = seed_of(checkpoint), tools.numbers(own["count"], "count")[0]
+    seed, count = seed_of(checkpoint), own["count"]
     paths = generate(seed, count, out / "shapes")
     print(f"{count} shapes of seed {seed:016x}: {out / 'shapes'}", flush=True)
     command = [sys.executable, "play.py", f"checkpoint={checkpoint}", f"episodes={own['episodes']}", "video=false",

@@ -22,6 +22,7 @@ import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks import tools
+from benchmarks.options import options
 from dexsim import rotation
 from dexsim.sim.launches import Launches
 from dexsim.tasks import make_env
@@ -125,8 +126,8 @@ def count(env: Any, actions: torch.Tensor) -> dict[str, Counter[str]]:
 
 
 def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"lines": "25"})
-    shown = tools.numbers(own["lines"], "lines")[0]
+    rest: list[str] = []
+    shown = options(argv, {"lines": 25}, rest)["lines"]
     cfg = tools.config(["device=cpu", "worlds=4", "sim.engine=warp", *rest])
     env = make_env(cfg, cfg["worlds"], "cpu", 0, "warp")
     found = count(env, torch.zeros(env.num_envs, env.num_actions))

@@ -36,6 +36,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks import tools
+from benchmarks.options import options
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
@@ -388,9 +389,10 @@ def spread(x: np.ndarray) -> dict[str, float]:
 
 
 def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"poses": "100000", "out": "", "kinds": ",".join(KINDS)})
+    rest: list[str] = []
+    own = options(argv, {"poses": 100000, "out": "", "kinds": ",".join(KINDS)}, rest)
     cfg = tools.config(rest)
-    n = tools.numbers(own["poses"], "poses")[0]
+    n = own["poses"]
     kinds = own["kinds"].split(",")
     if set(kinds) - set(KINDS):
         raise UserError(f"kinds={own['kinds']}: must be of {', '.join(KINDS)}")

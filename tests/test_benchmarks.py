@@ -12,6 +12,7 @@ from worlds import grasp_env
 
 from benchmarks import machines, tools
 from benchmarks.learning import Bare
+from benchmarks.options import options
 from benchmarks.tape import Tape
 from dexsim.errors import UserError
 
@@ -101,7 +102,7 @@ def test_numbers_and_settings_are_split():
     assert tools.numbers("8, 16", "worlds") == [8, 16]
     with pytest.raises(UserError, match="worlds=8,x"):
         tools.numbers("8,x", "worlds")
-    assert tools.split(["a=1", "b=2", "c"], {"a": "0"}) == ({"a": "1"}, ["b=2", "c"])
+    assert options(["a=1", "b=2", "c"], {"a": 0}, rest := []) == {"a": 1} and rest == ["b=2", "c"]
 
 
 def test_what_a_cable_costs_by_hand():

@@ -496,11 +496,11 @@ def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, mon
     """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong
     answer."""
     (tmp_path / "diagnose.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(60)\n")
-    ask, begun = answers.ask, command.time.perf_counter()
+    ask, begun = answers.ask, command.time.time()
     monkeypatch.setattr(answers, "ask", lambda *a: ask(*a, code=tmp_path))
     for name, limit, until in (("late", 100, 0.5), ("slow", 0.4, 0)):
         s = {"budget": 0, "until": until, "limit": limit, "braking": "unsaid"}
-        command._diagnose({"name": name, "digest": ""}, s, tmp_path, begun)
+        command.diagnose((name, s, tmp_path, begun))
     assert not (tmp_path / "diagnoses" / "late" / "seconds").exists()
     slow = tmp_path / "diagnoses" / "slow"
     assert json.loads((slow / "diagnosis.json").read_text())["verdict"] == "failed"
@@ -514,19 +514,11 @@ def test_the_first_cases_of_a_set_are_those_of_the_whole(monkeypatch, tmp_path):
     class Ended(Exception):
         pass
 
-    class Pool:
-        def __init__(self, *_, **__): ...
+    def at_once(work, given, out, engine):
+        built.append(list(given.values()))
+        raise Ended
 
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_): ...
-
-        def map(self, _, jobs):
-            built.append(list(jobs))
-            raise Ended
-
-    monkeypatch.setattr(command, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(answers, "at_once", at_once)
     for more in ([], ["first=5"]):
         with pytest.raises(Ended):
             command.main(["mix=effect:8,none:4", "seed=3", f"out={tmp_path}", *more])

@@ -124,11 +124,10 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
 
 @pytest.mark.slow
 def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
-    from benchmarks.real.common import dump, save
+    from benchmarks.real.common import rig, save
     from dexsim.gap.diagnosis import Settings, diagnose
 
     model, made = arm(), []
-    (tmp_path / "arm.xml").write_text(ARM)
     believed = {
         "kp": 80.0,
         "kd": 3.0,
@@ -136,7 +135,7 @@ def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
         "coulomb_friction": "unknown",
         "viscous_friction": "unknown",
     }
-    servo = dump(tmp_path / "arm.yaml", {"drive": "torque", "joints": {"*": believed}})
+    _, servo = rig(tmp_path, "arm", ARM, {"drive": "torque", "joints": {"*": believed}})
     for k in range(3):
         r = run(model, k, pushed=shove if k == 1 else None)
         cmd = r.q + (r.torque + 3.0 * np.gradient(r.q, r.t, axis=0)) / 80.0

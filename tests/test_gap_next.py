@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import press_rig
 import pytest
 from test_gap import demo, model, plant_run
 
-from benchmarks import press_rig
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CLASSES, EFFECTS, members, separating

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import press_rig
 import pytest
 from browser import CHROMIUM, Page
 
-from benchmarks import press_rig
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.finding import Finding, gathered

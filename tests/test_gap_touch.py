@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import press_rig
 import pytest
 
-from benchmarks import press_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
 from dexsim.gap.finding import Finding

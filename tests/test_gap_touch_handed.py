@@ -6,13 +6,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import press_rig
 import pytest
 import torch
 import yaml
 from bundles import make_checkpoint
 from worlds import grasp_cfg, grasp_env, task_cfg
 
-from benchmarks import press_rig
 from dexsim.assets import xhand
 from dexsim.cli import help as help_page
 from dexsim.cli import start

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import press_rig
 import pytest
 
-from benchmarks import press_rig
 from dexsim.errors import UserError
 from dexsim.gap.touch import diagnosis
 from dexsim.gap.touch import plant as touch_plant

@@ -43,8 +43,8 @@ def test_a_fingers_run_becomes_clips_of_whole_cycles_with_the_duty_as_command(tm
         for name in names:
             finger(tmp_path, name, dead=name == "thumb1")
     made = convert_ergocub.convert(tmp_path, tmp_path / "out")
-    assert len(made.runs["thumb1"]) == 1 and len(made.runs["middle"]) >= 2
-    r = read(made.runs["middle"][0])
+    assert len(made.groups["thumb1"]) == 1 and len(made.groups["middle"]) >= 2
+    r = read(made.groups["middle"][0])
     duty = np.asarray(r.commands.value)[:, 0] * convert_ergocub.PER_DUTY
     assert set(np.round(np.unique(duty), 3)) == {-0.3, 0.3}
     q, t = r.states.position.value[:, 0], r.states.position.t
@@ -106,7 +106,7 @@ def test_the_pandas_plain_least_squares_reads_off_a_friction(tmp_path):
     found = convert_panda.plain(tmp_path)
     assert all(x["coulomb"] == pytest.approx(0.4, abs=0.03) for x in found.values())
     made = convert_panda.convert(tmp_path, tmp_path / "out")
-    assert read(made.recording).joints == convert_panda.JOINTS
+    assert read(made.recordings[0]).joints == convert_panda.JOINTS
 
 
 def test_absent_data_is_a_line_and_no_error(tmp_path, monkeypatch, capsys):

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from benchmarks import answers, same_names
+from dexsim.console.jobs import Engine
 from dexsim.errors import UserError
 
 
@@ -16,6 +17,10 @@ def said(*findings, verdict="explained", seconds=10.0, times=()):
 
 def row(before, after, hidden=("backlash",), kind="effect", which="concealed", number=0):
     return {"set": which, "number": number, "kind": kind, "hidden": list(hidden), "before": before, "after": after}
+
+
+def wrong(row, version):
+    return answers.sure_and_wrong(row[version], row["hidden"])
 
 
 PLAY = ("backlash", ["elbow"], 0.9, [])
@@ -34,10 +39,10 @@ def test_right_and_sure():
     lag = ("lag", ["elbow"], 0.9, [])
     case = row(said(PLAY), said(lag))
     assert same_names.right(case, "before") and not same_names.right(case, "after")
-    assert same_names.sure_and_wrong(case, "after") and not same_names.sure_and_wrong(case, "before")
+    assert wrong(case, "after") and not wrong(case, "before")
     # a set of one class that holds it is right and not sure
     both = row(said(("coulomb_friction", ["elbow"], 0.9, ["coulomb_friction", "backlash"])), said())
-    assert same_names.right(both, "before") and not same_names.sure_and_wrong(both, "before")
+    assert same_names.right(both, "before") and not wrong(both, "before")
     nothing = row(said(), said(lag), hidden=(), kind="none")
     assert same_names.right(nothing, "before") and not same_names.right(nothing, "after")
     # what is in no catalogue: named with doubt is no error, named confidently is one
@@ -52,6 +57,16 @@ def test_the_time_left_is_held_against_what_was_left():
     assert times == [(2.0, 0.2, 9.0), (8.0, 0.5, 9.0), (12.0, 1.0, 0.0)]
     assert same_names.told_right([row(said(times=times), said())], "before") == "1 of 2"
     assert answers.times_of(lines[:2]) == []  # nobody knows how long it would have taken
+
+
+def test_each_case_is_a_job_of_its_own(tmp_path):
+    ask = lambda *seeds: answers.at_once(answers.seed_of, dict(zip("ab", seeds)), tmp_path, Engine(at_once=2))  # noqa: E731
+    assert list(ask("7", "8")) == [7, 8]
+    got = []
+    with pytest.raises(UserError, match="b ended with status 2: see .*b.txt"):
+        for x in ask("9", "none"):  # asked again; what was done comes, whatever became of the others
+            got.append(x)
+    assert got == [9] and "error: seed=none: must be" in (tmp_path / "work" / "jobs" / "b.txt").read_text()
 
 
 def test_what_both_have_answered_is_not_run_again(tmp_path, monkeypatch, capsys):

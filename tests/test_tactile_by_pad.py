@@ -228,9 +228,8 @@ def test_a_delay_between_two_readings_lies_between_them():
 def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the
     counts."""
+    import press_rig
     from test_gap_touch import collected
-
-    from benchmarks import press_rig
 
     pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 2 / 90}}
     paths = press_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})

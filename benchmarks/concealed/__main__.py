@@ -21,17 +21,14 @@ from __future__ import annotations
 import json
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 import yaml
-from tqdm import tqdm
 
 from benchmarks import answers
 from benchmarks.concealed import generate, laws, score
-from benchmarks.options import options
 from dexsim.console.ending import guard
+from dexsim.console.jobs import Engine
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 
@@ -41,25 +38,27 @@ SETTINGS = {"mix": "", "seed": "1", "laws": "two", "out": "out/concealed", "jobs
 CI = {"effect": 2, "none": 1, "pair": 1, "outside": 1, "decoy": 1}
 
 
-def parse(argv: list[str]) -> dict:
-    """Return the settings; raises UserError for one that does not exist or has a value that is not allowed."""
-    given = options(argv, SETTINGS, laws=laws.LAWS, braking=("said", "unsaid"))
+def parse(argv: list[str]) -> tuple[dict, Engine]:
+    """Return settings and engine; raises UserError for a setting that does not exist or has a value that is not
+    allowed."""
+    given, engine = answers.asked(argv, SETTINGS, laws=laws.LAWS, braking=("said", "unsaid"))
     pairs = [part.partition(":")[::2] for part in given["mix"].split(",") if part]
     if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
         raise UserError(f"mix={given['mix']}: must read like effect:14,none:4, groups of {', '.join(generate.MIX)}")
     given["mix"] = {group: int(number) for group, number in pairs} or dict(generate.MIX)
-    given["seed"] = answers.seed_of(given["seed"])
     if given["ci"]:
         given["mix"] = dict(CI)
-    return given
+    return given, engine
 
 
-def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
-    """Runs `diagnose.py` on a case as a user would, unless it was done before or the budget is spent."""
-    case, out = root / "cases" / m["name"], root / "diagnoses" / m["name"]
-    if (out / "seconds").is_file() or _spent(s, begun):
+def diagnose(job: tuple[str, dict, Path, float]) -> None:
+    """Run `diagnose.py` on a case as a user would, unless the budget is spent. job: the case's name, settings, folder,
+    begin of the run [s since the epoch]."""
+    name, s, root, begun = job
+    case, out = root / "cases" / name, root / "diagnoses" / name
+    if s["budget"] and time.time() - begun > s["budget"]:
         return
-    room = max(s["until"] - (time.perf_counter() - begun), 1.0) if s["until"] else 1e9
+    room = max(s["until"] - (time.time() - begun), 1.0) if s["until"] else 1e9
     out.mkdir(parents=True, exist_ok=True)
     servo = _with_braking(case, out) if s["braking"] == "said" else None
     status, spent, _ = answers.ask(generate.words(case, servo), out, s["limit"], room)
@@ -86,14 +85,10 @@ def _with_braking(case: Path, out: Path) -> Path:
     return out / "servo_said.yaml"
 
 
-def _spent(s: dict, begun: float) -> bool:
-    return bool(s["budget"]) and time.perf_counter() - begun > s["budget"]
-
-
 def main(argv: list[str]) -> dict:
     """Runs the benchmark; returns what the JSON line says."""
-    s = parse(argv)
-    begun = time.perf_counter()
+    s, engine = parse(argv)
+    begun = time.time()
     whose = None if s["hand"] == "xhand" and not s["mirror"] else load_hand(s["hand"], s["mirror"])
     name = f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}{'_' + whose.robot if whose else ''}"
     name += "_said" if s["braking"] == "said" else ""
@@ -107,17 +102,16 @@ def main(argv: list[str]) -> dict:
     # the hand's first: they take longest, and the run's end would cut them off. Else in the order of the plan, which is
     # drawn: where the budget ends the run, what was done is a fair sample of each
     jobs.sort(key=lambda job: -len(job[0]["kinds"]) - 1 if job[0]["shape"] == "hand" else 0)
-    with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
-        made = list(tqdm(pool.map(generate.once, jobs), "made", len(jobs)))
+    new = {str(job[1]): job for job in jobs if not generate.stub(root, job[1]).is_file()}
+    list(answers.at_once(generate.once, new, root / "making", engine))
+    made = [generate.once(job) for job in jobs]
     (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made,
                                                                                              key=lambda m: m["name"])),
                                                                                              encoding="utf-8")
     print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}",
           flush=True)
-    with ThreadPoolExecutor(max(s["jobs"], 1)) as pool:
-        waiting = [pool.submit(_diagnose, m, s, root, begun) for m in made]
-        for done in tqdm(as_completed(waiting), "diagnosed", len(waiting)):
-            done.result()
+    names = [m["name"] for m in made if not (root / "diagnoses" / m["name"] / "seconds").is_file()]
+    list(answers.at_once(diagnose, {name: (name, s, root, begun) for name in names}, root, engine))
     results, seconds = [], []
     for m in made:
         folder = root / "diagnoses" / m["name"]
@@ -136,7 +130,7 @@ def main(argv: list[str]) -> dict:
     line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "left_out": len(made) - len(results),
             "failed": sum(r["verdict"] == "failed" for r in results),
             "seconds_median": sorted(seconds)[len(seconds) // 2] if seconds else None,
-            "wall_s": round(time.perf_counter() - begun), "lines": lines}  # fmt: skip
+            "wall_s": round(time.time() - begun), "lines": lines}  # fmt: skip
     print(json.dumps(line))
     return line
 

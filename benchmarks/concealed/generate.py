@@ -130,24 +130,31 @@ def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
             if poor:  # slow and small: hardly anything shows
                 c = rng.uniform(-0.1, 0.1) + 0.06 * np.sin(2 * np.pi * rng.uniform(0.1, 0.2) * t)
             else:
-                knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 60)])
-                levels = np.r_[0.0, calm * rng.uniform(-0.8, 0.8, len(knots) - 1)]
-                # steps as a planner sends them: a drive that saturates all the time hides the rest
-                rise = rng.uniform(0.15, 0.35) / calm
-                step = np.interp(
-                    t,
-                    np.sort(np.r_[knots[1:], knots[1:] + rise]),
-                    np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]],
-                )
-                f = np.linspace(rng.uniform(0.15, 0.3), calm * rng.uniform(1.2, 2.5), len(t))
-                chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
-                ramp = np.interp(t, knots[::2], levels[::2])
-                parts = [ramp, step, chirp]
-                third = np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2)
-                c = np.choose(third, [parts[(k + j + i) % 3] for i in range(3)])
+                parts = courses(rng, t, 60, 0.8, (0.15, 0.35), (1.2, 2.5), calm)
+                c = in_turn([parts[(k + j + i) % 3] for i in range(3)])
             middle, half = 0.5 * (d.low[j] + d.high[j]), 0.5 * (d.high[j] - d.low[j])
             out[k, j] = np.repeat(middle + half * c / 0.8, 10)[:M]
     return out
+
+
+def courses(
+    rng: np.random.Generator, t: np.ndarray, count: int, most: float, rise: tuple, top: tuple, calm: float = 1.0
+) -> list[np.ndarray]:
+    """Return targets [T] at t [T] s, every 10 ms, that go along ramps, in steps, and as a chirp. count: of steps; most:
+    how far they go; rise [s]: how long one takes, as a planner sends it (a drive that saturates all the time hides the
+    rest); top [Hz]: where the chirp ends; calm: below 1, all is less and slower."""
+    knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, count)])
+    levels = np.r_[0.0, calm * rng.uniform(-most, most, len(knots) - 1)]
+    ends = np.sort(np.r_[knots[1:], knots[1:] + rng.uniform(*rise) / calm])
+    step = np.interp(t, ends, np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
+    f = np.linspace(rng.uniform(0.15, 0.3), calm * rng.uniform(*top), len(t))
+    chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
+    return [np.interp(t, knots[::2], levels[::2]), step, chirp]
+
+
+def in_turn(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the first third of the first part, the second of the second, the third of the third."""
+    return np.choose(np.minimum((3 * np.arange(len(parts[0])) / len(parts[0])).astype(int), 2), parts)
 
 
 class Bench:
@@ -499,17 +506,21 @@ def _record(
                     w.add_temperature(x, np.round(heat[:, i]))
 
 
+def stub(root: Path, number: int) -> Path:
+    """Return the file that says that a case is made, and what `once` returns of it."""
+    return root / "made" / f"{number}.json"
+
+
 def once(job: tuple[dict, int, int, Path, str]) -> dict:
     """{name, digest, settings}: the case as it was made before, or made now. job: entry of the plan, number, seed,
     folder, laws."""
     entry, number, seed, root, which = job
-    stub = root / "made" / f"{number}.json"
-    if not stub.is_file():
+    if not (file := stub(root, number)).is_file():
         make = touch_cases.build if entry["shape"] == "touch" else build
         made = make(entry, number, seed, root / "cases", root / "truth", which)
-        stub.parent.mkdir(parents=True, exist_ok=True)
-        stub.write_text(json.dumps(made), encoding="utf-8")
-    return json.loads(stub.read_text(encoding="utf-8"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(made), encoding="utf-8")
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
 def commit(answer: dict, folder: Path) -> str:

@@ -138,10 +138,8 @@ SECOND: dict[str, Law] = {
     "stribeck": Law("exp(-(|v|/vs)^2)", "exp(-|v|/vs)", _with("stribeck", peak_power=1.0),
                     own=lambda L, n, o: np.exp(-np.abs(L["speed"]) / n["peak_speed"]) * np.abs(L["slip"])),
     "viscous": Law("c v", "c v / (1 + |v|/v0), grease that thins", lambda p, s, u, i: {"shear": 0.4 * s * u}, _viscous),
-    "load": Law("f |load|", "f |load|^(2/3)", lambda p, s, u, i: KINDS["load"].apply(p, s, u, i)
-                | {"load_power": 2 / 3, "load_unit": u}, _load),
-    "load_one_way": Law("f |load|", "f |load|^(2/3)", lambda p, s, u, i: KINDS["load_one_way"].apply(p, s, u, i)
-                        | {"load_power": 2 / 3, "load_unit": u}, _load),
+    **{kind: Law("f |load|", "f |load|^(2/3)", lambda p, s, u, i, kind=kind: KINDS[kind].apply(p, s, u, i)
+                 | {"load_power": 2 / 3, "load_unit": u}, _load) for kind in ("load", "load_one_way")},
     "backlash": Law("damped impacts", "rebounding teeth", _with("backlash", impact=0.1)),
     "compliance": Law("k d", "k d (1 + (k d / h)^2), hardening", lambda p, s, u, i:
                       KINDS["compliance"].apply(p, s, u, i) | {"hardening": 1.5 * u}, _stiffness),

@@ -228,11 +228,7 @@ def _hand(rng: np.random.Generator, which: dict | None) -> Drawn:
             spread[c, d] = turn @ np.diag(model.body_inertia[b] / model.body_mass[b]) @ turn.T
             names[j], place[j], mass[j] = model.joint(j).name, (c, d), model.body_mass[b]
     rig = Rig(tuple(names), place, frame, offset, axis, com, spread, np.array([0, 0, -9.81]))
-    table = m.table.resolve(names) if hasattr(m.table, "resolve") else None
-    from dexsim.actuator.columns import INDEX
-
-    column = lambda key: (table[:, INDEX[key]] if table is not None else m.column(key)).astype(float)  # noqa: E731
-    dof = model.jnt_dofadr
+    column, dof = lambda key: m.column(key).astype(float), model.jnt_dofadr
     b = {"mass": mass, "rotor": model.dof_armature[dof].copy(), "kp": column("kp"), "kd": column("kd"),
          "torque_limit": column("torque_limit"),
          "no_load_speed": column("no_load_speed"), "coulomb": column("coulomb_friction"),

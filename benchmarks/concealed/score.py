@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.answers import SURE
 from benchmarks.concealed import laws, touch_cases
 from dexsim import intervals
 
-SURE = 0.8  # a name is confident from here, when it stands alone
 LEAST = (0.5, SURE)  # confidences that a name may be asked for
 TIERS = ("easy", "medium", "hard")
 CLASSES = tuple(
@@ -25,14 +24,6 @@ CLASSES = tuple(
     )
 )  # fmt: skip
 """Effects that recordings may fail to separate: a set within one of them, of three at most, may be an answer."""
-
-
-def bootstrap(values: list[float], statistic: Callable, count: int = 2000) -> tuple[float, float]:
-    """Return 95 % interval of a statistic of `values` by resampling; (nan, nan) without any."""
-    if not values:
-        return math.nan, math.nan
-    low, high = intervals.bootstrap(*intervals.of_rows(np.asarray(values), statistic), 0, count)
-    return float(low), float(high)
 
 
 def named_right(finding: dict | None, effect: str) -> bool:
@@ -57,11 +48,6 @@ TRAIN = ("a", "b", "c")
 
 def _f1(hits: int, said: int, true: int) -> float:
     return 2 * hits / (said + true) if said + true else 1.0
-
-
-def _holds(f: dict, effect: str) -> bool:
-    """Return whether a finding names the effect, alone or in an allowed set."""
-    return named_right(f, effect)
 
 
 def overlap(finding: dict, truth: list[list], step: float = 1e-3, seconds: float = 60.0) -> float:
@@ -152,7 +138,8 @@ def one(truth: dict, d: dict) -> dict:
         return [e["joint"], *e["also"]]
 
     def right_here(f: dict, e: dict) -> bool:
-        return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
+        joints = f["where"]["joints"]
+        return named_right(f, e["effect"]) and (not joints or any(j in joints for j in ends(e)))
 
     group = truth["group"]
     inside = group in ("effect", "pair") or (group in ("hand", "large", "touch", "spatial") and effects)
@@ -221,11 +208,11 @@ def rate(values: list) -> dict | None:
 
 
 def middle(values: list, statistic: Callable) -> dict | None:
-    """Return {value, low, high, n} of a statistic; None without cases."""
+    """Return {value, low, high, n} of a statistic, with its 95 % interval by resampling; None without cases."""
     if not values:
         return None
-    low, high = bootstrap(values, statistic)
-    return {"value": float(statistic(values)), "low": low, "high": high, "n": len(values)}
+    low, high = intervals.bootstrap(*intervals.of_rows(np.asarray(values), statistic), 0, 2000)
+    return {"value": float(statistic(values)), "low": float(low), "high": float(high), "n": len(values)}
 
 
 def alone_at(r: dict, least: float) -> bool:

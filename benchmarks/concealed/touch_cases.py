@@ -20,15 +20,6 @@ SECONDS, LSB, NOISE, SIZES = 8.0, 0.1, 0.02, 14
 FINGERS = ("index", "mid", "ring", "pinky")
 
 
-def _relaxed(f: np.ndarray, time_constant: float) -> np.ndarray:
-    """Return the force [M] as the rubber's slow branch follows it."""
-    a, state, out = np.exp(-1e-3 / time_constant), 0.0, np.empty_like(f)
-    for i, x in enumerate(f):
-        state = a * state + (1 - a) * x
-        out[i] = state
-    return out
-
-
 @dataclass(frozen=True)
 class TouchKind:
     """effect: id of the catalogue; span: sizes; apply(p, s): parameters that change; report(new): {key: value}; own(f,
@@ -41,12 +32,17 @@ class TouchKind:
     own: object
 
 
+def _relaxing(p: dict[str, float], f: np.ndarray) -> np.ndarray:
+    """Return what the branches add [M] to a force f [M]; see `touch.relaxing`."""
+    return touch.relaxing(p, f[:, None])[:, 0]
+
+
 KINDS: dict[str, TouchKind] = {
     "pad_gain": TouchKind("tactile_gain", (0.06, 0.8), lambda p, s: {"gain": p["gain"] * (1 - s)},
                           lambda n: {"gain": n["gain"]}, lambda f, n: f),
     "hysteresis": TouchKind("tactile_hysteresis", (0.02, 1.5), lambda p, s: {"fraction": s},
                             lambda n: {"fraction": n["fraction"], "time_constant": n["time_constant"]},
-                            lambda f, n: np.abs(f - _relaxed(f, n["time_constant"]))),
+                            lambda f, n: np.abs(_relaxing(n | {"fraction": 1.0, "branches": 1.0}, f))),
     "crosstalk": TouchKind("tactile_crosstalk", (0.02, 0.6), lambda p, s: {"crosstalk": s},
                            lambda n: {"fraction": n["crosstalk"]}, lambda f, n: f),
     "touch_delay": TouchKind("tactile_delay", (0.003, 0.2), lambda p, s: {"delay": s}, lambda n: {"delay": n["delay"]},
@@ -71,7 +67,7 @@ class TouchLaw:
 def _one_branch(pad: touch.Pad, force: list[np.ndarray], n: dict) -> dict[str, float]:
     """Return the fraction and time constant of the one branch that adds most nearly what the two add in the recorded
     force."""
-    of = lambda p: np.concatenate([touch.relaxing(p, f[:, None])[:, 0] for f in force])  # noqa: E731
+    of = lambda p: np.concatenate([_relaxing(p, f) for f in force])  # noqa: E731
     truth = of(n)
     best = (np.inf, 0.0, 0.0)
     for time_constant in np.geomspace(n["time_constant"] / 10, n["time_constant"] * 1.2, 50):
@@ -156,34 +152,29 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     own_gain = 1 + rng.uniform(-0.02, 0.02, len(pad.areas))
     cache: dict[float, list] = {}
 
+    def felt(p: dict, q: np.ndarray, f: np.ndarray) -> np.ndarray:
+        return touch.readings(pad, p, q, f) * own_gain
+
     def run(p: dict) -> list[tuple]:
         """Return (positions, force, readings) of every recording."""
         if p["stiffness"] not in cache:
             cache[p["stiffness"]] = [touch.move(pad, p, c) for c in commands]
-        return [(q, f, touch.readings(pad, p, q, f) * own_gain) for q, f in cache[p["stiffness"]]]
+        return [(q, f, felt(p, q, f)) for q, f in cache[p["stiffness"]]]
 
     stack = lambda r: np.stack([x[2][::11] for x in r])  # noqa: E731
     nominal = run(true)
     base = stack(nominal)
     kind = KINDS.get(entry["kinds"][0]) if entry["kinds"] else None
-    slopes, widths = [], []
+    slopes = []
     for k, width in REFIT.items():
-        step = 0.3 * width * (true[k] if k in ("stiffness", "gain") else 1.0)
-        changed = [
-            (
-                q,
-                f,
-                touch.readings(pad, true | {k: true[k] + step}, q, f * (1 + 0.3 * width) if k == "stiffness" else f)
-                * own_gain,
-            )
-            for q, f, _ in nominal
-        ]
+        p = true | {k: true[k] + 0.3 * width * (true[k] if k in ("stiffness", "gain") else 1.0)}
+        more = 1 + 0.3 * width if k == "stiffness" else 1.0
+        changed = [(q, f, felt(p, q, f * more)) for q, f, _ in nominal]
         slopes.append((stack(changed) - base).reshape(-1) / 0.3)
-        widths.append(1.0)
     Q, R = np.linalg.qr(np.stack(slopes, 1))
 
     def hidden(x: np.ndarray) -> float:
-        fit = lsq_linear(R, Q.T @ x.reshape(-1), (-np.array(widths), np.array(widths))).x
+        fit = lsq_linear(R, Q.T @ x.reshape(-1), (-1.0, 1.0)).x
         residual = (x.reshape(-1) - np.stack(slopes, 1) @ fit).reshape(x.shape)[-HELD:]
         return float(np.sqrt(np.mean(residual[..., base.max((0, 1)) > 0.02] ** 2)))
 

@@ -32,6 +32,7 @@ from scipy.stats import t as student
 from benchmarks import tools
 from benchmarks.loop import presses
 from benchmarks.loop.steps import EXCITED, FAST, KEPT
+from benchmarks.options import options
 from dexsim import intervals
 from dexsim.console import jobs
 from dexsim.errors import UserError
@@ -315,7 +316,8 @@ def _listed(name: str, paths: Sequence[Path]) -> str:
 def main(argv: list[str]) -> None:
     """Run what is not done yet, a step after the other, and report. Raises UserError for a setting that is none, or a
     job that failed."""
-    s, rest = tools.split(argv, SETTINGS)
+    rest: list[str] = []
+    s = options(argv, SETTINGS, rest)
     gpus = [g for g in s["gpus"].split(",") if g not in ("", "none")]
     engine, extra = jobs.taken(rest, gpus)
     loop = Loop(s, extra, "cuda" if gpus or engine.on != "local" else "cpu")

@@ -26,7 +26,11 @@ import mujoco
 import numpy as np
 import yaml
 
+from benchmarks import press_rig
+from benchmarks.real import common
+from dexsim.assets import xhand
 from dexsim.gap.rules import TOUCH
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
@@ -41,8 +45,6 @@ DRAWN = 0.25  # share of what was found by which training draws about it, at mos
 
 def rig(finger: str):
     """Return the press rig of `touch_rig` with a third slide, so that the ball reaches all of the pad: spec."""
-    from benchmarks import press_rig
-
     s, _, direction, along = press_rig.spec(finger)
     side = s.body("slider")
     side.add_joint(
@@ -72,19 +74,12 @@ def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> 
 
 
 def record(given: dict[str, str]) -> None:
-    """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are
+    """Write SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are
     led by hand)."""
-    from benchmarks.press_rig import SERVO
-    from dexsim.sim.quiet import quiet_warp
-
-    quiet_warp("cpu")
-    world = yaml.safe_load((CONFIGS / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
-    finger, out = given["finger"], Path(given["out"])
-    out.mkdir(parents=True, exist_ok=True)
+    world, finger, out = world_of(given["world"]), given["finger"], Path(given["out"])
     s = rig(finger)
     model = s.compile()
-    (out / "rig.xml").write_text(s.to_xml(), encoding="utf-8")
-    (out / "rig.yaml").write_text(yaml.safe_dump(SERVO, sort_keys=False), encoding="utf-8")
+    common.rig(out, "rig", s.to_xml(), press_rig.SERVO)
     sensor = Sensor(world, finger)
     rng = np.random.default_rng([world["seed"], sensor.pad])
     places = [(u, v) for u in ALONG for v in ACROSS]
@@ -95,47 +90,22 @@ def record(given: dict[str, str]) -> None:
     print(f"{out}: {finger}, {SETS} recordings", flush=True)
 
 
-class Sensor:
+class Sensor(press_rig.Touch):
     """The touch sensor of one hand in a reality: the kernels and settings with which policies are judged there. Gains
     and dead taxels are one draw of them, of the same seed for every finger."""
 
     def __init__(self, world: dict, finger: str, pinched: bool = False):
-        import torch
-
-        from benchmarks.press_rig import RADIUS
-        from dexsim.assets import xhand
-        from dexsim.assets.objects import library
-        from dexsim.hand import load_hand
-        from dexsim.tactile.layout import hand_layout
-        from dexsim.tactile.posed import PosedEngine
-        from dexsim.tactile.shapes import ShapeSet
-        from dexsim.tactile.tactile import Tactile
-
-        self.pad, self.stiffness, self.lsb = (
-            xhand.FINGERS.index(finger),
-            world["tasks"]["grasp"]["randomize"]["contact.stiffness"],
-            world["tactile"]["lsb"],
-        )
-        pads = [f"tip_{x}" for x in xhand.FINGERS]
-        self.engine = PosedEngine(1, [*xhand.TIP_BODIES, "indenter"], pads)
+        self.stiffness = world["tasks"]["grasp"]["randomize"]["contact.stiffness"]
+        self.lsb = world["tactile"]["lsb"]
         settings = yaml.safe_load((CONFIGS / "tactile" / "default.yaml").read_text(encoding="utf-8")) | world["tactile"]
         if not pinched:  # nothing but the ball comes near, and the work is spared
             settings |= {"feel_others": False, "others": False}
-        settings |= {"raw": True, "period": 0.5 / (RATE * INNER)}
-        self.touch = Tactile(self.engine, hand_layout(load_hand()), ShapeSet([library()["sphere"]], "cpu"), "indenter",
-                             settings, pairs=pads,
-                             tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
-                             seed=int(world["seed"]))  # fmt: skip
-        self.touch.shape_id.fill_(0)
-        self.touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
-        self.engine.t.xpos[0, :5] = 10.0 * torch.arange(1, 6)[:, None]
-        self.body = xhand.TIP_BODIES[self.pad]
+        super().__init__(load_hand(), finger, settings | {"raw": True, "period": 0.5 / (RATE * INNER)},
+                         int(world["seed"]))  # fmt: skip
 
     def feel_thumb(self, t: float, depth: float) -> np.ndarray:
-        """Return [5, K] N that are reported at time t s, with the thumb's tip pressed `depth` m into this one."""
+        """Return [5, K, 3] N that are reported at time t s, with the thumb's tip pressed `depth` m into this one."""
         import torch
-
-        from dexsim.assets import xhand
 
         k, x = 5 * xhand.ROWS + 6, self.engine.t
         thumb, mine = xhand.taxel_table("thumb"), xhand.taxel_table(xhand.FINGERS[self.pad])
@@ -145,31 +115,13 @@ class Sensor:
         x.xpos[0, 0] = torch.as_tensor(
             mine["position"][k] - depth * mine["normal"][k] - turn @ thumb["position"][k], dtype=torch.float32
         )
-        x.xpos[0, 5] = 100.0  # no ball
-        x.pair_normal[0] = 0.0
-        x.time[0] = t
-        self.touch.launch()
-        return self.touch.raw[0].numpy().copy()
+        x.xpos[0, self.ball] = 100.0  # no ball
+        return self.reported(t)
 
     def forget(self) -> None:
         import torch
 
         self.touch.reset(torch.ones(1, dtype=torch.bool))
-
-    def feel(self, t: float, data, force: float) -> np.ndarray:
-        """Return [5, K] N that are reported at time t s, with the rig as it stands and this contact force [N]."""
-        import torch
-
-        x, place, m = self.engine.t, self.pad, data.model
-        body = m.body(self.body).id
-        x.xpos[0, place] = torch.as_tensor(data.xpos[body], dtype=torch.float32)
-        x.xmat[0, place] = torch.as_tensor(data.xmat[body].reshape(3, 3), dtype=torch.float32)
-        x.xpos[0, 5] = torch.as_tensor(data.geom_xpos[m.geom("ball").id], dtype=torch.float32)
-        x.pair_normal[0] = 0.0
-        x.pair_normal[0, place] = float(force)
-        x.time[0] = t
-        self.touch.launch()
-        return self.touch.raw[0].numpy().copy()
 
 
 def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -179,96 +131,57 @@ def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.eye(3) + k + k @ k / (1 + c)
 
 
-def _gap(model, data, q) -> float:
-    """Return m between the ball and the fingertip; negative: pressed in."""
-    for name, x in zip(("slide", "across", "press"), q, strict=True):
-        data.qpos[model.joint(name).qposadr[0]] = x
-    mujoco.mj_kinematics(model, data)
-    tip, ball = model.geom("tip").id, model.geom("ball").id
-    return mujoco.mj_geomDistance(model, data, tip, ball, 0.05, np.zeros(6)) - model.geom_margin[tip]
-
-
 def _onset(model, u: float, v: float) -> float:
     """Return the position of `press` [m] at which the ball begins to touch at (u, v)."""
     data, low, high = mujoco.MjData(model), -0.01, 0.02
     for _ in range(20):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _gap(model, data, (u, v, middle)) > 0 else (low, middle)
+        low, high = (middle, high) if press_rig.gap(model, data, (u, v, middle)) > 0 else (low, middle)
     return 0.5 * (low + high)
 
 
 def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target: Path) -> None:
     """Write one recording: readings as the bus delivers them, the load cell, the slides' positions."""
-    from dexsim.recording import write
-    from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
-
     t, q = motion
     reads = np.arange(int((t[-1] - 0.05) * RATE)) / RATE + rng.uniform(0, 1e-3, int((t[-1] - 0.05) * RATE))
     every = np.concatenate(
         [np.linspace(a, b, INNER, endpoint=False) for a, b in zip(reads[:-1], reads[1:], strict=True)] + [reads[-1:]]
     )
-    data, n = mujoco.MjData(model), len(reads)
-    forces, force = np.zeros((n, 5, sensor.touch.layout.taxels, 3)), np.zeros(n)
+    data, forces, cell = mujoco.MjData(model), [], np.zeros((len(reads), 6))
     sensor.forget()
     start = float(sensor.engine.t.time[0]) + 1.0  # the sensor's clock goes on
     for i, now in enumerate(every):
-        f = sensor.stiffness * max(-_gap(model, data, [np.interp(now, t, x) for x in q.T]), 0.0)
+        f = sensor.stiffness * max(-press_rig.gap(model, data, [np.interp(now, t, x) for x in q.T]), 0.0)
         out = sensor.feel(start + now, data, f)
         if i % INNER == 0:
-            forces[i // INNER, ..., 2], force[i // INNER] = out, f
+            cell[len(forces), 0] = f
+            forces.append(out)
     sensor.touch.check()
-    forces[..., 2] = np.round(np.clip(forces[..., 2] / sensor.lsb, 0, 255))
-    names = [model.joint(j).name for j in range(model.njnt)]
-    order = [("slide", "across", "press").index(x) for x in names]
-    at = np.stack([np.interp(reads, t, x) for x in q.T], 1)[:, order]
-    cell = np.zeros((n, 6))
-    cell[:, 0] = force + 0.02 * rng.standard_normal(n)
-    meta = DEFAULTS | {"source": "real", "robot": "press_rig", "joint_names": ",".join(names), "effort_is": "none",
-                       "tactile_unit": "count",
-                       "tactile_lsb": f"{sensor.lsb:g}",
-                       "notes": "a fingertip pressed by a ball of 12 mm radius, led by hand"}  # fmt: skip
-    recording = Recording(Path("press.mcap"), meta, tuple(names),
-                          Series(np.zeros(0), np.zeros((0, len(names))), COMMANDS, np.zeros(0)),
-                          States(Series(reads, np.round(at / 1e-5) * 1e-5, STATES, reads.copy())),
-                          tactile=Series(reads, forces, TACTILE),
-                          external_force=Series(reads, cell, EXTERNAL_FORCE, reads.copy(), "indenter"),
-                          start_ns=int(1e9 + k * 60e9))  # fmt: skip
-    write(target, recording)
+    cell[:, 0] += 0.02 * rng.standard_normal(len(reads))
+    at = np.stack([np.interp(reads, t, x) for x in q.T], 1)
+    press_rig.write(target, model, reads, at, np.array(forces, float), sensor.lsb, cell=cell, start=1 + k * 60,
+                    notes="a fingertip pressed by a ball of 12 mm radius, led by hand")  # fmt: skip
 
 
 def pinch(given: dict[str, str]) -> None:
-    """Writes a recording of the index's fingertip pressed by the thumb's: whether a fingertip feels another."""
-    from dexsim.assets import xhand
-    from dexsim.recording import write
-    from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, TACTILE, Recording, Series, States
-    from dexsim.sim.quiet import quiet_warp
-
-    quiet_warp("cpu")
-    world = yaml.safe_load((CONFIGS / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
+    """Write a recording of the index's fingertip pressed by the thumb's: whether a fingertip feels another."""
+    world = world_of(given["world"])
     sensor, rng = Sensor(world, "index", pinched=True), np.random.default_rng(world["seed"])
     t = np.cumsum(rng.uniform(0.9, 1.1, 270)) / RATE
     depth = 0.8e-3 * np.sin(np.pi * t) ** 2
-    forces = np.zeros((len(t), 5, xhand.TAXELS_PER_FINGER, 3))
-    for i, now in enumerate(t):
-        forces[i, ..., 2] = np.round(sensor.feel_thumb(float(now), float(depth[i])) / sensor.lsb)
-    meta = DEFAULTS | {"source": "real", "robot": "xhand_right", "joint_names": "distance", "effort_is": "none",
-                       "tactile_unit": "count", "tactile_lsb": f"{sensor.lsb:g}",
-                       "notes": "the thumb's tip pressed on the index's by hand"}  # fmt: skip
-    out = Path(given["out"])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    states = States(Series(t, np.round(-depth[:, None] / 1e-5) * 1e-5, STATES, t.copy()))
-    write(
-        out,
-        Recording(
-            out,
-            meta,
-            ("distance",),
-            Series(np.zeros(0), np.zeros((0, 1)), COMMANDS, np.zeros(0)),
-            states,
-            tactile=Series(t, forces, TACTILE),
-            start_ns=1_000_000_000,
-        ),
-    )
+    forces = np.array([sensor.feel_thumb(float(now), float(d)) for now, d in zip(t, depth, strict=True)], float)
+    common.save(Path(given["out"]), ("distance",), np.zeros(0), np.zeros((0, 1)), t,
+                np.round(-depth[:, None] / press_rig.STEP) * press_rig.STEP,
+                tactile=np.round(forces / sensor.lsb), robot="xhand_right", tactile_unit="count",
+                tactile_lsb=f"{sensor.lsb:g}", notes="the thumb's tip pressed on the index's by hand")  # fmt: skip
+
+
+def world_of(name: str) -> dict:
+    """Return the numbers of a reality."""
+    from dexsim.sim.quiet import quiet_warp
+
+    quiet_warp("cpu")
+    return yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def make(folders: list[Path], taxels: list[int], lsb: float) -> dict:

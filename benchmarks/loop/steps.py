@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from benchmarks.loop.presses import world_of
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +67,7 @@ def record(given: dict[str, str]) -> None:
     from dexsim.recording.excitation import Limits, plan
     from dexsim.recording.mechanism import mechanism
 
-    world, out, seed = _world(given["world"]), Path(given["out"]), int(given.get("seed", 0))
+    world, out, seed = world_of(given["world"]), Path(given["out"]), int(given.get("seed", 0))
     out.mkdir(parents=True, exist_ok=True)
     believed = mechanism()
     top = used([read(p) for p in given.get("own", "").split(",") if p], believed)
@@ -177,13 +177,6 @@ def used(own: list, believed) -> float:
         believed_speed = believed.speeds[[believed.joints.index(j) for j in r.joints]]
         shares.append(float((np.nanpercentile(speed, 99, axis=0) / believed_speed).max()))
     return min(max(shares), 1.0)
-
-
-def _world(name: str) -> dict:
-    from dexsim.sim.quiet import quiet_warp
-
-    quiet_warp("cpu")
-    return yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def _drive(

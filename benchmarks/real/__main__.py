@@ -6,16 +6,18 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.fold import diagnosed, finger, fold, joint
+from benchmarks import answers
+from benchmarks.real import parts
+from benchmarks.real.common import Converted
+from benchmarks.real.fold import diagnosed, milli, one
 from dexsim import intervals
 from dexsim.console.ending import guard
+from dexsim.console.jobs import Engine
 from dexsim.errors import UserError
 
 USAGE = """\
@@ -31,22 +33,17 @@ out/NAME.json.
 FOLDERS = {"bam": "bam_xl330", "emps": "emps", "sage": "sage_so101", "panda": "panda", "ergocub": "ergocub_fingers"}
 
 
-def bam(data: Path, out: Path, jobs: int) -> dict:
+def bam(data: Path, out: Path, engine: Engine) -> dict:
     """Leave one gain out: each of the 16 recordings run free in closed loop, with everything chosen on the other three
     gains."""
-    from benchmarks.real.convert_bam import convert
-
-    gains = sorted(set(convert(data, out / "recordings").gains.values()))
-    folds = []
-    for done in _parts(fold, [(data, out, g) for g in gains], jobs):
-        folds.append(done)
+    folds = _each(parts.bam(data, out, "bam"), out, engine)
+    for done in folds:
         print(
-            f"gain {done['gain']} left out: {done['verdict']}, "
+            f"{done['name']} left out: {done['verdict']}, "
             f"{', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
             f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)",
             flush=True,
         )
-    folds.sort(key=lambda f: f["gain"])
     errors = {k: v for f in folds for k, v in f["recordings"].items()}
     x = np.array(list(errors.values()))
     low, high = intervals.bootstrap((x[:, 1],), np.mean, 0, 2000)
@@ -63,24 +60,22 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
     }
 
 
-def _parts(work: Callable, given: Sequence[tuple], jobs: int):
-    """Yield the results of work(x) for each x as they come, `jobs` at a time in processes of their own."""
-    with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(work, x) for x in given]):
-            yield done.result()
+def _each(given: Sequence[Converted], out: Path, engine: Engine) -> list[dict]:
+    """Return what a diagnosis says of each part, each a job of its own."""
+    return list(answers.at_once(one, {p.name: (p, out) for p in given}, out, engine))
 
 
 def _named(f: dict) -> str:
     return f"{f['effect']} {f['confidence']:.2f}"
 
 
-def emps(data: Path, out: Path, jobs: int) -> dict:
+def emps(data: Path, out: Path, engine: Engine) -> dict:
     """Return what was fitted to the estimation data and judged on the pulses: by the search in closed loop, and by the
     tool's own stage for a logged motor torque."""
     from benchmarks.real.convert_emps import FILES, REFERENCE, convert, load
 
     made = convert(data, out / "recordings")
-    d, said = diagnosed(out, "found", [made.estimation], [made.pulses], made)
+    d, said = diagnosed(out, "found", made.recordings, made.held_out, made)
     result = {"benchmark": "emps", "reference": REFERENCE, "joints": d.joints, **said}
     found = _emps_parameters(d)
     result["found"] = found
@@ -124,41 +119,42 @@ def _emps_parameters(d) -> dict[str, float]:
     }
 
 
-def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
+def sage(data: Path, out: Path, engine: Engine, fit: int = 0) -> dict:
     """Return the twenty motions to fit (or `fit` of them, evenly), ten held out; joint by joint, the others' motion
     prescribed."""
-    from benchmarks.real.convert_sage import JOINTS, convert
+    from benchmarks.real.convert_sage import JOINTS
 
-    made = convert(data, out / "recordings")
+    given = {p.judged[0]: p for p in parts.sage(data, out, "sage")}
     if fit:
-        made.recordings = made.recordings[:: max(len(made.recordings) // fit, 1)][:fit]
+        for p in given.values():
+            p.recordings = p.recordings[:: max(len(p.recordings) // fit, 1)][:fit]
     start = time.perf_counter()
-    rows = {}
-    for done in _parts(joint, [(made, out, j) for j in sorted(JOINTS, key=HARD.index)], jobs):
-        rows[done["joint"]] = done
+    done = _each([given[j] for j in HARD], out, engine)
+    rows = {r["name"].removeprefix("sage_"): r | r["joints"][r["name"].removeprefix("sage_")] for r in done}
+    for joint, row in rows.items():
         print(
-            f"{done['joint']:<12} {done['before_mrad']:>7} -> {done['after_mrad']:>6} mrad  "
-            f"{', '.join(_named(f) for f in done['findings']) or '-'} "
-            f"({done['seconds']:.0f} s)",
+            f"{joint:<12} {row['before_mrad']:>7} -> {row['after_mrad']:>6} mrad  "
+            f"{', '.join(_named(f) for f in row['findings']) or '-'} "
+            f"({row['seconds']:.0f} s)",
             flush=True,
         )
     return {
         "benchmark": "sage",
-        "fitted_motions": len(made.recordings),
-        "commands_logged_late": made.late,
+        "fitted_motions": len(given["Jaw"].recordings),
+        "commands_logged_late": given["Jaw"].late,
         "joints": {j: rows[j] for j in JOINTS},
         "seconds": round(time.perf_counter() - start, 1),
     }
 
 
-def panda(data: Path, out: Path, jobs: int) -> dict:
+def panda(data: Path, out: Path, engine: Engine) -> dict:
     """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is
     kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
     from dexsim.gap.rules import JUDGE
 
     made = convert(data, out / "recordings")
-    d, said = diagnosed(out, "found", [made.recording], [], made)
+    d, said = diagnosed(out, "found", made.recordings, [], made)
     rows, plainly = {}, plain(data, 1 - JUDGE.kept_end)
     for j in JOINTS:
         v = d.servo.value(j, "coulomb_friction")
@@ -169,26 +165,26 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
     return {"benchmark": "panda", "inside": inside, "of": len(JOINTS), "joints": rows, **said}
 
 
-def ergocub(data: Path, out: Path, jobs: int) -> dict:
+def ergocub(data: Path, out: Path, engine: Engine) -> dict:
     """Return each run of a finger alone, every fourth clip kept out; and each finger's runs together, every third
     kept out."""
-    from benchmarks.real.convert_ergocub import FINGERS, held_out
+    from benchmarks.real.convert_ergocub import FINGERS, repeat_noise
 
-    work = [(data, out, run, which, (run,), ()) for which, runs in FINGERS.items() for run in runs]
-    for which, runs in FINGERS.items():
-        held = held_out(which)
-        work += [(data, out, f"all_{which}", which, tuple(r for r in runs if r not in held), held)] if held else []
     start, rows = time.perf_counter(), {}
-    for done in _parts(finger, work, jobs):
-        rows[done["name"]] = done
-        print(f"{done['name']:<16} {done['verdict']:<16} plain {done['plain_mrad']} -> {done['after_mrad']} mrad  "
-              f"{', '.join(_named(f) for f in done['findings']) or '-'} ({done['seconds']:.0f} s)", flush=True)
-    rows = {x[2]: rows[x[2]] for x in work}
-    first = {which: {r: rows[r]["first_name"] for r in runs} for which, runs in FINGERS.items()}
+    for r in _each(parts.ergocub(data, out, "runs"), out, engine):
+        v, plain = r["joints"].get("joint", {}), milli(r["plain"].get("error"))
+        if v and plain:
+            r |= {**v, "plain_mrad": plain, "less_than_plain": round(1 - v["after_mrad"] / plain, 3)}
+        r["first_name"] = next((f["effect"] for f in r["findings"] if f["effect"] != "bad_channel"), None)
+        rows[r["name"]] = r
+        print(f"{r['name']:<20} {r['verdict']:<16} plain {plain} -> {v.get('after_mrad')} mrad  "
+              f"{', '.join(_named(f) for f in r['findings']) or '-'} ({r['seconds']:.0f} s)", flush=True)
+    runs = [run for runs in FINGERS.values() for run in runs]
     return {
         "benchmark": "ergocub",
-        "first_name_by_run": first,
+        "first_name_by_run": {which: {r: rows[r]["first_name"] for r in runs} for which, runs in FINGERS.items()},
         "dead_encoder_named": any(f["effect"] == "bad_channel" for f in rows["thumb1"]["findings"]),
+        "repeat_noise_mrad": {run: milli(repeat_noise(data, run)) for run in runs},
         "runs": rows,
         "seconds": round(time.perf_counter() - start, 1),
     }
@@ -198,7 +194,7 @@ HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the
 JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda, "ergocub": ergocub}
 
 
-def folder(name: str, given: str | None) -> Path | None:
+def folder(name: str, given: str) -> Path | None:
     """Return the folder of a data set; None where none was given and none lies beside the project. UserError where
     the given one is not there."""
     root = Path(given).expanduser() if given else Path("../shared/realdata")
@@ -215,41 +211,28 @@ def folder(name: str, given: str | None) -> Path | None:
 
 def main(argv: list[str]) -> int:
     """Runs one benchmark; returns the exit status."""
-    plain = [a for a in argv if "=" not in a]
-    given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if (
-        not plain
-        or len(plain) > 2
-        or plain[0] not in JOBS
-        or set(given) - {"data", "out", "jobs", "fit"}
-        or not given.get("jobs", "1").isdigit()
-    ):
+    name = argv[0] if argv else ""
+    if name not in JOBS:
         print(USAGE, end="")
-        return 0 if plain[:1] in (["-h"], ["--help"]) else 2
-    data = folder(plain[0], plain[1] if len(plain) == 2 else given.get("data"))
+        return 2
+    s, engine = answers.asked(argv[1:], {"data": "", "out": f"out/real/{name}", "jobs": 1, "fit": 0})
+    data = folder(name, s["data"])
     if data is None:
-        print(
-            json.dumps(
-                {
-                    "benchmark": plain[0],
-                    "skipped": f"../shared/realdata/{FOLDERS[plain[0]]} is absent; data=PATH names the recordings "
-                    f"(benchmarks/real/convert_{plain[0]}.py says where from)",
-                }
-            )
-        )
+        skipped = (f"../shared/realdata/{FOLDERS[name]} is absent; data=PATH names the recordings "
+                   f"(benchmarks/real/convert_{name}.py says where from)")  # fmt: skip
+        print(json.dumps({"benchmark": name, "skipped": skipped}))
         return 0
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    out = Path(given.get("out", f"out/real/{plain[0]}"))
-    more = {"fit": int(given["fit"])} if "fit" in given and plain[0] == "sage" else {}
-    result = JOBS[plain[0]](data, out, int(given.get("jobs", 1)), **more)
+    out = Path(s["out"])
+    result = JOBS[name](data, out, engine, *[s["fit"]] * (name == "sage"))
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(result, default=float)
-    (out / f"{plain[0]}.json").write_text(text, encoding="utf-8")
+    (out / f"{name}.json").write_text(text, encoding="utf-8")
     print(text)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], USAGE))

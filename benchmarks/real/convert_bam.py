@@ -4,13 +4,12 @@ four motions."""
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from benchmarks.real.common import dump, save
+from benchmarks.real.common import Converted, rig, save
 from dexsim.errors import UserError
 
 MODEL = """<mujoco model="bam_pendulum">
@@ -43,27 +42,15 @@ SERVO = {
 DUTY_PER_RAD = (4096 / (2 * np.pi)) / (256 * 885)  # the firmware's law: duty = kp_register * error * this
 
 
-@dataclass
-class Bam:
-    """Converted files; gain register by recording."""
-
-    recordings: list[Path]
-    gains: dict[str, int]
-    model: Path
-    servo: Path
-
-
-def convert(data: Path, out: Path) -> Bam:
-    """Converts the folder of BAM's raw JSON files (its `raw/` or the folder that holds it)."""
+def convert(data: Path, out: Path) -> Converted:
+    """Convert the folder of BAM's raw JSON files (its `raw/` or the folder that holds it); groups: by gain register."""
     folder = data / "raw" if (data / "raw").is_dir() else data
     files = sorted(folder.glob("*.json"))
     if not files:
         raise UserError(
             f"{data}: no BAM recordings (*.json); give the folder that holds bam/data.bak/raw of github.com/Rhoban/bam"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    model, servo = out / "rig.xml", dump(out / "rig.yaml", SERVO)
-    model.write_text(MODEL, encoding="utf-8")
+    model, servo = rig(out, "rig", MODEL, SERVO)
     made, gains = [], {}
     for path in files:
         raw = json.loads(path.read_text(encoding="utf-8"))
@@ -73,11 +60,10 @@ def convert(data: Path, out: Path) -> Bam:
         load = column("load")
         duty = np.where(load > 32767, load - 65536, load) / 885.0
         pick = lambda x, keep=keep: x[keep][:, None]  # noqa: E731
-        name = f"{path.stem}.mcap"
         kp = raw["kp"] * DUTY_PER_RAD
         made.append(
             save(
-                out / name,
+                out / f"{path.stem}.mcap",
                 ("joint",),
                 t[keep],
                 pick(column("goal_position")),
@@ -94,5 +80,5 @@ def convert(data: Path, out: Path) -> Bam:
                 notes=f"{raw['trajectory']}, gain register {raw['kp']}",
             )
         )
-        gains[name] = int(raw["kp"])
-    return Bam(made, gains, model, servo)
+        gains.setdefault(int(raw["kp"]), []).append(made[-1])
+    return Converted(made, model, servo, groups=gains)

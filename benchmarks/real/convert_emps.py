@@ -3,12 +3,11 @@ drive's voltage."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.common import dump, save
+from benchmarks.real.common import Converted, rig, save
 from dexsim.errors import UserError
 
 KP, KV, FORCE_PER_VOLT = 160.18, 243.45, 35.1507  # 1/s, V/(m/s), N/V: of the benchmark's controller and drive
@@ -27,16 +26,6 @@ FILES = {"estimation": "DATA_EMPS.mat", "pulses": "DATA_EMPS_PULSES.mat"}
 REFERENCE = {"mass": 95.1089, "viscous": 203.5034, "coulomb": 20.3935, "offset": -3.1648}
 
 
-@dataclass
-class Emps:
-    """Converted files."""
-
-    estimation: Path
-    pulses: Path
-    model: Path
-    servo: Path
-
-
 def load(data: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return times s, positions m, forces N and targets m of one of FILES."""
     from scipy.io import loadmat
@@ -46,16 +35,13 @@ def load(data: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return get("t"), get("qm"), float(raw["gtau"].squeeze()) * get("vir"), get("qg")
 
 
-def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
-    """Converts DATA_EMPS.mat and DATA_EMPS_PULSES.mat. mass: believed [kg]; of the friction nothing is."""
+def convert(data: Path, out: Path, mass: float = 95.0) -> Converted:
+    """Convert DATA_EMPS.mat and DATA_EMPS_PULSES.mat. mass: believed [kg]; of the friction nothing is."""
     if not (data / "DATA_EMPS.mat").is_file():
         raise UserError(f"{data}: no DATA_EMPS.mat; download the EMPS benchmark from nonlinearbenchmark.org")
-    out.mkdir(parents=True, exist_ok=True)
-    model = out / "emps.xml"
-    model.write_text(MODEL.format(mass=mass), encoding="utf-8")
     # the law is volts = KV * (KP * error - speed); as a duty of 10 V, of which the drive makes FORCE_PER_VOLT * 10 N
-    servo = dump(
-        out / "emps.yaml",
+    model, servo = rig(
+        out, "emps", MODEL.format(mass=mass),
         {
             "drive": "voltage",
             "loop_rate": 1000,
@@ -69,7 +55,7 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
                 }
             },
         },
-    )
+    )  # fmt: skip
     paths = []
     for name, file in FILES.items():
         t, q, force, target = load(data, name)
@@ -86,4 +72,4 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
                 gravity="0 0 0",
             )
         )
-    return Emps(paths[0], paths[1], model, servo)
+    return Converted(paths[:1], model, servo, paths[1:])

@@ -22,13 +22,12 @@ is one of the duties alone; that there was something to look for was seen in a c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import grey_opening
 
-from benchmarks.real.common import dump, save
+from benchmarks.real.common import Converted, rig, save
 from dexsim.errors import UserError
 
 FINGERS = {
@@ -77,32 +76,21 @@ SERVO = {
 }
 
 
-@dataclass
-class Ergocub:
-    """Converted files: clips by run, in the order of time."""
-
-    runs: dict[str, list[Path]]
-    model: Path
-    servo: Path
-
-
 def held_out(finger: str) -> tuple[str, ...]:
     """Runs of a finger that are kept out of the fit."""
     return FINGERS[finger][2::3]
 
 
-def convert(data: Path, out: Path) -> Ergocub:
-    """Converts all runs. The duty that was given is a command (as a target far off, through a gain that makes a duty of
-    it); what was read back is the duty topic."""
+def convert(data: Path, out: Path) -> Converted:
+    """Convert all runs; groups: clips by run, in the order of time. The duty that was given is a command (as a target
+    far off, through a gain that makes a duty of it); what was read back is the duty topic."""
     names = [n for runs in FINGERS.values() for n in runs]
     absent = [n for n in names if not (data / f"{n}.npz").is_file()]
     if absent:
         raise UserError(
             f"{data}: no {', '.join(f'{n}.npz' for n in absent)}; give the folder of the fingers' runs as npz"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    model, servo = out / "finger.xml", dump(out / "finger.yaml", SERVO)
-    model.write_text(MODEL, encoding="utf-8")
+    model, servo = rig(out, "finger", MODEL, SERVO)
     made = {}
     for name in names:
         read = CLOSES * np.load(data / f"{name}.npz")["pwm_read"] / 100.0
@@ -126,7 +114,7 @@ def convert(data: Path, out: Path) -> Ergocub:
                     gravity="0 0 0",
                 )
             )
-    return Ergocub(made, model, servo)
+    return Converted([p for clips in made.values() for p in clips], model, servo, groups=made)
 
 
 def cycles(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.common import save
+from benchmarks.real.common import Converted, save
 from dexsim.errors import UserError
 
 SPLITS = ((2, 5), (0, 3))  # segments that are held out
@@ -19,17 +18,8 @@ JOINTS = tuple(
 )
 
 
-@dataclass
-class Igris:
-    """Converted files: one recording a segment."""
-
-    recordings: list[Path]
-    model: Path
-    servo: Path
-
-
-def convert(data: Path, out: Path) -> Igris:
-    """Cuts the chirp at its segments and writes each as a recording of all fourteen joints."""
+def convert(data: Path, out: Path) -> Converted:
+    """Cut the chirp at its segments and write each as a recording of all fourteen joints."""
     if not (data / "chirp.npz").is_file() or not (data / "rig.xml").is_file():
         raise UserError(f"{data}: needs chirp.npz, rig.xml and servo.yaml")
     out.mkdir(parents=True, exist_ok=True)
@@ -52,4 +42,4 @@ def convert(data: Path, out: Path) -> Igris:
         )
     for name in ("rig.xml", "servo.yaml"):
         shutil.copyfile(data / name, out / name)
-    return Igris(made, out / "rig.xml", out / "servo.yaml")
+    return Converted(made, out / "rig.xml", out / "servo.yaml")

@@ -9,14 +9,13 @@ loose belief of the drives).
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
-from benchmarks.real.common import save
+from benchmarks.real.common import Converted, save
 from dexsim import intervals
 from dexsim.errors import UserError
 
@@ -25,17 +24,8 @@ FILE = "exciting_trajectory_1.npz"
 DRAWS, BLOCK, WIDTH = 400, 0.5, 0.16  # bootstraps, s of a block, s of the smoothing polynomial
 
 
-@dataclass
-class Panda:
-    """Converted files."""
-
-    recording: Path
-    model: Path
-    servo: Path
-
-
-def convert(data: Path, out: Path) -> Panda:
-    """Converts the trajectory; the reference is its command, the sensors' torque its effort."""
+def convert(data: Path, out: Path) -> Converted:
+    """Convert the trajectory; the reference is its command, the sensors' torque its effort."""
     missing = [n for n in (FILE, "panda.xml", "panda.yaml") if not (data / n).is_file()]
     if missing:
         raise UserError(f"{data}: no {', '.join(missing)}")
@@ -54,7 +44,7 @@ def convert(data: Path, out: Path) -> Panda:
         robot="panda",
         gravity="0 0 -9.81",
     )
-    return Panda(path, out / "panda.xml", out / "panda.yaml")
+    return Converted([path], out / "panda.xml", out / "panda.yaml")
 
 
 def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from benchmarks.real import sage_clock
-from benchmarks.real.common import dump, save
+from benchmarks.real.common import Converted, rig, save
 from dexsim.errors import UserError
 
 JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
@@ -43,24 +42,12 @@ SERVO = {
 }
 
 
-@dataclass
-class Sage:
-    """Converted files."""
-
-    recordings: list[Path]
-    held_out: list[Path]
-    model: Path
-    servo: Path
-    late: list[str]  # motions whose commands were logged a period late, and are put right
-
-
-def convert(data: Path, out: Path, held: int = 10) -> Sage:
-    """Converts the npz files of the motions; every third, up to `held`, is kept out. Commands that the current shows to
+def convert(data: Path, out: Path, held: int = 10) -> Converted:
+    """Convert the npz files of the motions; every third, up to `held`, is kept out. Commands that the current shows to
     be logged a period late (`sage_clock`) are put where they acted, in what is kept out as in the rest."""
     files = sorted(data.glob("*.npz"))
     if not files or not (data / "so101.xml").is_file():
         raise UserError(f"{data}: needs the motions (*.npz) and so101.xml")
-    out.mkdir(parents=True, exist_ok=True)
     spec = mujoco.MjSpec.from_file(str(data / "so101.xml"))
     for joint in spec.joints:
         joint.armature = ARMATURE
@@ -78,9 +65,7 @@ def convert(data: Path, out: Path, held: int = 10) -> Sage:
             conaffinity=1,
         )
     spec.compile()
-    model = out / "so101.xml"
-    model.write_text(spec.to_xml(), encoding="utf-8")
-    servo = dump(out / "so101.yaml", SERVO)
+    model, servo = rig(out, "so101", spec.to_xml(), SERVO)
     made = []
     late = sorted(name for name, evidence in sage_clock.late(data).items() if evidence > sage_clock.SURE)
     for path in files:
@@ -100,4 +85,4 @@ def convert(data: Path, out: Path, held: int = 10) -> Sage:
             )
         )
     chosen = made[2::3][:held]
-    return Sage([p for p in made if p not in chosen], chosen, model, servo, late)
+    return Converted([p for p in made if p not in chosen], model, servo, chosen, late=late)

@@ -1,4 +1,4 @@
-"""One diagnosis of a data set, in a process of its own: a fold of BAM, a joint of SAGE, runs of an ergoCub finger."""
+"""One diagnosis of a part of a data set."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from benchmarks.real.common import Converted
 
 
 def diagnosed(out: Path, name: str, fit: Sequence[Path], held: Sequence[Path], made: Any, **more: Any) -> tuple:
@@ -43,71 +45,20 @@ def diagnosed(out: Path, name: str, fit: Sequence[Path], held: Sequence[Path], m
     }
 
 
-def fold(job: tuple[Path, Path, int]) -> dict:
-    """Return one gain of BAM left out: fitted on the other three, judged on its four recordings."""
-    from benchmarks.real.convert_bam import convert
-
-    data, out, gain = job
-    made = convert(data, out / f"recordings_{gain}")
-    held = [p for p in made.recordings if made.gains[p.name] == gain]
-    rest = [p for p in made.recordings if p not in held]
-    name = f"gain_{gain}"
-    return _keep(out, name, {"gain": gain, **diagnosed(out, name, rest, held, made)[1]})
-
-
-def joint(job: tuple[Any, Path, str]) -> dict:
-    """Return one joint of SAGE: fitted on the motions to fit, judged on those held out."""
-    made, out, name = job
-    d, said = diagnosed(out, name, made.recordings, made.held_out, made, joints={name})
-    v = d.joints[name]
-    errors = {f"{k}_mrad": milli(v[k]) for k in ("before", "after")}
-    return _keep(out, name, {"joint": name, **errors, **said})
-
-
-def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -> dict:
-    """Return runs of one ergoCub finger: fitted on the first names, judged on the second (none: on every fourth clip of
-    the first)."""
-    from benchmarks.real.convert_ergocub import KEPT, convert, repeat_noise
-
-    data, out, name, which, fitted, held = job
-    made = convert(data, out / f"recordings_{name}")
-    clips, judged = [p for n in fitted for p in made.runs[n]], [p for n in held for p in made.runs[n]]
-    if not held:
-        judged = clips[KEPT - 1 :: KEPT]
-        clips = [p for p in clips if p not in judged]
-    d, said = diagnosed(out, name, clips, judged, made)
-    v, plain = d.joints.get("joint", {}), d.data["baseline"]
-    named = [f["effect"] for f in d.data["findings"] if f["effect"] != "bad_channel"]
-    return _keep(
-        out,
-        name,
-        {
-            "name": name,
-            "finger": which,
-            "fitted": fitted,
-            "kept_out": held,
-            "clips": [len(clips), len(judged)],
-            "first_name": named[0] if named else None,
-            "before_mrad": milli(v.get("before")),
-            "after_mrad": milli(v.get("after")),
-            "plain_mrad": milli(plain.get("error")),
-            "plain": plain.get("joints", {}).get("joint", {}).get("parameters"),
-            "less_than_plain": round(1 - v["after"] / plain["error"], 3) if v and plain else None,
-            "repeat_noise_mrad": {n: milli(repeat_noise(data, n)) for n in (*fitted, *held)},
-            **said,
-        },
-    )
+def one(job: tuple[Converted, Path]) -> dict:
+    """Diagnose one part of a data set: fitted on its recordings, judged on those held out. Written to out/NAME.json."""
+    part, out = job
+    joints = None if part.judged is None else set(part.judged)
+    d, said = diagnosed(out, part.name, part.recordings, part.held_out, part, joints=joints)
+    errors = {j: {f"{k}_mrad": milli(v.get(k)) for k in ("before", "after")} for j, v in d.joints.items()}
+    result = {"name": part.name, "joints": errors, "plain": d.data["baseline"], **said}
+    (out / f"{part.name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
+    return result
 
 
 def milli(x: float | None) -> float | None:
     """Return thousandths, to two digits; None for what is not known."""
     return None if x is None or x != x else round(1e3 * x, 2)
-
-
-def _keep(out: Path, name: str, result: dict) -> dict:
-    """Return the result, written to out/NAME.json as well."""
-    (out / f"{name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
-    return result
 
 
 def brief(f: dict) -> dict:

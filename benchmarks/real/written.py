@@ -19,97 +19,28 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
-from multiprocessing import get_context
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import answers
 from benchmarks.real import fold
+from benchmarks.real.common import Converted
+from benchmarks.real.parts import MAKE
 from dexsim.console.ending import guard
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
 SETS = ("igris", "igris_other", "igris_pair", "sage", "ergocub", "bam", "panda")
 FOLDERS = {"sage": "sage_so101", "ergocub": "ergocub_fingers", "bam": "bam_xl330", "panda": "panda"}
+SETTINGS = {"sets": ",".join(SETS), "data": "../shared/realdata", "out": "out/real/written", "jobs": 1, "limit": 0,
+            "hand": 300, "only": ""}  # fmt: skip
 AGREE, WORSE = 0.10, 1.05  # the two criteria
 
 
-@dataclass
-class Part:
-    """Holds the work of one process. judged: joints that are judged (None: all that are driven)."""
-
-    name: str
-    recordings: list[Path]
-    held_out: list[Path]
-    model: Path
-    servo: Path
-    judged: tuple[str, ...] | None = None
-    notes: list[str] = field(default_factory=list)
-
-
-def igris(data: Path, out: Path, name: str) -> list[Part]:
-    """Return eight joints with either split of the segments, or two of them."""
-    from benchmarks.real.convert_igris import JOINTS, PAIR, SPLITS, convert
-
-    made = convert(data / "igris", out / f"recordings_{name}")
-    held = SPLITS[name == "igris_other"]
-    judging = [made.recordings[k] for k in held]
-    rest = [p for p in made.recordings if p not in judging]
-    return [Part(name, rest, judging, made.model, made.servo, PAIR if name == "igris_pair" else JOINTS)]
-
-
-def sage(data: Path, out: Path, name: str) -> list[Part]:
-    """Return six joints of an arm, each alone; ten of thirty motions held out."""
-    from benchmarks.real.convert_sage import JOINTS, convert
-
-    made = convert(data, out / f"recordings_{name}")
-    return [Part(f"sage_{j}", made.recordings, made.held_out, made.model, made.servo, (j,)) for j in JOINTS]
-
-
-def ergocub(data: Path, out: Path, name: str) -> list[Part]:
-    """Return the runs of each finger together, every third held out."""
-    from benchmarks.real.convert_ergocub import FINGERS, convert, held_out
-
-    made, parts = convert(data, out / f"recordings_{name}"), []
-    for which, runs in FINGERS.items():
-        judging = held_out(which)
-        if judging:
-            clips, held = ([p for r in runs if (r in judging) is x for p in made.runs[r]] for x in (False, True))
-            parts.append(Part(f"ergocub_{which}", clips, held, made.model, made.servo))
-    return parts
-
-
-def bam(data: Path, out: Path, name: str) -> list[Part]:
-    """Return one of four gains held out, each."""
-    from benchmarks.real.convert_bam import convert
-
-    made, parts = convert(data, out / f"recordings_{name}"), []
-    for gain in sorted(set(made.gains.values())):
-        judging = [p for p in made.recordings if made.gains[p.name] == gain]
-        rest = [p for p in made.recordings if p not in judging]
-        parts.append(Part(f"bam_{gain}", rest, judging, made.model, made.servo))
-    return parts
-
-
-def panda(data: Path, out: Path, name: str) -> list[Part]:
-    """Return one trajectory, its last quarter held out."""
-    from benchmarks.real.convert_panda import convert
-
-    made = convert(data, out / f"recordings_{name}")
-    return [Part("panda", [made.recording], [], made.model, made.servo)]
-
-
-MAKE: dict[str, Callable[[Path, Path, str], list[Part]]] = {
-    "igris": igris, "igris_other": igris, "igris_pair": igris, "sage": sage, "ergocub": ergocub, "bam": bam,
-    "panda": panda,
-}  # fmt: skip
-
-
-def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
+def diagnosed(job: tuple[Converted, Path, float | None]) -> dict[str, Any]:
     """Diagnose one part, write its files and replay them."""
     part, out, limit = job
     judged = None if part.judged is None else set(part.judged)
@@ -144,7 +75,7 @@ def diagnosed(job: tuple[Part, Path, float | None]) -> dict[str, Any]:
     return result
 
 
-def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
+def play(part: Converted, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Return by joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
     from dexsim.cli import recorded
     from dexsim.paths import CONFIGS
@@ -166,7 +97,7 @@ def play(part: Part, folder: Path, files: dict[str, Path], parts: Sequence[dict[
     return {joint: float(np.sqrt(a / b)) for joint, (a, b) in total.items()}
 
 
-def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]], float]) -> dict[str, Any]:
+def by_hand(job: tuple[Converted, Path, str, Sequence[dict[str, Any]], float]) -> dict[str, Any]:
     """Fit our own least squares to one joint of a part. held: parts of recordings that were held out (none: all
     of those files); limit: seconds."""
     from benchmarks.real import baseline
@@ -190,7 +121,7 @@ def by_hand(job: tuple[Part, Path, str, Sequence[dict[str, Any]], float]) -> dic
     return found
 
 
-def hand_replayed(job: tuple[Part, Path, dict[str, dict[str, Any]], Sequence[dict[str, Any]]]) -> dict[str, Any]:
+def hand_replayed(job: tuple[Converted, Path, dict[str, dict[str, Any]], Sequence[dict[str, Any]]]) -> dict[str, Any]:
     """Write our own least squares of all joints of a part as `diagnose` writes its answer, and replay it as `play`
     does."""
     from dexsim.actuator.columns import INDEX
@@ -260,52 +191,43 @@ def text_of(results: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: list[str]) -> int:
     """Runs the sets; returns the exit status."""
-    given = dict(a.partition("=")[::2] for a in argv)
-    if set(given) - {"sets", "data", "out", "jobs", "limit", "hand", "only"} or not given.get("jobs", "1").isdigit():
-        print(__doc__)
-        return 2
-    sets = given.get("sets", ",".join(SETS)).split(",")
-    if bad := [s for s in sets if s not in SETS]:
+    s, engine = answers.asked(argv, SETTINGS)
+    sets = s["sets"].split(",")
+    if bad := [x for x in sets if x not in SETS]:
         raise UserError(f"sets={','.join(bad)}: must be of {', '.join(SETS)}")
-    data, out = Path(given.get("data", "../shared/realdata")), Path(given.get("out", "out/real/written"))
+    data, out, parts = Path(s["data"]), Path(s["out"]), []
     out.mkdir(parents=True, exist_ok=True)
-    limit, hand_limit, parts = float(given.get("limit", 0)) or None, float(given.get("hand", 300)), []
+    limit, hand_limit = s["limit"] or None, s["hand"]
     for name in sets:
         folder = data / FOLDERS.get(name, "igris")
         if not folder.is_dir():
             print(json.dumps({"set": name, "skipped": f"{folder} is absent"}))
             continue
         parts += MAKE[name](data if name.startswith("igris") else folder, out, name)
-    parts = [p for p in parts if given.get("only", p.name) == p.name]
-    by, results = {p.name: p for p in parts}, {}
-    with ProcessPoolExecutor(max(int(given.get("jobs", 1)), 1), mp_context=get_context("spawn")) as pool:
-        waiting = {pool.submit(diagnosed, (p, out, limit)) for p in parts}
-        early = [(p, j) for p in parts if p.held_out and p.judged for j in p.judged]
-        waiting |= {pool.submit(by_hand, (p, out, j, [], hand_limit)) for p, j in early}
-        hand: dict[str, dict[str, dict[str, Any]]] = {p.name: {} for p in parts}
-        while waiting:
-            done = next(as_completed(waiting))
-            waiting.discard(done)
-            r = done.result()
-            name = r["part"]
-            if "by_hand" in r:
-                for joint, error in r["by_hand"].items():
-                    results[name]["joints"][joint]["by_hand"] = error
-            elif "joint" in r:
-                hand[name][r["joint"]] = r
-            else:
-                results[name] = r
-                print(f"{name}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
-                late = [j for j in r["joints"] if r["parts"] and (by[name], j) not in early]
-                waiting |= {pool.submit(by_hand, (by[name], out, j, r["parts"], hand_limit)) for j in late}
-            if name in results and "by_hand" not in r:
-                joints = results[name]["joints"]
-                if results[name]["parts"] and set(joints) == set(hand[name]):
-                    for joint, found in hand[name].items():
-                        joints[joint]["by_hand_alone"] = found["error"]
-                    waiting.add(pool.submit(hand_replayed, (by[name], out, hand[name], results[name]["parts"])))
-            (out / "written.json").write_text(json.dumps(list(results.values()), default=float), encoding="utf-8")
-    ordered = [results[p.name] for p in parts]
+    parts = [p for p in parts if (s["only"] or p.name) == p.name]
+    begun = {p.name: (p, out, limit) for p in parts}
+    results = {r["part"]: r for r in answers.at_once(diagnosed, begun, out / "searched", engine)}
+    each: dict[str, tuple] = {}
+    for p in parts:
+        r = results[p.name]
+        print(f"{p.name}: {r['verdict']}, {r['seconds']:.0f} s: {r['sentence']}", flush=True)
+        early = p.judged or () if p.held_out else ()
+        joints = dict.fromkeys((*early, *(r["joints"] if r["parts"] else ())))
+        each |= {f"{p.name}.{j}": (p, out, j, [] if j in early else r["parts"], hand_limit) for j in joints}
+    hand: dict[str, dict[str, dict[str, Any]]] = {p.name: {} for p in parts}
+    for found in answers.at_once(by_hand, each, out / "by_hand", engine):
+        hand[found["part"]][found["joint"]] = found
+    whole = {}
+    for p in parts:
+        r, mine = results[p.name], hand[p.name]
+        if r["parts"] and set(r["joints"]) == set(mine):
+            for joint, found in mine.items():
+                r["joints"][joint]["by_hand_alone"] = found["error"]
+            whole[p.name] = (p, out, mine, r["parts"])
+    for played in answers.at_once(hand_replayed, whole, out / "replayed", engine):
+        for joint, error in played["by_hand"].items():
+            results[played["part"]]["joints"][joint]["by_hand"] = error
+    ordered = list(results.values())
     for r in ordered:
         for row in r["joints"].values():
             row["passed"] = judged(row)
@@ -315,4 +237,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))
