@@ -348,7 +348,7 @@ def test_laws_are_drawn_by_a_generator_of_their_own():
         laws.draw(["lag"], [torque], "three", 9, 0)
     with pytest.raises(UserError, match="laws=3: must be two or one"):
         command.parse(["laws=3"])
-    assert 10_000 <= command.parse(["seed=source"])["seed"] < 100_000
+    assert 10_000 <= command.parse(["seed=source"])[0]["seed"] < 100_000
     assert {k for k in laws.SECOND} <= set(effects.KINDS) and set(touch_cases.SECOND) <= set(touch_cases.KINDS)
 
 

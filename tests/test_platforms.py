@@ -145,6 +145,35 @@ def test_signals_that_are_there(monkeypatch):
         assert stop.requested() and stop.status == 128 + hangup
 
 
+def test_each_answer_where_what_it_asks_is_taken_away(monkeypatch, tmp_path):
+    """No affinity, fork, session, count of pages, /proc, C library or `resource`; on macOS and on Windows."""
+    with monkeypatch.context() as less:
+        for name in ("sched_getaffinity", "register_at_fork", "setsid", "statvfs", "sysconf_names"):
+            less.delattr(os, name)
+        less.setitem(sys.modules, "resource", None)
+        less.setattr(system, "SHARED", tmp_path / "none")
+        less.setattr(system, "Path", lambda *_: tmp_path / "none")
+        less.setattr(ctypes, "CDLL", lambda name: ctypes)  # has no malloc_trim
+        system._libc.cache_clear()
+        assert system.cores() == os.cpu_count() and system.memory() is None and system.shared_memory() is None
+        assert system.at_work(os.getpid()) == (False, 0) and system._libc() is None
+        for call in (system.give_back, system.leave_terminal, lambda: system.after_fork(pytest.fail)):
+            call()
+        system.limit(1.0, 1)  # nothing is limited
+        asked = []
+        less.setattr(os, "kill", lambda pid, number: asked.append(number))
+        for platform, how, words in (("win32", signal.SIGTERM, "screen"), ("darwin", signal.SIGINT, "screen"),
+                                     ("linux", signal.SIGINT, "apt-get")):  # fmt: skip
+            less.setattr(system, "sys", types.SimpleNamespace(platform=platform))
+            system.stop(7)
+            assert asked.pop() == how and words in system.no_renderer()
+            assert system.start_method() == ("fork" if platform == "linux" else "spawn")
+        for name in ("SIGHUP", "SIGQUIT", "SIGUSR1", "SIGTSTP", "SIGXCPU", "SIGALRM", "SIGPWR"):
+            less.delattr(signal, name)
+        assert {signal.SIGINT, signal.SIGTERM} < set(system.hand_signals())
+    system._libc.cache_clear()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["win32", "darwin", "linux"])
 def test_a_lesser_system_trains_plays_and_diagnoses(name, tmp_path):

@@ -72,6 +72,13 @@ def test_several_gpus_need_room_to_talk(monkeypatch):
     assert [x[0] for x in doctor.gpu()] == ["ok", "ok"]
 
 
+def test_the_versions_of_python_are_those_that_are_resolved_each_night():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    stated = [c.rpartition(" ")[2] for c in project["classifiers"] if ":: Python ::" in c]
+    resolved = re.search(r"for version in (.*); do", (ROOT / ".ci" / "nightly").read_text())[1].split()
+    assert stated == resolved and project["requires-python"] == f">={stated[0]}"
+
+
 def test_the_doctor_knows_every_extra():
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
     assert set(doctor.EXTRAS) == extras - {"test", "docs", "view"}
