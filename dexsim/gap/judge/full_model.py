@@ -14,7 +14,7 @@ import copy
 import itertools
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +54,7 @@ REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
 PROBE = 1.0  # s of what was held out that are replayed first, for how long all of it takes
 KINDS = 0.5  # of the time that there is for the choice: what every joint as its own kind may take
+MORE = 2.0  # times as much of it is replayed, or none again
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
@@ -249,10 +250,12 @@ def worlds_of(
     cases: Sequence[Case],
     table: ServoTable,
     windows: Windows,
+    begins: dict[int, tuple] | None = None,
 ) -> list[World]:
     """Return one world a window (a whole run, or the part of it that was held out), driven by a fitted table and begun
-    as `play replay=` begins."""
-    out = []
+    as `play replay=` begins. begins: how that is by window, filled where it is not known: it is the same of any
+    table."""
+    out, begins = [], {} if begins is None else begins
     at_rest = m.spec.compile()
     rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
     mine = Mechanism(m.spec, m.joints, table, m.robot)
@@ -264,7 +267,9 @@ def worlds_of(
         scale, offset = rows[:, SERVO_INDEX["position_scale"]], rows[:, SERVO_INDEX["position_offset"]]
         q, home = scale * rest + offset, scale * rest + offset
         place = [m.joints.index(j) for j in run.joints]
-        initial, v, paths = begun(recordings[run.name], m, start)
+        if w not in begins:
+            begins[w] = begun(recordings[run.name], m, start)
+        initial, v, paths = begins[w]
         q = np.where(np.isfinite(initial), initial, q)
         sent = max(int(np.searchsorted(run.cmd_t, start - BEFORE)) - 1, 0)
         targets = np.full((len(run.cmd_t) - sent, len(m.joints)), np.nan)
@@ -564,8 +569,7 @@ def write_best(
 ) -> Written:
     """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
     engine: of `REPLAY`; none: by the search's own plant; room: s that there are for it; too few: by the begin of each
-    part held out, by the search's own plant where there is no time for that either. Raises UserError where the model
-    or a drive does not serve the engine."""
+    part held out. Raises UserError where the model or a drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if engine == "none" or not cases or not len(windows[0].window):
@@ -576,7 +580,8 @@ def write_best(
     starts = [_start(r, float(t)) for r, t in zip(of, first.window_t, strict=True)]
     ends = [float(within[first.sample_row[first.sample_window == k][-1]]) for k in range(len(starts))]
     longest = max(b - a for a, b in zip(starts, ends, strict=True))
-    share, pace = 1.0, 0.0  # of each part; s of a choice
+    kinds, begins = kinds_of(by), dict[int, tuple]()
+    share, pace = min(1.0, PROBE / longest) if math.isfinite(room()) else 1.0, 0.0  # of each part; s of a choice
 
     def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
         """Return rms by joint of each choice."""
@@ -591,7 +596,7 @@ def write_best(
         found: dict[int, list[np.ndarray]] = {}
         count = len(windows[0].window)
         for group in groups.values():
-            worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0])]
+            worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0], begins)]
             for w in worlds:
                 w.duration *= share
             spec = given[group[0]][1]
@@ -613,43 +618,42 @@ def write_best(
         square, count = np.sum(parts, 0) if parts else (0.0, 1.0)
         return math.sqrt(square / max(count, 1.0))
 
-    names = {j: tuple(x) for j, x in by.items()}
-    if math.isfinite(room()) and longest > PROBE:
-        share = PROBE / longest
-        kinds = _kinds(names)
-        replayed(kinds)
-        if pace * len(kinds) > KINDS * room():
-            return write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
-        share = min(1.0, share * KINDS * room() / (pace * len(kinds)))
-    chosen = composed(names, errors, noise, replayed, lambda count: count * pace > room())
+    while True:
+        done = list(zip(kinds, replayed(kinds), strict=True))
+        more = KINDS * room() / max(pace * len(kinds), 1e-9)
+        if share >= 1.0 or more < MORE:
+            break
+        share = min(1.0, share * more)
+    chosen = composed(by, errors, noise, done, replayed, lambda count: count * pace > room())
     return Written(candidates, errors, chosen, True, share=share)
 
 
-def _kinds(by: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
+def kinds_of(by: Mapping[str, Collection[str]]) -> list[dict[str, str]]:
     """Return choices: every joint as its own kind, of `ORDER`, where it has such a candidate."""
-    return [{j: k if k in x else x[0] for j, x in by.items()} for k in ORDER if any(k in x for x in by.values())]
+    there = [k for k in ORDER if any(k in x for x in by.values())]
+    return [{j: k if k in x else next(iter(x)) for j, x in by.items()} for k in there]
 
 
 def composed(
-    by: Mapping[str, Sequence[str]],
+    by: Mapping[str, Collection[str]],
     errors: dict[str, dict[str, float]],
     noise: Mapping[str, float],
+    done: list[tuple[dict[str, str], dict[str, float]]],
     replayed: Callable[[Sequence[dict[str, str]]], list[dict[str, float]]],
     passed: Callable[[int], bool] = lambda count: False,
 ) -> dict[str, str]:
     """Return a candidate's name by joint. by: names of each joint's candidates; errors: filled with what each leaves
-    [rad or m] where all joints are of its kind; noise: floor by joint; replayed: what whole choices leave by joint;
-    passed: whether there is no time to replay so many more."""
-    # every joint as its own kind first, then the best of each together; where joints pull at one another that may be
-    # none of them: then each is asked once more with what the others now are
-    every = _kinds(by)
-    done = list(zip(every, replayed(every), strict=True))
+    [rad or m] where all joints are of its kind; noise: floor by joint; done: what every joint as its own kind leaves
+    (`kinds_of`), by joint; replayed: the same of whole choices; passed: whether there is no time for so many more."""
+    # the best of each together; where joints pull at one another that may be none of them: then each is asked once more
+    # with what the others now are
+    first = len(done)
     for choice, found in done:
         for j, name in choice.items():
             errors[j][name] = found[j]
     here = {j: dict(x) for j, x in errors.items()}  # with what the others are by then
     chosen = {j: choose(x, noise[j]) for j, x in here.items()}
-    while chosen not in [c for c, _ in done] and len(done) < len(every) + TURNS and not passed(1):
+    while chosen not in [c for c, _ in done] and len(done) < first + TURNS and not passed(1):
         (together,) = replayed([chosen])
         done.append((chosen, together))
         moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]] and len(by[j]) > 1]
