@@ -48,7 +48,7 @@ def seed_of(text: str) -> int:
     return seed_of_sources() if text == "source" else int(text)
 
 
-def asked(
+def settings(
     argv: Sequence[str], defaults: dict[str, Any], **choices: Sequence[str]
 ) -> tuple[dict[str, Any], jobs.Engine]:
     """Return the settings of a benchmark, its seed as a number, and where its jobs run: `jobs` of them at a time, on=
@@ -89,10 +89,10 @@ def at_once(work: Callable[[Any], Any], given: dict[str, Any], out: Path, engine
     todo, place = [], out.resolve() / "work"
     (place / "jobs").mkdir(parents=True, exist_ok=True)
     for key, x in given.items():
-        asked, answer = place / "jobs" / f"{key}.pickle", place / key / "answer.json"
-        asked.write_bytes(pickle.dumps(x))
+        question, answer = place / "jobs" / f"{key}.pickle", place / key / "answer.json"
+        question.write_bytes(pickle.dumps(x))
         answer.unlink(missing_ok=True)
-        todo.append(jobs.Job(((name, str(asked), str(answer)),), place / key, PROGRAM))
+        todo.append(jobs.Job(((name, str(question), str(answer)),), place / key, PROGRAM))
         todo[-1].note.unlink(missing_ok=True)  # where it was asked before, it is asked again
     try:
         status = jobs.run(todo, engine) if todo else []

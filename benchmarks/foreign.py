@@ -163,7 +163,7 @@ def table(truths: Sequence[dict], answers: dict[str, dict | None], seconds: dict
 
 def main(argv: Sequence[str]) -> dict | None:
     """Runs the benchmark; returns what the JSON line says, None where it is skipped."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     plant = Path(s["plant"]).expanduser().resolve()
     if not (plant / "generate.py").is_file():
         print(f"skipped: plant={plant} is not there (a plant by other hands, which is not part of dexsim)")

@@ -193,7 +193,7 @@ def sheet(rows: Sequence[dict[str, Any]], out: Path, path: Path) -> None:
 
 def main(argv: Sequence[str]) -> int:
     """Try every hand; print the table."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     out, folder = Path(s["out"]).resolve(), Path(s["folder"])
     s["out"] = str(out)
     out.mkdir(parents=True, exist_ok=True)

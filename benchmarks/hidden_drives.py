@@ -167,7 +167,7 @@ def diagnosed(folder: Path, truth: dict[str, Any], limit: int) -> dict[str, Any]
 
 def main(argv: list[str]) -> int:
     """Run the cases; print a line of each, and how many were named."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     hands = [Path(h).resolve() for h in s["hands"].split(",") if h]
     if not hands:
         raise UserError("say which hands: hands=FOLDER,FOLDER (of dexsim import-hand)")

@@ -196,7 +196,7 @@ def table(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
 
 def main(argv: Sequence[str]) -> int:
     """Run the cases and print them; return the exit status."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     ends = time.time() + (s["until"] or 1e9)
     out = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
     jobs = {("planted", k): (k, s, out, ends) for k in range(s["cases"])}

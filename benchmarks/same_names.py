@@ -167,7 +167,7 @@ def run(work: Callable, s: dict[str, Any], engine: Engine, sets: Sequence[str], 
 
 def main(argv: Sequence[str]) -> int:
     """Run both versions; return the exit status."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     if not (Path(s["before"]) / "diagnose.py").is_file():
         raise UserError(f"before={s['before']}: must be a folder of code (git worktree add FOLDER COMMIT)")
     print("\n" + text_of(run(pair, s, engine, SETS, "pairs")))

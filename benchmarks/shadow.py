@@ -153,7 +153,7 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Diagnose the cases, and print the table; return the exit status."""
-    print("\n" + text_of(same_names.run(case, *answers.asked(argv, SETTINGS), SETS, "cases")))
+    print("\n" + text_of(same_names.run(case, *answers.settings(argv, SETTINGS), SETS, "cases")))
     return 0
 
 

@@ -93,13 +93,13 @@ def record(
         n = int((t[-1] - 0.02) * RATE)
         seen = np.sort(rng.uniform(0, 1e-3, n) + np.arange(n) / RATE)
         now = np.stack([np.interp(seen, t, x) for x in real.T], 1)
-        data, felt, z, cell = mujoco.MjData(model), Touch(hand, finger, settings), [], np.zeros((n, 6))
+        data, touch, z, cell = mujoco.MjData(model), Touch(hand, finger, settings), [], np.zeros((n, 6))
         for i in range(n):
             deep = max(-gap(model, data, now[i]), 0.0)
             cell[i, 0] = pressed[k][i] if len(pressed) else stiffness * deep
-            z.append(felt.feel(float(seen[i]), data, cell[i, 0]))
+            z.append(touch.feel(float(seen[i]), data, cell[i, 0]))
             if rubber:
-                cell[i, 0] = float(felt.touch.force_clean[0, f])
+                cell[i, 0] = float(touch.touch.force_clean[0, f])
         z = np.array(z, float)
         if crosstalk:
             mine = z[:, f, : sensors.layout.count[f]]

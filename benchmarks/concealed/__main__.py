@@ -41,7 +41,7 @@ CI = {"effect": 2, "none": 1, "pair": 1, "outside": 1, "decoy": 1}
 def parse(argv: list[str]) -> tuple[dict, Engine]:
     """Return settings and engine; raises UserError for a setting that does not exist or has a value that is not
     allowed."""
-    given, engine = answers.asked(argv, SETTINGS, laws=laws.LAWS, braking=("said", "unsaid"))
+    given, engine = answers.settings(argv, SETTINGS, laws=laws.LAWS, braking=("said", "unsaid"))
     pairs = [part.partition(":")[::2] for part in given["mix"].split(",") if part]
     if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
         raise UserError(f"mix={given['mix']}: must read like effect:14,none:4, groups of {', '.join(generate.MIX)}")

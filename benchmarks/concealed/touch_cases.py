@@ -152,14 +152,14 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     own_gain = 1 + rng.uniform(-0.02, 0.02, len(pad.areas))
     cache: dict[float, list] = {}
 
-    def felt(p: dict, q: np.ndarray, f: np.ndarray) -> np.ndarray:
+    def read(p: dict, q: np.ndarray, f: np.ndarray) -> np.ndarray:
         return touch.readings(pad, p, q, f) * own_gain
 
     def run(p: dict) -> list[tuple]:
         """Return (positions, force, readings) of every recording."""
         if p["stiffness"] not in cache:
             cache[p["stiffness"]] = [touch.move(pad, p, c) for c in commands]
-        return [(q, f, felt(p, q, f)) for q, f in cache[p["stiffness"]]]
+        return [(q, f, read(p, q, f)) for q, f in cache[p["stiffness"]]]
 
     stack = lambda r: np.stack([x[2][::11] for x in r])  # noqa: E731
     nominal = run(true)
@@ -169,7 +169,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     for k, width in REFIT.items():
         p = true | {k: true[k] + 0.3 * width * (true[k] if k in ("stiffness", "gain") else 1.0)}
         more = 1 + 0.3 * width if k == "stiffness" else 1.0
-        changed = [(q, f, felt(p, q, f * more)) for q, f, _ in nominal]
+        changed = [(q, f, read(p, q, f * more)) for q, f, _ in nominal]
         slopes.append((stack(changed) - base).reshape(-1) / 0.3)
     Q, R = np.linalg.qr(np.stack(slopes, 1))
 

@@ -215,7 +215,7 @@ def main(argv: list[str]) -> int:
     if name not in JOBS:
         print(USAGE, end="")
         return 2
-    s, engine = answers.asked(argv[1:], {"data": "", "out": f"out/real/{name}", "jobs": 1, "fit": 0})
+    s, engine = answers.settings(argv[1:], {"data": "", "out": f"out/real/{name}", "jobs": 1, "fit": 0})
     data = folder(name, s["data"])
     if data is None:
         skipped = (f"../shared/realdata/{FOLDERS[name]} is absent; data=PATH names the recordings "

@@ -191,7 +191,7 @@ def text_of(results: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: list[str]) -> int:
     """Runs the sets; returns the exit status."""
-    s, engine = answers.asked(argv, SETTINGS)
+    s, engine = answers.settings(argv, SETTINGS)
     sets = s["sets"].split(",")
     if bad := [x for x in sets if x not in SETS]:
         raise UserError(f"sets={','.join(bad)}: must be of {', '.join(SETS)}")
