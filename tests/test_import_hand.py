@@ -85,6 +85,8 @@ def test_a_gripper_with_slides_looks_along_its_fingers(one_start, tmp_path):
     np.testing.assert_allclose(hand.file.palm.normal, [1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(np.abs(hand.file.palm.forward), [0, 1, 0], atol=1e-6)
     assert result.hand["handedness"] == "none" and len(hand.joints) == 2
+    drive = yaml.safe_load((tmp_path / "hand" / "servo.yaml").read_text())["joints"]["slide_left"]
+    assert drive["kp"] * 0.04 == pytest.approx(drive["torque_limit"] / 0.178, rel=0.01)  # a slide's travel is no radian
     assert all(m.closer > 0.002 for m in moves.moves(hand))
 
 

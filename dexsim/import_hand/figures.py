@@ -29,6 +29,7 @@ TURN_SPEED = (0.05, 100.0)  # rad/s
 # N m of its largest torque; without one, the light links of a hand are stiffer than a physics step can follow.
 ROTOR = 4.5e-4  # kg m2 per N m
 DAMPING = 0.01  # N m s/rad per N m
+TRAVEL = 0.5 * np.pi  # rad for which the range of a slide stands where what moves it is guessed as if it turned
 
 
 @dataclass
@@ -83,10 +84,10 @@ def check(
                         f"joint '{name}': {what} {value:g} {unit} is unusual for a hand ({low:g} to {high:g}): check it"
                     )
             if out.armature[name] <= 0:
-                out.armature[name] = ROTOR * out.effort[name]
+                out.armature[name] = ROTOR * out.effort[name] / radius(m, name)
                 out.guessed_armature.append(name)
             if out.damping[name] <= 0:
-                out.damping[name] = DAMPING * out.effort[name]
+                out.damping[name] = DAMPING * out.effort[name] / radius(m, name)
                 out.guessed_damping.append(name)
     for pull in source.drives.pulls:
         reach = max(
@@ -100,6 +101,13 @@ def check(
     out.warnings += _inertias(m, tree)
     out.massless = _massless(m, tree)
     return out
+
+
+def radius(m: mujoco.MjModel, name: str) -> float:
+    """Return the metres that a slide moves for a radian of what is guessed to drive it; 1 for all that turns."""
+    j = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_JOINT, name)
+    slides = j >= 0 and m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+    return float(np.ptp(m.jnt_range[j])) / TRAVEL if slides else 1.0
 
 
 def _weight(m: mujoco.MjModel, j: int) -> float:

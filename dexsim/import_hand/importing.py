@@ -506,7 +506,8 @@ def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
     friction = {m.joint(j).name: float(m.dof_frictionloss[m.jnt_dofadr[j]]) for j in range(m.njnt)}
     joints, guessed = {}, {"kp": 0, "kd": 0, "coulomb_friction": 0}
     for j in hand["joints"]:
-        guess = {"kp": j["effort"] / SWEEP, "kd": 0.025 * j["effort"] / SWEEP, "coulomb_friction": 0.02 * j["effort"]}
+        stiff = j["effort"] / (SWEEP * figures.radius(m, j["name"]))
+        guess = {"kp": stiff, "kd": 0.025 * stiff, "coulomb_friction": 0.02 * j["effort"]}
         own = {"kp": said.kp.get(j["name"]), "kd": said.kd.get(j["name"]), "coulomb_friction": friction.get(j["name"])}
         if own["kp"] and not own["kd"]:
             guess["kd"] = 0.025 * own["kp"]
@@ -518,7 +519,8 @@ def _servo(name: str, hand: dict[str, Any], robot: source.Source) -> str:
             "delay": said.delay.get(j["name"], 0.01), "coulomb_friction": value["coulomb_friction"],
         }  # fmt: skip
     rules = {
-        "kp": f"full torque at {SWEEP:g} rad of error", "kd": "a fortieth of kp",
+        "kp": f"full torque at {SWEEP:g} rad of error, a slide's force at {SWEEP / figures.TRAVEL:.0%} of its range",
+        "kd": "a fortieth of kp",
         "coulomb_friction": "2 % of the torque",
     }  # fmt: skip
     text = "; ".join(f"{key} of {guessed[key]} joints ({rule})" for key, rule in rules.items() if guessed[key])
