@@ -125,6 +125,14 @@ def test_a_joint_that_rests_until_its_target_steps_is_not_frozen():
     quick = 0.6 * there + 0.3 * np.r_[there[:1], there[:-1]] + 0.1 * np.r_[there[:2], there[:-2]]
     found, _, _ = channels.inspect([run("steps", target, quick)], model, {})
     assert [f for f in found if f.regime.startswith("stale")] == []
+    held, sticks = 0.0, []
+    target = np.where(T < 3.5, 0.3 * np.sin(4 * T), 0.2 * (T // 0.8 % 2) + 0.015 * (T // 0.4 % 2))
+    for c in target:  # dry friction holds it through the small steps, as where it turns
+        held = min(max(held, c - 0.02), c + 0.02)
+        sticks.append(held)
+    sticks = np.convolve(sticks, (0.5, 0.3, 0.2))[: len(T)]
+    found, _, _ = channels.inspect([run("sticks", target, sticks)], model, {})
+    assert [f for f in found if f.regime.startswith("stale")] == []
     chirp = 0.4 * np.sin(2 * np.pi * 0.5 * T)
     old = chirp.copy()
     for at in (100, 205, 310, 415):

@@ -547,8 +547,8 @@ def _holds(run: Run, j: int, end: int) -> float:
 
 def _held(t: np.ndarray, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the readings [S] that repeat the one before and end in a jump that a joint of this speed cannot make in
-    one sample. targets [2, S]: in force at each reading, and REACTS s before; a joint whose target stood with it, and
-    then stepped, was at rest."""
+    one sample. targets [2, S]: in force at each reading, and REACTS s before; a joint whose target stood with it, or
+    went no farther than dry friction has held it elsewhere, and then stepped, was at rest."""
     step = np.abs(np.diff(q))
     out = np.zeros(len(q), bool)
     edge = np.flatnonzero(np.diff(np.concatenate([[False, False], step == 0, [False]]).astype(np.int8)))
@@ -558,12 +558,13 @@ def _held(t: np.ndarray, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
     if not long.any() or len(moving) < 20:
         return out
     usual = float(np.percentile(moving, 90))
-    stood = zip(first[long].tolist(), end[long].tolist(), strict=True)
+    stood = list(zip(first[long].tolist(), end[long].tolist(), strict=True))
     now, before = targets
+    passed = max((_way(t, before, a, b) for a, b in stood if step[b - 1] <= usual), default=0.0)
 
     def woken(a: int, b: int) -> bool:
         stepped = abs(now[b] - before[b - 1]) > 0.5 * step[b - 1]
-        return bool(stepped) and t[b - 1] - t[a] > REACTS and _way(t, before, a, b) < 0.2 * step[b - 1]
+        return bool(stepped) and t[b - 1] - t[a] > REACTS and _way(t, before, a, b) <= max(0.2 * step[b - 1], passed)
 
     jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual and not woken(a, b)]
     # a joint at rest may start with a jump: at least two must have been moving when they froze
