@@ -334,6 +334,7 @@ BAD = {
         ),
         r"run xacro",
     ),
+    "xacro's value": (lambda t: t.replace('xyz="0.045 0 0"', 'xyz="${near} 0 0"', 1), r"run xacro"),
     "not finite": (
         lambda t: t.replace('xyz="0.045 0 0"', 'xyz="nan 0 0"', 1),
         r"position of 'index_far' is nan 0 0: must be numbers",

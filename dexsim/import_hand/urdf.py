@@ -61,7 +61,8 @@ def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
     efforts and speeds that are none."""
     root = _root(path)
     out = Urdf("")
-    if any(e.tag.startswith("{") and "xacro" in e.tag for e in root.iter()):
+    words = [v for e in root.iter() for v in (*e.attrib.values(), e.tag if e.tag.startswith("{") else "")]
+    if any("xacro" in v and v.startswith("{") or "${" in v or "$(" in v for v in words):
         raise UserError(f"model {path}: has xacro macros in it; run xacro on it first: xacro {path.name} > robot.urdf")
     for tag in ("link", "joint"):
         names = [e.get("name", "") for e in root.findall(tag)]
