@@ -91,11 +91,11 @@ _ELSEWHERE = {
 def _without_absent_gl() -> None:
     """Turns MUJOCO_GL off where it names an OpenGL that is not here: MuJoCo loads it when it is imported, and commands
     that draw nothing would die of it. What draws tries each backend in a process of its own (`dexsim.view.video`)."""
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     libraries = {"osmesa": "OSMesa", "egl": "EGL"} if sys.platform == "linux" else {}
     known = ("", "off", "disable", "disabled", "false", "0", "on", "enable", "enabled", "true", "1", "glfw", "glx",
              "cgl", "wgl", *libraries)  # fmt: skip
-    if asked not in known or (asked in libraries and not ctypes.util.find_library(libraries[asked])):
+    if wanted not in known or (wanted in libraries and not ctypes.util.find_library(libraries[wanted])):
         os.environ["MUJOCO_GL"] = "off"
 
 

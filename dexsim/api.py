@@ -178,9 +178,9 @@ def diagnose(
         "remap": dict(remap or {}),
     }
     where = Path(out).expanduser()
-    asked = command.settings_of(given, where, command.started(device))
-    command.claim(asked)
-    found = search(asked, say=say or _silent)
+    parsed = command.settings_of(given, where, command.started(device))
+    command.claim(parsed)
+    found = search(parsed, say=say or _silent)
     save(found, where)
     return found
 
@@ -414,4 +414,4 @@ def _folder(path: File) -> Path:
 
 
 def _silent(_: str) -> None:
-    """Progress that nobody wants to see."""
+    """Discard progress that nobody wants to see."""

@@ -182,7 +182,7 @@ MOST_HAND = 256 << 20
 
 
 def _copy_hand(hand: Any, out: Path) -> None:
-    """The hand's folder into the bundle, whole: the simulated hand needs it, and a robot its kinematics."""
+    """Copy the hand's whole folder into the bundle: the simulated hand needs it, and a robot its kinematics."""
     import shutil
 
     from dexsim.hand import load_hand
@@ -214,7 +214,7 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     if not hasattr(of, "SIGNALS"):
         return _golden_terms(env, of.Observation(env), policy, model, steps, seed)
     names = ("observation", "q", "before", "target", "begins", *(f"signal_{n}" for n in of.SIGNALS.Signals._fields))
-    kept: dict[str, list] = {k: [] for k in names}
+    series: dict[str, list] = {k: [] for k in names}
     env.rng.manual_seed(seed)
     with torch.no_grad():
         env.reset_all()
@@ -229,22 +229,22 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
             if begins:
                 continue  # the target is the new episode's
             for name, value in (now | {"target": env.target[0].clone()}).items():
-                kept[name].append(value)
-    return _with_random(kept, model, steps, seed)
+                series[name].append(value)
+    return _with_random(series, model, steps, seed)
 
 
-def _with_random(kept: dict[str, list], model: Any, steps: int, seed: int) -> dict[str, Any]:
+def _with_random(series: dict[str, list], model: Any, steps: int, seed: int) -> dict[str, Any]:
     """Return what was kept of an episode, and as many random observations, with their actions."""
     import torch
 
     rng = torch.Generator().manual_seed(seed)
-    episode = torch.stack(kept["observation"])
+    episode = torch.stack(series["observation"])
     spread = episode.mean(0) + 3 * episode.std(0).clamp(min=0.05) * torch.randn(steps, episode.shape[1], generator=rng)
     with torch.no_grad():
         everything = torch.cat([episode, spread])
-        begins = [bool(x) for x in kept["begins"]] + [True] * steps
+        begins = [bool(x) for x in series["begins"]] + [True] * steps
         action = _actions(model, everything, begins)
-    out = {k: torch.stack(v).numpy() for k, v in kept.items() if k != "observation"}
+    out = {k: torch.stack(v).numpy() for k, v in series.items() if k != "observation"}
     return out | {"observation": everything.numpy(), "action": action.numpy()}
 
 
@@ -255,13 +255,13 @@ def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: 
 
     for row in env._sensed:
         row.noise, row.dropout, row.delay = 0.0, 0.0, (0.0, 0.0)
-    kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", "begins")}
-    kept |= {f"signal_{k}": [] for k in of.names}
+    series: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", "begins")}
+    series |= {f"signal_{k}": [] for k in of.names}
     env.rng.manual_seed(seed)
     with torch.no_grad():
         env.reset_all()
         begins = True
-        while len(kept["observation"]) < steps:
+        while len(series["observation"]) < steps:
             now = {f"signal_{k}": v[0] for k, v in of.of_env().items()}
             now |= {"observation": env.get_observations()["actor"][0].clone(), "q": env.q[0].clone(),
                     "before": env.target[0].clone(), "begins": torch.tensor(begins)}  # fmt: skip
@@ -271,8 +271,8 @@ def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: 
                 env.reset_all()
                 continue
             for name, value in (now | {"target": env.target[0].clone()}).items():
-                kept[name].append(value)
-    return _with_random(kept, model, steps, seed)
+                series[name].append(value)
+    return _with_random(series, model, steps, seed)
 
 
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
@@ -285,13 +285,13 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
     hand, (pads, taxels) = env.hand, touch_shape(env.hand)
     task, cfg = env.task, data["config"]
     of = measure.of(task["name"])
-    own, told = of.parts(env), getattr(of, "SIGNALS", of)
+    own, labels = of.parts(env), getattr(of, "SIGNALS", of)
     if "terms" in own:
         own["terms"]["sha256"] = bundle.sha256(policy.with_name(bundle.TERMS))
     table, at = [], 0
     for name, width, unit, source, scaling in own.pop("rows"):
         table.append({"name": name, "start": at, "stop": at + width, "unit": unit,
-                      "frame": told.FRAME.get(name, "palm"), "order": told.ORDER.get(name, "as declared"),
+                      "frame": labels.FRAME.get(name, "palm"), "order": labels.ORDER.get(name, "as declared"),
                       "scaling": scaling,
                       "source": source})  # fmt: skip
         at += width
@@ -382,10 +382,10 @@ def check(path: str | Path) -> bool:
         raise UserError(
             f"{file}: its arrays do not fit the bundle ({' '.join(str(error).split())[:160]}); export it again"
         ) from None
-    apart = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
+    relative = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
     found = {
-        "actions": float(apart(whole, expected).max()),
-        "actions, one row at a time": float(apart(single, expected).max()),
+        "actions": float(relative(whole, expected).max()),
+        "actions, one row at a time": float(relative(single, expected).max()),
         "observations": float(np.abs(built).max()),
         "targets [rad]": float(np.abs(aimed).max()),
     }

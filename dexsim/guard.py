@@ -49,7 +49,8 @@ FULL = re.compile("(could not|unable to|cannot|failed to) allocate|out of memory
 TRUSTED = "DEXSIM_LIMITS"
 """Environment variable: a number that all limits are multiplied with."""
 PACKAGE = Path(__file__).parent
-_inside = False
+inside = False
+"""Whether this process works within a reader's limits already."""
 
 
 def ours(path: Path) -> bool:
@@ -63,7 +64,7 @@ def call(
     """Return `function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size:
     bytes of the file, with which the limits grow; patience: multiplies the processor time, where more than reading is
     done; wanted: false leaves the answer there (None). Raises UserError."""
-    if _inside:  # within a reader's limits already
+    if inside:
         return function(*args)
     times = typed.number(TRUSTED, os.environ.get(TRUSTED, "1"), 1.0, 1e6)
     seconds = times * (patience * SECONDS + SECONDS_A_MIB * size / 2**20)
@@ -128,9 +129,9 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
 def _child(
     send: Connection, here: str, function: Callable[..., Any], args: tuple, seconds: float, most: int, wanted: bool
 ) -> None:
-    """The process: works out, answers, ends."""
-    global _inside
-    _inside = True
+    """Work out the answer in the process, send it, and end."""
+    global inside
+    inside = True
     os.chdir(here)  # a process that is begun anew has that of the program's start
     gc.freeze()  # what a fork would collect of the program may wait for a thread that is not here
     system.limit(seconds, most)
@@ -162,7 +163,7 @@ def _child(
 
 
 def _opened(event: str, about: tuple) -> None:
-    """Python's readers open regular files only."""
+    """Refuse what is no regular file, where Python's readers open one."""
     if event != "open" or not isinstance(about[0], (str, bytes)):
         return
     try:

@@ -89,7 +89,7 @@ def hull_obj(points: np.ndarray) -> str:
 
 
 def draw(shape: Shape, mesh: Path, picture: Path) -> None:
-    """The mesh, its convex parts in colours, and the distance grid cut through its middle."""
+    """Draw the mesh, its convex parts in colours, and the distance grid cut through its middle."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection

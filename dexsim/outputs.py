@@ -88,11 +88,11 @@ def recover(folder: Path) -> None:
     sums = pending.get("files") if isinstance(pending, dict) else None
     stage = folder / str(pending.get("stage")) if isinstance(pending, dict) else folder
     if isinstance(sums, dict) and files.abandoned(stage.name) and stage.parent == folder and not stage.is_symlink():
-        left = {str(k): str(v) for k, v in sums.items() if _is(folder, stage / str(k), str(v))}
+        unmoved = {str(k): str(v) for k, v in sums.items() if _is(folder, stage / str(k), str(v))}
         with contextlib.suppress(OSError, UserError):
-            for path in left:
+            for path in unmoved:
                 _refuse(folder, folder / path, "out=")
-            _move(folder, stage, left)
+            _move(folder, stage, unmoved)
             _write_note(folder, _known(folder))
     files.sweep(folder)
 

@@ -155,8 +155,8 @@ def after_fork(forget: Callable[[], None]) -> None:
 def renderers() -> tuple[str, ...]:
     """Return offscreen OpenGL to try in turn; only the one that MUJOCO_GL asks for, where this system knows it."""
     known = RENDERERS.get(sys.platform, RENDERERS["linux"])
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    return (asked,) if asked in known else known
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    return (wanted,) if wanted in known else known
 
 
 def renderer_environment(name: str) -> dict[str, str]:

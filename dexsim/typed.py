@@ -96,9 +96,9 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
             valid = ", ".join(_fields(inspect.type_info(kind), place))
             what = f"{place}{'.' * bool(place)}{name}: unknown; valid ones: {valid}"
             raise UserError(f"{source}: {what}{f'; {fix}' if fix else ''}") from None
-        shown = f" ({_shown(data, place)})" if place else ""
+        excerpt = f" ({_excerpt(data, place)})" if place else ""
         fix = f"; {fix}" if fix else ""
-        raise UserError(f"{source}: {place or 'its contents'}{shown}: {what[0].lower()}{what[1:]}{fix}") from None
+        raise UserError(f"{source}: {place or 'its contents'}{excerpt}: {what[0].lower()}{what[1:]}{fix}") from None
     except RecursionError:
         raise UserError(f"{source}: nested too deeply{f'; {fix}' if fix else ''}") from None
     finite(data, source, fix)
@@ -193,7 +193,7 @@ def finite(node: Any, source: object, fix: str = "", place: str = "") -> None:
         raise UserError(f"{source}: {place or 'its value'} ({what}): expected a number{f'; {fix}' if fix else ''}")
 
 
-def _shown(data: Any, place: str) -> str:
+def _excerpt(data: Any, place: str) -> str:
     """Return the value at a place, shortened."""
     text = " ".join(repr(_at(data, place)).split())
     return text if len(text) <= 60 else text[:57] + "..."

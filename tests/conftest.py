@@ -13,9 +13,13 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-"""Before NumPy is loaded, here and in programs that tests start. Its threads wait for each other by spinning: where
-other work shares the cores, products of small matrices take ten times as long with two threads as with one."""
+from dexsim import guard
+
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
+"""Before NumPy and torch are loaded, here and in programs that tests start. Their threads wait for each other by
+spinning: where other work shares the cores, products of small matrices take ten times as long with two threads as with
+one."""
 
 
 def pytest_configure(config) -> None:
@@ -35,6 +39,13 @@ def pytest_collection_modifyitems(items) -> None:
     """Files with tests of half a minute and more come first: a worker that has done its own takes over the last of
     another's, and they should be short ones."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item) -> None:
+    """Tests that are not of the limits on strangers' files (mark `limits`) read them in their own process: each reader
+    would be a fork of it, which takes longer than most of these tests."""
+    guard.inside = item.get_closest_marker("limits") is None
 
 
 def pytest_collection(session) -> None:

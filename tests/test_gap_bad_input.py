@@ -121,7 +121,14 @@ LOST = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "change"), STILL, ids=[c.__name__ for _, c in STILL])
+def cases(changes, *quick):
+    """Yield all of them; those that are not named `quick`, whose fault tests of the audit find too, are slow."""
+    for kind, change in changes:
+        marks = [] if change in quick else [pytest.mark.slow]
+        yield pytest.param(kind, change, id=change.__name__, marks=marks)
+
+
+@pytest.mark.parametrize(("kind", "change"), cases(STILL, wrapped_effort, drifting_stamp))
 def test_a_bad_channel_is_named_and_the_rest_still_judged(rig, tmp_path, kind, change):
     d = judged(rig, tmp_path, change)
     bad = [f for f in d.data["findings"] if f["effect"] == "bad_channel"]
@@ -133,7 +140,7 @@ def test_a_bad_channel_is_named_and_the_rest_still_judged(rig, tmp_path, kind, c
     assert "not what it says" in d.sentence
 
 
-@pytest.mark.parametrize(("kind", "change"), LOST, ids=[c.__name__ for _, c in LOST])
+@pytest.mark.parametrize(("kind", "change"), cases(LOST, degrees_everywhere, reversed_commands, stopped, late_commands))
 def test_a_bad_position_or_command_makes_the_joint_unusable(rig, tmp_path, kind, change):
     d = judged(rig, tmp_path, change, keep=(1, 2) if change is late_commands else (0, 2))
     bad = [f["regime"].split(":")[0] for f in d.data["findings"]]

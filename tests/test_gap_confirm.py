@@ -174,25 +174,35 @@ def best_of(m, runs, case, trials, **more):
     ("effect", "label", "hidden", "x", "servo", "temperature"),
     [
         ("backlash", "", {"backlash": 0.05}, [0.05, 0.1], {"loop_encoder": "motor"}, False),
-        (
+        pytest.param(
             "backlash",
             "",
             {"backlash": 0.05},
             [0.05, 0.1],
             {"loop_encoder": "motor", "position_encoder": "motor"},
             False,
+            marks=pytest.mark.slow,
         ),
         ("compliance", "", {"softness": 0.4}, [0.4, 0.1], {"loop_encoder": "motor"}, False),
         ("lag", "velocity filter", {"speed_lag": 0.03}, [0.03], None, False),
-        (
+        pytest.param(
             "position_scale",
             "eccentricity",
             {"eccentric_sin": 0.15, "eccentric_cos": 0.15},
             [0.15, 0.15],
             {"kp": 0.8, "kd": 0.02},
             False,
+            marks=pytest.mark.slow,
         ),
-        ("deadband", "counted from its edge", {"deadband": 0.03, "deadband_kind": 2.0}, [0.03], None, False),
+        pytest.param(
+            "deadband",
+            "counted from its edge",
+            {"deadband": 0.03, "deadband_kind": 2.0},
+            [0.03],
+            None,
+            False,
+            marks=pytest.mark.slow,
+        ),
         (
             "thermal",
             "friction",

@@ -51,12 +51,12 @@ def pages(tmp_path_factory):
         str(model),
         str(servo),
         next_recording=False,
-        allowed={"command_delay", "lag", "coulomb_friction"},  # others are more rows of the same tables
+        allowed={"command_delay"},  # others are more rows of the same tables
     )
     paths, model, servo = press_rig.record(folder / "touch", 2, 5.0, gains={54: 0.4, 66: 0.0})
     out["touch"] = replace(
         out["joint"], recordings=paths, out=folder / "touch_out", model=str(model), servo=str(servo),
-        allowed={"tactile_gain", "contact_stiffness"},
+        allowed={"tactile_gain"},
     )  # fmt: skip
     from dexsim.recording import read, write
 

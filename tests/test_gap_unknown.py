@@ -46,11 +46,11 @@ def searched(unknown: tuple[str, ...], changes: dict[str, float], **more):
 @pytest.mark.parametrize(
     ("name", "true", "effect"),
     [
-        ("softness", 0.2, "compliance"),
-        ("backlash", 0.05, "backlash"),
+        pytest.param("softness", 0.2, "compliance", marks=pytest.mark.slow),
+        pytest.param("backlash", 0.05, "backlash", marks=pytest.mark.slow),
         ("thermal_torque", -0.006, "thermal"),
         ("speed_lag", 0.03, "lag"),
-        ("load_friction", 0.2, "load_friction"),
+        pytest.param("load_friction", 0.2, "load_friction", marks=pytest.mark.slow),
     ],
 )
 def test_an_unknown_column_is_fitted_with_every_hypothesis_and_handed_on(name, true, effect):

@@ -16,6 +16,8 @@ import pytest
 from dexsim import files, guard, model_file
 from dexsim.errors import UserError
 
+pytestmark = pytest.mark.limits
+
 
 def _arrays(n):
     return {"a": np.arange(n), "none": np.zeros(0), "text": "x"}

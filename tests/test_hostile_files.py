@@ -323,6 +323,7 @@ LIMITS = {
 }
 
 
+@pytest.mark.limits
 @pytest.mark.parametrize("kind", LIMITS)
 def test_yaml_keeps_its_limits(kind):
     begun = time.process_time()
@@ -578,13 +579,14 @@ READERS = ("hand", "model=", "model_file=", "import-hand")
 
 
 def pairs():
-    """Yield each kind with each reader; quick are all kinds with one reader, and copies with all of them."""
+    """Yield each kind with each reader; quick are all kinds with one reader, and one kind with all of them."""
     for reader in READERS:
         for kind in MODELS:
-            quick = reader == "hand" or kind == "copies"
+            quick = reader == "hand" or kind == "pipe included by an included one"
             yield pytest.param(kind, reader, marks=[] if quick else [pytest.mark.slow])
 
 
+@pytest.mark.limits
 @pytest.mark.parametrize(("kind", "reader"), list(pairs()))
 def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp_path, monkeypatch):
     """Each as a hand's own, a diagnosis', a training's and one to be imported, in one line."""
@@ -621,6 +623,7 @@ def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp
     assert "xhand_right.xml" in (text := one_line(error)), text
 
 
+@pytest.mark.limits
 def test_what_is_taken_out_of_a_model_is_taken_out_within_limits(tmp_path, monkeypatch):
     """MuJoCo looks for a keyframe among all of them, to take it out."""
     from dexsim import guard
@@ -641,12 +644,20 @@ def test_an_object_that_is_named_twice_is_said():
         own.named({"train": ["box", "sphere", "box"], "held_out": []})
 
 
+@pytest.fixture(scope="module")
+def grasping():
+    from dexsim.cli import start
+    from dexsim.paths import CONFIGS
+
+    return start.for_train(["task=grasp", "device=cpu", "worlds=2"], CONFIGS).cfg
+
+
 NAMES = ("a" * 5000, "a/" * 3000, "~nobody_of_this_name/x.obj", "x\0y.obj", "/proc/1/map_files", "\x1b[2J\u202e\ud800")
 
 
 @pytest.mark.parametrize("name", NAMES, ids=["long", "deep", "nobody's", "a zero", "not ours", "not printable"])
 @pytest.mark.parametrize("key", ["objects", "kept_out", "hand", "model_file", "task.evaluation.base"])
-def test_a_name_that_no_file_can_have_is_one_line(payload, tmp_path, key, name):
+def test_a_name_that_no_file_can_have_is_one_line(payload, grasping, tmp_path, key, name):
     """In a checkpoint's settings, as they are built."""
     from dexsim.assets.objects import own
     from dexsim.cli import start
@@ -655,7 +666,7 @@ def test_a_name_that_no_file_can_have_is_one_line(payload, tmp_path, key, name):
     from dexsim.tasks import base_path
     from dexsim.tasks.building import model_of
 
-    config = start.for_train(["task=grasp", "device=cpu", "worlds=2"], CONFIGS).cfg
+    config = copy.deepcopy(grasping)
     uses = {"objects": lambda: own.own_shape(name), "kept_out": lambda: own.own_shape(name),
             "hand": lambda: load_hand(name), "model_file": lambda: model_of(load_hand("xhand"), name),
             "task.evaluation.base": lambda: base_path.of(name if name.endswith(".csv") else f"{name}.csv")}  # fmt: skip
@@ -671,6 +682,7 @@ def test_a_name_that_no_file_can_have_is_one_line(payload, tmp_path, key, name):
             assert str(error).isprintable() and "x.pt" in str(error) and len(str(error)) < 700
 
 
+@pytest.mark.limits
 @pytest.mark.parametrize("kind", ["unpacks to 300 MiB", "cut off", "no archive", "a pipe", "objects"])
 def test_archives_of_objects_poses_and_dumps_have_limits(kind, tmp_path, monkeypatch):
     from dexsim import guard

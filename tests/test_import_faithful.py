@@ -63,13 +63,12 @@ def imported(tmp_path: Path, text: str, suffix: str = ".xml", **given):
     return load_hand(tmp_path / "hand"), "\n".join(result.lines), result
 
 
-@pytest.mark.parametrize("names", [
-    ("1.", "2."), ("on", "null"), ("0x", "1e"), ("-a ", "~b"), ("a: b#", 'q"'), ("é.j", "="),
-])  # fmt: skip
-def test_names_of_any_kind_read_back(tmp_path, names):
-    escaped = [n.replace('"', "&quot;") for n in names]
-    hand, _, _ = imported(tmp_path, jaws(joints=escaped))
-    expected = [f"{n}{k}" for k in range(3) for n in names]
+def test_names_of_any_kind_read_back(tmp_path):
+    expected = ["1.", "2.", "on", "null", "0x", "1e", "-a 0", "~b", "a: b#", 'q"', "é.j", "="]
+    text = jaws(fingers=6)
+    for k, name in enumerate(expected):
+        text = text.replace(f'"{("first", "second")[k % 2]}{k // 2}"', '"' + name.replace('"', "&quot;") + '"')
+    hand, _, _ = imported(tmp_path, text)
     assert list(hand.joints) == expected and sorted(hand.file.poses.open) == sorted(expected)
     content = yaml.safe_load((tmp_path / "hand" / "hand.yaml").read_text())
     content["joints"][1]["armature"] = 3e-4  # a place that no step asks for

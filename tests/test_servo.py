@@ -129,7 +129,9 @@ def test_every_column_says_how_large_a_usual_one_is():
         pytest.param(tuple(FEATURES), id="all_features"),
     ],
 )
-@pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
+@pytest.mark.parametrize(
+    "real, tolerance", [pytest.param(wp.float32, 1e-5, marks=pytest.mark.slow), (wp.float64, 1e-12)]
+)
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     """Also that a kernel built without a feature does not see its columns."""
     rng = np.random.default_rng(2)

@@ -111,8 +111,8 @@ def explicit(
 
 
 @pytest.mark.parametrize(("columns", "loop"), [
-    ({"backlash": 0.04, "coulomb_friction": 0.01}, "motor"),
-    ({"softness": 0.15}, "motor"),
+    pytest.param({"backlash": 0.04, "coulomb_friction": 0.01}, "motor", marks=pytest.mark.slow),
+    pytest.param({"softness": 0.15}, "motor", marks=pytest.mark.slow),
     ({"softness": 0.05}, "joint"),
     ({"softness": 0.05, "backlash": 0.03, "coulomb_friction": 0.02}, "motor"),
 ])  # fmt: skip

@@ -127,8 +127,9 @@ def xmat_of(engine: PosedEngine, world: int, body: int) -> np.ndarray:
 def test_readings_do_not_change_when_all_is_turned(hand):
     out = []
     turn, shift = random_rotation(np.random.default_rng(1)), np.array([0.3, -0.2, 0.1])
+    layout = hand_layout(hand)
     for move in (False, True):
-        engine, touch = feeling(hand, hand_layout(hand), 3)
+        engine, touch = feeling(hand, layout, 3)
         drop_in(engine, touch, 5)
         if move:
             r = torch.as_tensor(turn, dtype=torch.float32)

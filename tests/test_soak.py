@@ -18,6 +18,8 @@ from tests.soak import __main__ as soak
 from tests.soak import parts
 from tests.soak.watch import COLUMNS, Watch, grows, judge, look
 
+pytestmark = pytest.mark.limits
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -88,7 +88,7 @@ def test_effort_that_follows_a_jump_of_its_target_is_none():
 
 def test_a_clock_set_back_for_good_loses_only_what_overlaps():
     t = np.r_[T, T - 3.0 + 10.0]
-    on = timeline.kept(t)
+    on = timeline.possible(t)
     assert (np.diff(t[on]) >= 0).all() and on.sum() >= len(t) - 300
     (gap,) = timeline.gaps(t, on)
     assert gap == pytest.approx((7.0, 10.0), abs=0.05)
@@ -101,7 +101,7 @@ def test_stamps_that_jump_for_a_sample_are_left_out(jump, share):
     t = T.copy()
     at = rng.choice(len(t), int(share * len(t)), replace=False)
     t[at] += jump
-    on = timeline.kept(t)
+    on = timeline.possible(t)
     assert not on[at].any() and on.sum() >= len(t) - len(at) - 2
     assert not timeline.gaps(t, on)
 

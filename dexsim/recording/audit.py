@@ -92,8 +92,8 @@ def _of_joints(r: Recording) -> list[Finding]:
         audit_values.units,
     ):
         found += check(r)
-    told = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
-    return [*found, *reach.unreachable(r, told)]
+    faulty = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
+    return [*found, *reach.unreachable(r, faulty)]
 
 
 def table(findings: Sequence[Finding]) -> str:

@@ -153,14 +153,14 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
             )
     if len(offsets) > 1:
         low, high = min(offsets, key=offsets.__getitem__), max(offsets, key=offsets.__getitem__)
-        apart = offsets[high] - offsets[low]
-        if apart > 2 * SKEW_S:
+        skew = offsets[high] - offsets[low]
+        if skew > 2 * SKEW_S:
             yield Finding(
                 "clock_skew",
                 high,
                 0.0,
                 1,
-                f"the clocks that stamp {high} and {low} are {apart * 1e3:.4g} ms apart",
+                f"the clocks that stamp {high} and {low} are {skew * 1e3:.4g} ms apart",
                 "warning",
             )
 

@@ -67,11 +67,11 @@ def commanded(r: Recording) -> Iterator[Finding]:
     """Yield that nothing says what the joints were asked for: an error, but where touch was recorded, which `calibrate
     touch` reads by itself."""
     if not np.isfinite(r.commands.value).any():
-        felt = r.tactile is not None and len(r.tactile) > 0
-        use = "calibrate touch can use this recording, diagnose and replay cannot" if felt else (
+        has_touch = r.tactile is not None and len(r.tactile) > 0
+        use = "calibrate touch can use this recording, diagnose and replay cannot" if has_touch else (
             "diagnose and replay cannot use this recording")  # fmt: skip
         text = f"no commands: {use}; {COMMANDS_FIX}"
-        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if felt else "error")
+        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if has_touch else "error")
     have = [np.isfinite(x.value).any(0) if len(x) else np.zeros(len(r.joints), bool) for x in (
         r.commands, r.states.position)]  # fmt: skip
     if have[0].any() and have[1].any() and not (have[0] & have[1]).any():

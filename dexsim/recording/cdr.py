@@ -25,24 +25,24 @@ class Cdr:
         self._b += b"\0" * (-(len(self._b) - 4) % size)
 
     def pack(self, code: str, value: float) -> None:
-        """One number; `code` as in `struct`."""
+        """Append one number; `code` as in `struct`."""
         self._align(struct.calcsize(code))
         self._b += struct.pack("<" + code, value)
 
     def string(self, text: str) -> None:
-        """A string with its length and a closing zero."""
+        """Append a string with its length and a closing zero."""
         data = text.encode()
         self.pack("I", len(data) + 1)
         self._b += data + b"\0"
 
     def strings(self, texts: Sequence[str]) -> None:
-        """A sequence of strings."""
+        """Append a sequence of strings."""
         self.pack("I", len(texts))
         for text in texts:
             self.string(text)
 
     def sequence(self, values: np.ndarray | Sequence[float] | None, dtype: str) -> None:
-        """A sequence of numbers ("<f8" or "<f4"); None is empty."""
+        """Append a sequence of numbers ("<f8" or "<f4"); None is empty."""
         array = np.asarray([] if values is None else values, dtype=dtype).ravel()
         self.pack("I", array.size)
         self.array(array)
@@ -54,13 +54,13 @@ class Cdr:
             self._b += array.tobytes()
 
     def header(self, stamp_ns: int, frame: str = "") -> None:
-        """std_msgs/Header."""
+        """Append a std_msgs/Header."""
         self.pack("i", stamp_ns // 1_000_000_000)
         self.pack("I", stamp_ns % 1_000_000_000)
         self.string(frame)
 
     def stamp(self, stamp_ns: int) -> None:
-        """Another time in the header of a message that begins with one."""
+        """Set another time in the header of a message that begins with one."""
         struct.pack_into("<iI", self._b, len(_ENCAPSULATION), *divmod(stamp_ns, 1_000_000_000))
 
     def bytes(self) -> bytes:

@@ -90,7 +90,7 @@ class Table:
 
     meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
     left out; unnamed: whether no column names the one joint; si: (quantity, joint) in SI units, by their own unit;
-    told: by quantity and joint, which lines tell of it (all where it is not there); arrays [T, ...]: of other
+    reported: by quantity and joint, which lines tell of it (all where it is not there); arrays [T, ...]: of other
     topics; ranges: the unit along its range that a joint's columns name."""
 
     joints: list[str]
@@ -101,16 +101,16 @@ class Table:
     findings: list[Finding] = field(default_factory=list)
     unnamed: bool = False
     si: set[tuple[str, str]] = field(default_factory=set)
-    told: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    reported: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     ranges: dict[str, str] = field(default_factory=dict)
 
     def carried(self, quantity: str) -> np.ndarray | None:
         """Return [T, J] of which joints each of the quantity's samples tells; None: of all."""
-        if quantity not in self.told:
+        if quantity not in self.reported:
             return None
         lines = len(self.time[quantity])
-        out = np.stack([self.told[quantity].get(j, np.ones(lines, bool)) for j in self.joints], 1)
+        out = np.stack([self.reported[quantity].get(j, np.ones(lines, bool)) for j in self.joints], 1)
         return out[self._any(quantity)]
 
     def _any(self, quantity: str) -> np.ndarray:
@@ -155,7 +155,7 @@ def of_columns(
         raise UserError(f"recording {path}: holds no column of numbers")
     raw = _lines_of_joints(_stamped(raw))
     roles, said = _roles(path, list(raw), named), _names_in(raw)
-    raw, told = _numbers(path, raw, roles, findings, set(named.values()))
+    raw, reported = _numbers(path, raw, roles, findings, set(named.values()))
     roles = {c: r for c, r in roles.items() if c in raw}
     if not any(r[0] == "time" for r in roles.values()):
         roles |= _some_clock(raw, roles, findings)
@@ -236,7 +236,7 @@ def of_columns(
     time, start = _clock(path, found, roles, time_unit, list(raw))
     value = {q: c for q, c in found.items() if q != "time"}
     lines: dict[str, dict[str, np.ndarray]] = {}
-    for column, on in told.items():
+    for column, on in reported.items():
         quantity, joint = roles[column][:2]
         lines.setdefault(quantity, {})[joint or joints[0]] = on
     ranges = {}
@@ -304,7 +304,7 @@ def _numbers(
     """Return (columns as numbers, those without any left out; of columns with empty places, where there is a value
     [T]). Texts that are none are found, but in columns that no role asks for. named: columns that the user named."""
     out: dict[str, np.ndarray] = {}
-    told: dict[str, np.ndarray] = {}
+    reported: dict[str, np.ndarray] = {}
     words, example = 0, ""
     for column, cells in raw.items():
         if not isinstance(cells, list):
@@ -333,11 +333,11 @@ def _numbers(
             words += bad
             empty = np.array([not x.strip() for x in cells])
             if empty.any() and not clock:
-                told[column] = ~empty
+                reported[column] = ~empty
     if words:
         text = f"{words} entries are not numbers ('{example[:20]}'; a number is like 1.5e-3); taken as missing"
         findings.append(Finding("unreadable", "", np.nan, words, text, "error"))
-    return out, told
+    return out, reported
 
 
 def _some_clock(

@@ -93,7 +93,8 @@ def open_container(path: Path) -> Container:
 
 
 def _sqlite(data: Any, out: Container) -> None:
-    """The messages of an SQLite bag. Definitions that it lacks (before ROS 2 Iron) are those of the standard types."""
+    """Return the messages of an SQLite bag. Definitions that it lacks (before ROS 2 Iron) are those of the standard
+    types."""
     try:
         with contextlib.closing(sqlite3.connect(":memory:")) as db:
             db.deserialize(data)
@@ -128,7 +129,7 @@ def _standard(kind: str) -> str:
 
 
 def _mcap(data: mmap.mmap | bytes, size: int, out: Container) -> None:
-    """The records of an MCAP file."""
+    """Return the records of an MCAP file."""
     finished = False
     for opcode, at, length in _records(data, out):
         body = data[at : at + length]
@@ -220,7 +221,7 @@ def _unzip(packed: Any) -> bytes:
 
 
 def _chunk(body: bytes, cut: bool, out: Container) -> None:
-    """The records of a chunk. One whose checksum fails is left out whole; of one cut short, what is complete is
+    """Return the records of a chunk. One whose checksum fails is left out whole; of one cut short, what is complete is
     kept."""
     before = len(out.messages)
     span = None
@@ -261,5 +262,5 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
         text = " ".join(str(error).split()) or type(error).__name__
         out.damage.append((span, 0, f"a chunk of {len(body)} bytes is lost: {text}"))
     if cut:
-        kept = len(out.messages) - before
-        out.damage.append((span, 0, f"the last chunk is cut off; its first {kept} messages were recovered"))
+        usable = len(out.messages) - before
+        out.damage.append((span, 0, f"the last chunk is cut off; its first {usable} messages were recovered"))

@@ -217,7 +217,7 @@ def write_plan(p: Plan, folder: Path) -> list[Path]:
 
 
 def write_commands(p: Plan, path: str | Path) -> None:
-    """The commands alone, as a recording without states."""
+    """Write the commands alone, as a recording without states."""
     m = p.mechanism
     notes = yaml.safe_dump(
         [[s.kind, list(s.joints), round(s.start, 3), round(s.end, 3)] for s in p.segments],

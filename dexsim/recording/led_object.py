@@ -46,7 +46,7 @@ class Stated:
     friction: float = 0.8
 
     def about(self) -> dict[str, Any]:
-        """As a recorded play states it: MuJoCo's sizes. Raises UserError."""
+        """Return the object as a recorded play states it, in MuJoCo's sizes. Raises UserError."""
         shapes = library()
         if self.shape not in shapes:
             raise UserError(f"object={self.shape}: must be one of {', '.join(shapes)}")
@@ -126,7 +126,7 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
 
 
 def _contact(spec: mujoco.MjSpec, hand: Hand, about: dict[str, Any], d: float) -> None:
-    """Friction on the hand, stiffness and damping of the tips: see `tasks.objects.Objects`."""
+    """Set friction on the hand, stiffness and damping of the tips: see `tasks.objects.Objects`."""
     model = spec.compile()
     for geom in spec.geoms:
         if not geom.contype or geom.parent.name == NAME:
@@ -143,7 +143,7 @@ def _contact(spec: mujoco.MjSpec, hand: Hand, about: dict[str, Any], d: float) -
 
 
 def _solver(spec: mujoco.MjSpec, hand: Hand, sim: dict[str, Any]) -> None:
-    """As in the hand's tasks (`tasks.env`), so that a play is repeated as it was."""
+    """Set the solver as in the hand's tasks (`tasks.env`), so that a play is repeated as it was."""
     for joint in spec.joints:
         if joint.name in hand.joints:
             joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]

@@ -174,7 +174,7 @@ def _hand_folder(model: str | Path) -> Path | None:
 
 
 def _moved(model: mujoco.MjModel, where: str) -> None:
-    """UserError for a joint that moves nothing."""
+    """Raise UserError for a joint that moves nothing."""
     for k in range(model.njnt):
         if not model.dof_M0[model.jnt_dofadr[k]] > 0:
             raise UserError(

@@ -22,8 +22,8 @@ from dexsim.recording.schema import (
     TACTILE_UNIT,
     UNIT_KEYS,
     Finding,
+    brief,
     numbers,
-    shown,
 )
 from dexsim.recording.units import split
 
@@ -70,7 +70,7 @@ def collect(
                         "",
                         NAN,
                         1,
-                        f"{key}: '{shown(stated[key])}' as recorded, '{shown(text)}' by {source}; the latter is used",
+                        f"{key}: '{brief(stated[key])}' as recorded, '{brief(text)}' by {source}; the latter is used",
                         "info",
                     )
                 )

@@ -201,7 +201,7 @@ class _Reading:
     def _first(self, messages: list[Message]) -> int:
         """Return the earliest host time [ns] of those that can be true."""
         base = sorted(m.log_time for m in messages)[len(messages) // 2]
-        keep = timeline.kept(np.array([(m.log_time - base) * 1e-9 for m in messages]))
+        keep = timeline.possible(np.array([(m.log_time - base) * 1e-9 for m in messages]))
         return min((m.log_time for m, on in zip(messages, keep, strict=True) if on), default=base)
 
     def _losses(self) -> str:
@@ -362,7 +362,7 @@ class _Reading:
         another."""
         keep = np.zeros(len(t), bool)
         for part in written if written is not None else [slice(0, len(t))]:
-            keep[part] = timeline.kept(t[part])
+            keep[part] = timeline.possible(t[part])
             self.breaks += timeline.gaps(t[part], keep[part])
         lost = np.flatnonzero(~keep)
         if len(lost):
@@ -539,20 +539,21 @@ class _Reading:
             if len(mapping) < len(theirs) and 3 * len(mapping) < 2 * len(self.hand.joints):  # not that hand
                 mapping = {their: their for their in theirs}
         renamed = [f"{a} is {b}" for a, b in mapping.items() if a != b]
-        left = [n for n in theirs if n not in mapping]
+        foreign = [n for n in theirs if n not in mapping]
         if renamed:
             self.findings.append(Finding("joint_names", "", NAN, len(renamed), "; ".join(renamed), "info"))
-        if left:
+        if foreign:
             self.findings.append(
                 Finding(
-                    "joint_names", "", NAN, len(left), f"not joints of the model, left out: {', '.join(left)}", "info"
+                    "joint_names", "", NAN, len(foreign), f"not joints of the model, left out: {', '.join(foreign)}",
+                    "info",
                 )
             )
         return mapping
 
     def _convert(self, r: Recording, units: Units, theirs: Mapping[str, str]) -> None:
-        """The values of each joint in SI: by the unit that is stated, else by a guess, with a warning. theirs: their
-        name of each joint."""
+        """Return the values of each joint in SI: by the unit that is stated, else by a guess, with a warning. theirs:
+        their name of each joint."""
         s, said = r.states, dict[tuple[str, str, bool], dict[str, dict[str, None]]]()
         parts = {"command": r.commands, "position": s.position, "velocity": s.velocity, "effort": s.effort,
                  "temperature": r.temperature, "duty": r.duty}  # fmt: skip

@@ -27,7 +27,7 @@ import numpy as np
 
 from dexsim import door, files, guard
 from dexsim.errors import UserError
-from dexsim.recording.schema import TACTILE, Finding, shown
+from dexsim.recording.schema import TACTILE, Finding, brief
 
 GROUP = "dexsim.readers"
 MAX_EPISODES = 100_000
@@ -405,7 +405,7 @@ class Torch:
             found = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:
             raise UserError(
-                f"recording {path}: holds more than plain tensors ({shown(str(error).splitlines()[0])}); save a "
+                f"recording {path}: holds more than plain tensors ({brief(str(error).splitlines()[0])}); save a "
                 "dictionary of tensors: torch.save({'time': t, 'des_dof_pos': c, 'dof_pos': q}, ...)"
             ) from None
         if not isinstance(found, dict):

@@ -206,7 +206,7 @@ class Series:
 
     @classmethod
     def empty(cls, topic: str, *shape: int) -> Series:
-        """No samples of values of this shape."""
+        """Return no samples of values of this shape."""
         return cls(np.zeros(0), np.zeros((0, *shape)), topic)
 
 
@@ -279,10 +279,10 @@ class Recording:
         """Return the recording as one for each group of joints that are told of in the same messages, without the
         messages of others; itself where each message tells of all."""
         groups: dict[tuple[bytes, ...], list[int]] = {}
-        told = [s.carried for s in (self.commands, self.states.position)]
+        masks = [s.carried for s in (self.commands, self.states.position)]
         for j in range(len(self.joints)):
-            groups.setdefault(tuple(b"" if c is None else c[:, j].tobytes() for c in told), []).append(j)
-        if len(groups) < 2 and all(c is None or c.all() for c in told):
+            groups.setdefault(tuple(b"" if c is None else c[:, j].tobytes() for c in masks), []).append(j)
+        if len(groups) < 2 and all(c is None or c.all() for c in masks):
             return [self]
         return [self._of(columns) for columns in groups.values()]
 
@@ -378,7 +378,7 @@ class Recording:
         return replace(self.tactile, value=self.tactile.value * (self.tactile_lsb * self.tactile_axis_sign))
 
 
-def shown(text: str) -> str:
+def brief(text: str) -> str:
     """Return a value as a message names it: one line, not long."""
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
@@ -392,13 +392,13 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
         raise UserError(
-            f"{where}: metadata {key}='{shown(text)}' must be {count} finite number{'s' * (count > 1)};"
+            f"{where}: metadata {key}='{brief(text)}' must be {count} finite number{'s' * (count > 1)};"
             f" correct it with meta.{key}=..."
         )
     low, high = ALLOWED.get(key, (-np.inf, np.inf))
     if ((values < low) | (values > high)).any():
         raise UserError(
-            f"{where}: metadata {key}='{shown(text)}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=..."
+            f"{where}: metadata {key}='{brief(text)}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=..."
         )
     return values
 
@@ -409,7 +409,7 @@ def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray
     values = numbers(text, 1 if count == 1 else len(joints), "effort_sign", where)
     if not np.isin(values, (-1, 0, 1)).all():
         raise UserError(
-            f"{where}: metadata effort_sign='{shown(text)}' must hold +1, -1 or 0; correct it with meta.effort_sign=..."
+            f"{where}: metadata effort_sign='{brief(text)}' must hold +1, -1 or 0; correct it with meta.effort_sign=..."
         )
     return np.broadcast_to(values, len(joints)).copy()
 

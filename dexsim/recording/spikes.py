@@ -58,17 +58,18 @@ def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
     near = np.where(far, np.nan, v)
     for _ in range(2):
         near = np.where(np.isnan(near), np.r_[np.nan, near[:-1]], near)
-    left = np.r_[np.nan, near[:-1]]
+    prior = np.r_[np.nan, near[:-1]]
     near = np.where(far, np.nan, v)
     for _ in range(2):
         near = np.where(np.isnan(near), np.r_[near[1:], np.nan], near)
-    right = np.r_[near[1:], np.nan]
-    apart = np.abs(right - left)
-    back = np.isnan(apart) | (
-        apart
+    following = np.r_[near[1:], np.nan]
+    change = np.abs(following - prior)
+    back = np.isnan(change) | (
+        change
         < 0.5
         * np.minimum(
-            np.abs(v - np.where(np.isnan(left), v - off, left)), np.abs(v - np.where(np.isnan(right), v - off, right))
+            np.abs(v - np.where(np.isnan(prior), v - off, prior)),
+            np.abs(v - np.where(np.isnan(following), v - off, following)),
         )
     )
     far &= back

@@ -146,9 +146,9 @@ def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
         return None
     seconds, rest, position, velocity, effort = found
     rows = JointRows(one.names, position, velocity, effort, nanoseconds(seconds, rest))
-    told = rows[0]
-    same = told.stamp == one.stamp and all(
-        _equal(getattr(told, k), getattr(one, k)) for k in ("position", "velocity", "effort")
+    first_row = rows[0]
+    same = first_row.stamp == one.stamp and all(
+        _equal(getattr(first_row, k), getattr(one, k)) for k in ("position", "velocity", "effort")
     )
     return rows if same else None
 

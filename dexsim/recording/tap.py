@@ -53,7 +53,7 @@ def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.
 
     @wp.func
     def remembered(w: int, j: int, first: int, state: wp.array3d(dtype=real)):
-        """(what a joint's drive remembers, whether that is nothing yet)."""
+        """Return (what a joint's drive remembers, whether that is nothing yet)."""
         memory = Memory()
         fresh = bool(True)
         if wp.static(remembers):
@@ -204,7 +204,7 @@ class PlayRecorder:
         return out
 
     def _fetch(self) -> None:
-        """What waits on the device goes to the tracks."""
+        """Move what waits on the device to the tracks."""
         if not self._waiting:
             return
         flat = torch.stack(self._waiting).cpu().numpy()
@@ -244,7 +244,7 @@ class PlayRecorder:
         return path
 
     def claim(self, path: str | Path) -> None:
-        """What `save` would write can be written, and is not there yet. Raises UserError."""
+        """Check that what `save` would write can be written, and is not there yet. Raises UserError."""
         for to in self._paths(self.place(path)).values():
             outputs.new(to, "record=")
 
@@ -369,7 +369,7 @@ class _Track:
         self.over, self._waits = False, False
 
     def finish(self) -> None:
-        """The episode that goes on ends here; the longer one is kept."""
+        """End the episode that goes on; the longer one is kept."""
         if len(self._now.times) > len(self.episode.times):
             self.episode = self._now
         self._now, self._waits = _Episode(), False
@@ -385,8 +385,8 @@ class _Track:
         done: np.ndarray,
         touch: np.ndarray | None,
     ) -> None:
-        """One control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows [K,
-        W], target [J] and touch as they are after it."""
+        """Add one control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows
+        [K, W], target [J] and touch as they are after it."""
         if self.over:
             return
         e, start = self._now, float(rows[0, 0])

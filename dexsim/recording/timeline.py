@@ -16,7 +16,7 @@ LOST = 0.3
 """s: where samples are left out over at least as long, nothing is known of the time between those that stay."""
 
 
-def kept(t: np.ndarray) -> np.ndarray:
+def possible(t: np.ndarray) -> np.ndarray:
     """Return [T] bool: the samples whose times t [T] s, in the order they were written, can be theirs.
 
     Where times only change places (by less than REORDERED), all can. Else the longest series of times that never goes

@@ -133,10 +133,10 @@ class Units:
 
     def of(self, quantity: str, joint: str) -> Unit | None:
         """Return the unit that is stated; None where none is."""
-        asked = [f"{quantity}.{joint}", quantity]
+        keys = [f"{quantity}.{joint}", quantity]
         if quantity in ("command", "velocity"):
-            asked += [f"position.{joint}", "position"]
-        for key in asked:
+            keys += [f"position.{joint}", "position"]
+        for key in keys:
             if key not in self.stated:
                 continue
             kind = quantity if key.startswith(quantity) else "position"

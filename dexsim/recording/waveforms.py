@@ -39,7 +39,8 @@ def triangles(a: float, v: float, dt: float, rng: np.random.Generator) -> np.nda
 
 
 def ladder(a: float, v: float, dt: float, rng: np.random.Generator) -> np.ndarray:
-    """There and back at ever higher speeds, then down again: friction over speed, torque-speed limit."""
+    """Return a motion there and back at ever higher speeds, then down again: friction over speed, torque-speed
+    limit."""
     rungs = [f * v for f in (0.05, 0.1, 0.2, 0.4, 0.7, 0.95)]
     parts = [through((min(a, 0.6 * r), -min(a, 0.6 * r)), r, dt) for r in rungs]
     return np.concatenate([np.concatenate([p, np.zeros(round(0.2 / dt))]) for p in (*parts, parts[2], parts[0])])

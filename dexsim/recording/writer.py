@@ -81,7 +81,7 @@ class Writer:
         self._mcap.add_metadata(name, dict(values))
 
     def add_command(self, t: float, position: np.ndarray, stamp: float | None = None) -> None:
-        """Targets [J] sent to the servos [rad]; NaN: none for this joint."""
+        """Add targets [J] sent to the servos [rad]; NaN: none for this joint."""
         self._joints(schema.COMMANDS, t, position, None, None, stamp)
 
     def add_state(
@@ -93,7 +93,7 @@ class Writer:
         stamp: float | None = None,
         follower: np.ndarray | None = None,
     ) -> None:
-        """Measured position, velocity, effort [J] each; follower [S] rad: joints without a drive."""
+        """Add measured position, velocity, effort [J] each; follower [S] rad: joints without a drive."""
         if follower is not None and self.sensed:
             none = np.full(len(self.sensed), np.nan)
             position = np.append(position, follower)
@@ -101,35 +101,35 @@ class Writer:
         self._joints(schema.STATES, t, position, velocity, effort, stamp)
 
     def add_temperature(self, t: float, value: np.ndarray) -> None:
-        """[J] degC."""
+        """Add temperatures [J] in degC."""
         self._array(schema.TEMPERATURES, t, value, ("joint",))
 
     def add_duty(self, t: float, value: np.ndarray) -> None:
-        """[J] -1..1."""
+        """Add duty cycles [J], -1..1."""
         self._array(schema.DUTY, t, value, ("joint",))
 
     def add_enabled(self, t: float, value: np.ndarray) -> None:
-        """[J] 1 where the servo drives, 0 where it is free."""
+        """Add [J]: 1 where the servo drives, 0 where it is free."""
         self._array(schema.ENABLED, t, value, ("joint",))
 
     def add_supply_voltage(self, t: float, value: float) -> None:
-        """V."""
+        """Add the supply's voltage [V]."""
         self._array(schema.SUPPLY, t, np.atleast_1d(value), ("supply",))
 
     def add_tactile(self, t: float, value: np.ndarray) -> None:
-        """[fingers, taxels, 3] in `tactile_unit`."""
+        """Add readings [fingers, taxels, 3] in `tactile_unit`."""
         self._array(schema.TACTILE, t, value, ("finger", "taxel", "axis"))
 
     def add_external_force(self, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None) -> None:
-        """[6] force [N] and torque [N.m] in `frame`."""
+        """Add [6]: force [N] and torque [N.m] in `frame`."""
         self._message(schema.EXTERNAL_FORCE, t, cdr.wrench(self._ns(t if stamp is None else stamp), frame, value))
 
     def add_object_pose(self, t: float, value: np.ndarray, stamp: float | None = None) -> None:
-        """[7] x y z [m], w x y z, palm frame."""
+        """Add a pose [7]: x y z [m], w x y z, palm frame."""
         self._message(schema.OBJECT_POSE, t, cdr.pose(self._ns(t if stamp is None else stamp), "palm", value))
 
     def add_imu(self, t: float, value: np.ndarray, frame: str = "object", stamp: float | None = None) -> None:
-        """[10] orientation w x y z, angular velocity [rad/s], linear acceleration [m/s2]."""
+        """Add [10]: orientation w x y z, angular velocity [rad/s], linear acceleration [m/s2]."""
         self._message(schema.IMU, t, cdr.imu(self._ns(t if stamp is None else stamp), frame, value))
 
     def flush(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -203,7 +204,24 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"taxel file {path}: not found")
-    text = files.text(path, "taxel file")
+    point, normal, tx, area = (
+        None if x is None else x.copy() for x in _columns(path, files.text(path, "taxel file"))
+    )
+    return {
+        "name": name or path.stem,
+        "body": body,
+        "kind": kind or name or path.stem,
+        "point": point,
+        "normal": normal,
+        "tx": tx,
+        "area": None if area is None else area[:, 0],
+    }
+
+
+@lru_cache(maxsize=32)  # fingers share a file, and environments of a process a hand
+def _columns(path: Path, text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Return points and normals [n, 3], directions [n, 3] and areas [n, 1] of a taxel file's text. Raises
+    UserError."""
     lines = [s for s in text.splitlines() if s.strip() and not s.startswith("#")]
     rows = list(csv.DictReader(lines))
     if not rows:
@@ -224,20 +242,13 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
                     out[i, j] = float(row[n])
                 except (TypeError, ValueError):
                     raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]!r}, not a number") from None
-                if not np.isfinite(out[i, j]):
+                if not math.isfinite(out[i, j]):
                     raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]}, must be finite")
         return out
 
-    area = read(["area"], False)
-    return {
-        "name": name or path.stem,
-        "body": body,
-        "kind": kind or name or path.stem,
-        "point": read(["x", "y", "z"], True),
-        "normal": read(["nx", "ny", "nz"], True),
-        "tx": read(["tx", "ty", "tz"], False),
-        "area": None if area is None else area[:, 0],
-    }
+    point, normal = read(["x", "y", "z"], True), read(["nx", "ny", "nz"], True)
+    assert point is not None and normal is not None
+    return point, normal, read(["tx", "ty", "tz"], False), read(["area"], False)
 
 
 def hand_layout(hand: Hand) -> TaxelLayout | None:

@@ -20,6 +20,8 @@ from dexsim.recording import write
 from . import __main__ as program
 from . import corpus, mutate, silence, strategies, targets
 
+pytestmark = pytest.mark.limits
+
 SHORT = settings(
     max_examples=10, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
@@ -72,7 +74,7 @@ def test_damaged_trees(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", sorted(targets.TARGETS))
 def test_damaged_files(kind, files, tmp_path):
-    @settings(SHORT, max_examples=6)
+    @settings(SHORT, max_examples=3)
     @given(strategies.seeds)
     def run(seed):
         mutate.clean(tmp_path)
