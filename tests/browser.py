@@ -96,7 +96,7 @@ class Page:
         return value
 
     def click(self, text: str) -> None:
-        """A click on the middle of the element whose own text (or label) is `text`."""
+        """Click on the middle of the element whose own text (or label) is `text`."""
         at = self.wait(f"""(() => {{ const all = [...document.querySelectorAll('button, label, input, a')];
             const e = all.find(x => x.innerText && x.innerText.trim() === {json.dumps(text)}) ; if (!e) return null;
             const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()""")
@@ -107,7 +107,7 @@ class Page:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def press(self, key: str) -> None:
-        """A key, e.g. ArrowRight."""
+        """Press a key, e.g. ArrowRight."""
         for kind in ("keyDown", "keyUp"):
             self.call(
                 "Input.dispatchKeyEvent",

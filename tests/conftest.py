@@ -23,7 +23,7 @@ one."""
 
 
 def pytest_configure(config) -> None:
-    """Programs that tests start can be interrupted and hung up, also where the tests themselves run in the background
+    """Let programs that tests start be interrupted and hung up, also where the tests themselves run in the background
     of a shell without job control, or under nohup, which has SIGINT or SIGHUP ignored for them."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -36,7 +36,7 @@ LONGEST = [f"test_{name}.py" for name in ("reproduce", "wheel", "ranks", "resume
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """Files with tests of half a minute and more come first: a worker that has done its own takes over the last of
+    """Put files with tests of half a minute and more first: a worker that has done its own takes over the last of
     another's, and they should be short ones."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
 
@@ -49,13 +49,13 @@ def pytest_runtest_setup(item) -> None:
 
 
 def pytest_collection(session) -> None:
-    """Until all is loaded there is no garbage to look for among it."""
+    """Collect no garbage until all is loaded: there is none among it."""
     gc.disable()
 
 
 def pytest_collection_finish(session) -> None:
-    """What is loaded by now (torch, Warp, MuJoCo, some million objects) stays until the end: looking through it for
-    garbage again and again took a tenth of all tests' processor time. A deployment's loop thaws what it froze, and
+    """Freeze what is loaded by now (torch, Warp, MuJoCo, some million objects) stays until the end: looking through it
+    for garbage again and again took a tenth of all tests' processor time. A deployment's loop thaws what it froze, and
     would thaw this too."""
     gc.enable()
     gc.collect()

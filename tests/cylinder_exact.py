@@ -59,7 +59,7 @@ def _between(radius: float, half: float, corners: np.ndarray, dist: float, u: np
 
 
 def _off(radius: float, half: float, x: np.ndarray) -> np.ndarray:
-    """From the cylinder's nearest point to each x [..., 3]."""
+    """Return vectors from the cylinder's nearest point to each x [..., 3]."""
     rho = np.hypot(x[..., 0], x[..., 1])
     k = np.maximum(rho - radius, 0) / np.maximum(rho, 1e-300)
     return np.stack([k * x[..., 0], k * x[..., 1], x[..., 2] - np.clip(x[..., 2], -half, half)], -1)

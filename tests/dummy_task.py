@@ -54,7 +54,7 @@ class DummyEnv(VecEnv):
         return self.get_observations(), reward, lost | late, extras
 
     def check(self):
-        """Nothing can overflow here."""
+        """Do nothing: nothing can overflow here."""
 
     def describe(self):
         return {"observations": {"actor": [("x", 2, "m")], "critic": [("x", 2, "m"), ("x clean", 2, "m")]},

@@ -75,7 +75,7 @@ def run(module: str, *arguments: str, timeout: float = 600.0) -> subprocess.Comp
 
 
 def script(path: str, *arguments: str) -> None:
-    """What `python path arguments` does; for `Forked`."""
+    """Run `python path arguments`; for `Forked`."""
     sys.argv = [path, *arguments]
     runpy.run_path(path, run_name="__main__")
 
@@ -87,7 +87,7 @@ def _program(module: str, arguments: tuple[str, ...]) -> None:
 
 
 def _child(work: Callable[..., Any], arguments: tuple, cwd: str, env: dict[str, str], texts: list[Path]) -> None:
-    """multiprocessing prints an error that ends it, and knows what SystemExit means."""
+    """Work in the process: multiprocessing prints an error that ends it, and knows what SystemExit means."""
     os.setsid()
     os.chdir(cwd)
     os.environ.clear()

@@ -72,7 +72,7 @@ def urdf(mesh: str = "meshes/tip.stl", left: bool = False) -> str:
 
 
 def tip(path: Path, hole: bool = False, scale: float = 1.0) -> None:
-    """A rounded fingertip along x from the joint, 42 mm long and 15 mm thick."""
+    """Return a rounded fingertip along x from the joint, 42 mm long and 15 mm thick."""
     mesh = trimesh.creation.capsule(radius=0.0075, height=0.030, count=(20, 10))
     mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0]))
     mesh.apply_translation([0.006 - mesh.bounds[0, 0], 0, 0])

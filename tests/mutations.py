@@ -408,7 +408,7 @@ def mutated(m: Mutation, root: Path = ROOT) -> str:
 
 
 def copy(folder: Path) -> None:
-    """What tests need: the package and the tests as copies, all else as links."""
+    """Copy what tests need: the package and the tests as copies, all else as links."""
     for path in ROOT.iterdir():
         if path.name in COPIED:
             shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("__pycache__"))

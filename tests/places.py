@@ -93,7 +93,7 @@ def exact(model: mujoco.MjModel, poses, i: int) -> tuple[float, np.ndarray, np.n
 
 
 def changed(poses, i: int, n: int = CHANGED):
-    """n poses that differ from pose i by no more than a unit in the last place; the same ones each time."""
+    """Return n poses that differ from pose i by no more than a unit in the last place; the same ones each time."""
     rng = np.random.default_rng(0)
     out = poses[np.full(n, i)]
     out.pos[:, 1] += rng.uniform(-MOVED, MOVED, (n, 3))

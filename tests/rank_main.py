@@ -82,7 +82,7 @@ def main(argv: list[str]) -> int:
 
 
 def one_rank(argv: list[str]) -> None:
-    """A rank that is a fork of torchrun: with the signals that a program begins with. argv: of `main`, or a program
+    """Run a rank that is a fork of torchrun: with the signals that a program begins with. argv: of `main`, or a program
     (NAME.py) and its arguments."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -93,7 +93,7 @@ def one_rank(argv: list[str]) -> None:
 
 
 def launched(options: list[str], argv: list[str]) -> None:
-    """`torchrun options rank_main.py argv` (argv: as for `one_rank`), but that the ranks are forks."""
+    """Run `torchrun options rank_main.py argv` (argv: as for `one_rank`), but that the ranks are forks."""
     from torch.distributed import run
 
     configured = run.config_from_args

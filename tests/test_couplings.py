@@ -99,7 +99,7 @@ def _imported(tmp_path, text):
 
 
 def _reached(hand, target, seconds=1.0, spec=None):
-    """qpos at the end, of the hand sent to target [J] from its open pose."""
+    """Return qpos at the end, of the hand sent to target [J] from its open pose."""
     m = of_hand(hand, gravity=(0, 0, 0))
     if spec is not None:
         spec(m.spec)

@@ -106,7 +106,8 @@ def run(b, hand, eye=None, recorder=None, **changes):
 
 
 def check_sent(hand, guard):
-    """Nothing that is not finite or outside the limits has left, and nothing drives after the first letting go."""
+    """Check that nothing that is not finite or outside the limits has left, and nothing drives after the first letting
+    go."""
     driven = [(t, q) for t, q, _, mode in hand.sent if mode != PASSIVE]
     for _, q in driven:
         assert np.isfinite(q).all() and (q >= guard.low - 1e-6).all() and (q <= guard.high + 1e-6).all()
@@ -557,7 +558,7 @@ while time.monotonic() < end:
 
 @contextlib.contextmanager
 def flood(port, line):
-    """Another program that sends a line as fast as it can; gives how many it has sent so far."""
+    """Start another program that sends a line as fast as it can; gives how many it has sent so far."""
     child = subprocess.Popen([sys.executable, "-c", FLOOD, str(port), line], stdout=subprocess.PIPE, text=True)
     sent = [int(child.stdout.readline())]
     reader = threading.Thread(target=lambda: [sent.append(int(x)) for x in child.stdout], daemon=True)

@@ -139,7 +139,7 @@ def _scaled(env) -> torch.Tensor:
 
 
 def covers(values: torch.Tensor, low: float, high: float, slack: float = 0.0) -> None:
-    """Values lie in [low, high] and come near both ends."""
+    """Check that values lie in [low, high] and come near both ends."""
     width = high - low
     assert width > 0, "a fixed value shows nothing"
     near = EDGE * width + slack

@@ -27,7 +27,7 @@ STEPS = ["connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "
 
 
 def walk(out, hand=LaggingHand, steps=STEPS, more=(), **faults):
-    """(status, check.json, the fake, what was said)."""
+    """Return (status, check.json, the fake, what was said)."""
     clock, said = VirtualClock(5.0), []
     package = partial(FakeXHand, make=hand, faults=Faults(**{"outlier": 0.0, "press": 11} | faults))
     driver = VendorXHand("auto", clock, package, side="right")

@@ -151,13 +151,13 @@ def test_correlation_is_numpy_s():
 
 
 def chirp(t, low=0.1, high=10.0, span=10.0):
-    """A sweep of constant size; t: s from its begin."""
+    """Return a sweep of constant size; t: s from its begin."""
     turns = low * span / np.log(high / low) * ((high / low) ** (np.clip(t, 0, span) / span) - 1)
     return 0.3 * np.sin(2 * np.pi * turns)
 
 
 def swept(name, lag, sign, begin, end, droop=0.05):
-    """A joint that follows a part of a sweep, `lag` s late, by ever less."""
+    """Return a joint that follows a part of a sweep, `lag` s late, by ever less."""
     t = np.arange(begin, end, 0.005)
     q = sign * chirp(t - lag) / (1 + droop * t)
     table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.0}}})

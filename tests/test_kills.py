@@ -20,7 +20,7 @@ def test_recordings_survive():
 
 
 def spoiled(*args: str) -> None:
-    """With a writer that does not write beside its place."""
+    """Run with a writer that does not write beside its place."""
     from dexsim import files
     from tests import kills
 

@@ -46,7 +46,7 @@ def nodes(tmp_path):
 
 
 def begin(nodes: Nodes, configs: Path, mode: str, *settings: str, count: int = 2):
-    """torchrun on the first `count` nodes, one rank each."""
+    """Start torchrun on the first `count` nodes, one rank each."""
     argv = [MAIN, str(configs), mode, *QUICK, *settings]
     return [nodes.start(k, 1, argv, nodes=count, program=()) for k in range(count)]
 

@@ -48,7 +48,7 @@ def mine(path: Path) -> Path:
 
 
 def refused(capfd, status: int, path: Path) -> None:
-    """One line that names the file, and the file as it was."""
+    """Expect one line that names the file, and the file as it was."""
     err = capfd.readouterr().err.strip()
     assert status == 2 and path.name in err and "would be overwritten" in err and "\n" not in err, err
     assert path.read_bytes() == MINE

@@ -57,7 +57,7 @@ def wheel(r):
 
 
 def steps(r):
-    """A wheel that is sent five turns on now and then, and goes there."""
+    """Return a wheel that is sent five turns on now and then, and goes there."""
     t = r.commands.t
     r.commands.value[:, 0] = 10 * np.pi * np.floor(t / 2)
     r.states.position.value[:, 0] = np.interp(r.states.position.t - 0.3, t, r.commands.value[:, 0])
@@ -68,7 +68,7 @@ def still(r):
 
 
 def dangles(r):
-    """No target moves, and the joint is turned by hand, three turns."""
+    """Return a joint whose target does not move, and the joint is turned by hand, three turns."""
     r.commands.value[:, 0] = 0.1
     r.states.position.value[:, 0] = 6 * np.pi * np.sin(0.4 * r.states.position.t)
 

@@ -18,14 +18,14 @@ JOINTS, FPS, LENGTHS = ("shoulder", "elbow"), 50, (100, 150, 120)
 
 
 def motion(episode):
-    """(t [n], targets [n, J], positions [n, J]) of an episode."""
+    """Return (t [n], targets [n, J], positions [n, J]) of an episode."""
     t = np.arange(LENGTHS[episode]) / FPS
     c = np.stack([0.4 * np.sin(2 * t + k + episode) for k in range(2)], 1)
     return t, c, np.stack([0.4 * np.sin(2 * (t - 0.04) + k + episode) for k in range(2)], 1)
 
 
 def lerobot(folder, version):
-    """A data set in the documented layout of v2.1 (a file an episode) or v3.0 (episodes in one file)."""
+    """Write a data set in the documented layout of v2.1 (a file an episode) or v3.0 (episodes in one file)."""
     pa = pytest.importorskip("pyarrow")
     from pyarrow import parquet
 
@@ -59,7 +59,7 @@ def lerobot(folder, version):
 
 
 def replay_buffer(folder, version):
-    """Zarr as diffusion-policy code writes it: arrays of all episodes, and their ends."""
+    """Write Zarr as diffusion-policy code writes it: arrays of all episodes, and their ends."""
     zarr = pytest.importorskip("zarr")
     root = zarr.open_group(str(folder), mode="w", zarr_format=version)
     data, meta = root.create_group("data"), root.create_group("meta")
@@ -72,7 +72,7 @@ def replay_buffer(folder, version):
 
 
 def hands(folder, version):
-    """Zarr with a group an episode, joints and touch of a right hand."""
+    """Write Zarr with a group an episode, joints and touch of a right hand."""
     zarr = pytest.importorskip("zarr")
     root = zarr.open_group(str(folder), mode="w", zarr_format=version)
     for k in range(3):

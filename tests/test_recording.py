@@ -37,7 +37,7 @@ def ros2_bytes(kind, definition, message):
 
 
 def ros2_decoder(kind, definition):
-    """mcap_ros2's decoder of messages of a kind."""
+    """Return mcap_ros2's decoder of messages of a kind."""
     return DecoderFactory().decoder_for("cdr", Schema(id=1, name=kind, encoding="ros2msg", data=definition.encode()))
 
 

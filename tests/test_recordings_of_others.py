@@ -58,7 +58,7 @@ START = 1_700_000_000
 
 
 def bag(folder, messages, storage=StoragePlugin.MCAP, packed=None, store=STORE):
-    """A bag as `rosbags` writes it. messages: (topic, s since the start, message)."""
+    """Write a bag as `rosbags` writes it. messages: (topic, s since the start, message)."""
     writer = Writer(folder, version=9, storage_plugin=storage)
     if packed is not None:
         writer.set_compression(packed, CompressionFormat.ZSTD)
@@ -77,7 +77,7 @@ def follow(t, joint, delay=0.03):
 
 
 def states(names, seconds=6.0, rate=100.0, noise=0.0, apart=None):
-    """Joint states, all in a message, or each in one of its own, `apart` s after the other."""
+    """Return joint states, all in a message, or each in one of its own, `apart` s after the other."""
     rng = np.random.default_rng(0)
     out = []
     for t in np.arange(0.001, seconds, 1 / rate):

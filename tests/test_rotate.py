@@ -185,7 +185,7 @@ def test_fingertip_velocity_is_that_of_the_link():
 
 
 def put(env, pose: torch.Tensor) -> None:
-    """The cubes at pose [N, 7], hands as they are; the task's view of it refreshed, no physics."""
+    """Put the cubes at pose [N, 7], hands as they are; the task's view of it refreshed, no physics."""
     env.object_pose.copy_(pose)
     env.object_velocity.zero_()
 

@@ -303,7 +303,7 @@ def test_thinning_friction_is_half_gone_at_its_speed_and_linear_without():
 
 
 def sawtooth(angle):
-    """By its Fourier series: rises through 0 at angle 0, drops at pi."""
+    """Return a sawtooth by its Fourier series: rises through 0 at angle 0, drops at pi."""
     k = np.arange(1, 400)[:, None]
     return (2 / np.pi * (-1.0) ** (k + 1) / k * np.sin(k * angle)).sum(0)
 

@@ -29,7 +29,7 @@ from dexsim.tasks import make_env
 
 
 def path(targets, dt, speed=np.inf, acceleration=np.inf, start=0.0):
-    """[n] setpoints after each step towards targets [n], from rest at `start`."""
+    """Return setpoints [n] after each step towards targets [n], from rest at `start`."""
     p = {c.name: c.neutral for c in COLUMNS} | {"profile_speed": speed, "profile_acceleration": acceleration}
     step, out = Step(), []
     step.dt = dt

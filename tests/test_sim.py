@@ -299,7 +299,7 @@ def _rest(e) -> None:
 
 
 def _check_stack(e, g: np.ndarray) -> None:
-    """Static forces under gravity g [3]: the sum carries the weight, whatever the number of contacts."""
+    """Check static forces under gravity g [3]: the sum carries the weight, whatever the number of contacts."""
     tol = dict(rtol=3e-3, atol=3e-3)
     normal, force = e.t.pair_normal.double().numpy(), e.t.pair_force.double().numpy()
     both, ball = -(SLAB + BALL) * g, -BALL * g

@@ -65,7 +65,8 @@ def both(m, d, ours: NewtonSolver, warm: np.ndarray) -> dict[str, dict[str, np.n
 
 
 def assert_same(found: dict, nefc: np.ndarray, tolerance: float) -> None:
-    """Accelerations and forces to `tolerance` of their largest; rows in the same state but for a few at an edge."""
+    """Compare accelerations and forces to `tolerance` of their largest; rows in the same state but for a few at an
+    edge."""
     a, b = found["theirs"], found["ours"]
     for name in ("qacc", "Ma", "constraint"):
         assert np.isfinite(b[name]).all(), name

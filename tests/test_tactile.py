@@ -44,7 +44,7 @@ def shapes() -> list:
 
 
 def contact_poses(n: int, seed: int):
-    """n worlds: a random shape, its size, and poses of object and hand bodies that overlap some pads."""
+    """Return n worlds: a random shape, its size, and poses of object and hand bodies that overlap some pads."""
     rng = np.random.default_rng(seed)
     out = []
     for i in range(n):

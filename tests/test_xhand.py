@@ -69,7 +69,7 @@ class Watched(Loop):
 
 
 def run(b, hand=LaggingHand, port="auto", settings=None, **faults):
-    """A run of the policy in virtual time: (report, loop, fake, what was said)."""
+    """Make a run of the policy in virtual time: (report, loop, fake, what was said)."""
     said = []
     d = driver(VirtualClock(50.0), hand, port, **faults)
     loop = Watched(b, d, FixedPlace([0.055, 0.0, 0.04]), Calibration.default(),
@@ -80,7 +80,7 @@ def run(b, hand=LaggingHand, port="auto", settings=None, **faults):
 
 
 def since(fake, loop, t):
-    """s from a fault's time until the hand was let go."""
+    """Return the s from a fault's time until the hand was let go."""
     return loop.relaxed - (fake.zero + t)
 
 
@@ -587,7 +587,7 @@ OTHERS = os.path.join(os.path.dirname(__file__), "another_package")
 
 
 def with_another(b, monkeypatch, posture=0.3, seconds=1.5, **faults):
-    """A run in virtual time on the second fake: (report, module, s by the clock at which the port was opened)."""
+    """Make a run in virtual time on the second fake: (report, module, s by the clock at which the port was opened)."""
     monkeypatch.syspath_prepend(OTHERS)
     from xhand_controller import xhand_control as package
 

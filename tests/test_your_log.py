@@ -39,7 +39,7 @@ def moved(topics, names=("shoulder", "elbow")):
 
 
 def one_file(folder, messages):
-    """The MCAP file of a bag, by itself."""
+    """Move the MCAP file of a bag, by itself."""
     made = others.bag(folder.with_suffix(".bag"), messages)
     next(made.glob("*.mcap")).rename(folder)
 

@@ -123,7 +123,8 @@ def random_values(n: int, rows: int, seed: int) -> dict[str, torch.Tensor]:
 
 
 def put_object(engine, position, quat=(1.0, 0, 0, 0), hand=None) -> None:
-    """All worlds: the object at rest at a pose ([3] or [N, 3], [4] or [N, 4]); the hand at `hand` [12] or zero."""
+    """Put the object of all worlds at rest at a pose ([3] or [N, 3], [4] or [N, 4]); the hand at `hand` [12] or
+    zero."""
     q, v = engine.t.qpos.clone(), torch.zeros_like(engine.t.qvel)
     q[:] = torch.as_tensor(engine.mjm.qpos0)
     if hand is not None:

@@ -89,7 +89,7 @@ def _checked(raw: Mapping[str, Any], hand: Hand) -> dict[str, dict[str, Any]]:
 
 
 def _pads(value: Any, hand: Hand) -> dict[str, Any]:
-    """As given, once every pad and taxel is one of the hand's."""
+    """Return pads as given, once every pad and taxel is one of the hand's."""
     layout = hand_layout(hand)
     if layout is None:
         if not value:

@@ -44,7 +44,7 @@ class PosedEngine:
         return self.pairs.index(name)
 
     def place(self, world: int, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
-        """One body's pose in one world: position [3] (m), rotation [3, 3]."""
+        """Set one body's pose in one world: position [3] (m), rotation [3, 3]."""
         b = self.body(body)
         self.t.xpos[world, b] = torch.as_tensor(np.asarray(position, np.float32))
         if rotation is not None:

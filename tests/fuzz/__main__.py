@@ -75,7 +75,7 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
 
 
 def work(kinds: list[str], first: int, count: int, files: dict[str, list[Path]], out: Path, send) -> None:
-    """A batch in a process of its own: a crash ends this one alone."""
+    """Run a batch in a process of its own: a crash ends this one alone."""
     warnings.simplefilter("ignore")
     used = (
         int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -118,7 +118,7 @@ class Run:
         self._begun = self._said = time.monotonic()
 
     def go(self, processes: int, until: float) -> None:
-        """Until the seeds or the time (of `time.monotonic`) are over; batches under way are finished."""
+        """Go on until the seeds or the time (of `time.monotonic`) are over; batches under way are finished."""
         while True:
             while len(self._batches) < processes and self.next < self.end and time.monotonic() < until:
                 last = min(self.next + BATCH, self.end)
@@ -148,7 +148,7 @@ class Run:
         self._batches[receive] = Batch(worker, last)
 
     def _hear(self, receive: Connection) -> None:
-        """One message of a batch, or its end."""
+        """Hear one message of a batch, or its end."""
         batch = self._batches[receive]
         try:
             seed, kind, what, text = receive.recv()

@@ -250,7 +250,7 @@ def objects(folder: Path) -> list[Path]:
 
 
 def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
-    """A bag as others write it: other topics, no metadata."""
+    """Write a bag as others write it: other topics, no metadata."""
     from dexsim.recording import cdr
 
     with open(path, "wb") as file:

@@ -122,7 +122,7 @@ def _said(path: Path) -> Any:
 
 
 def beside(path: Path) -> str:
-    """As the metadata file beside a recording."""
+    """Read it as the metadata file beside a recording."""
     path = path.rename(path.with_name("case.mcap.yaml"))
     stated, units, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
     metadata.complete(stated, True, True)
@@ -138,7 +138,7 @@ def config(path: Path) -> str:
 
 
 def hand(path: Path) -> str:
-    """As the hand.yaml of a folder with the xHand's other files, read as far as a training reads it."""
+    """Read it as the hand.yaml of a folder with the xHand's other files, read as far as a training reads it."""
     folder = path.parent / "case_hand"
     folder.mkdir()
     grasps = xhand.FOLDER.parent / "grasps"

@@ -22,7 +22,7 @@ TOLD = 5000
 
 
 def tell(folder: Path, done: float, between: bool = True) -> None:
-    """How much of its work a part has done, and where it is `between` two pieces of it (all that they had is given
+    """Tell how much of its work a part has done, and where it is `between` two pieces of it (all that they had is given
     back), the memory that the process then keeps [MiB], in a file `done`, for who watches it."""
     kept = look(os.getpid()) if between else None
     part = folder / "done.tmp"

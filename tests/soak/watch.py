@@ -87,10 +87,10 @@ class Watch(threading.Thread):
 
 
 def judge(rows: list[tuple[float, ...]]) -> dict[str, dict[str, float]]:
-    """By column: mean, and growth over the judged part of the run with its 95 % interval, from a line through the means
-    of BLOCKS blocks (neighbouring samples are alike); the same per hour of wall time (`per_hour`, `per_hour_low`,
-    `per_hour_high`) and, where it is known how much was done, per unit of work (`per_unit`). Empty where there are too
-    few samples."""
+    """Judge each column: mean, and growth over the judged part of the run with its 95 % interval, from a line through
+    the means of BLOCKS blocks (neighbouring samples are alike); the same per hour of wall time (`per_hour`,
+    `per_hour_low`, `per_hour_high`) and, where it is known how much was done, per unit of work (`per_unit`). Empty
+    where there are too few samples."""
     table = np.array(rows[:], float).reshape(-1, len(COLUMNS))
     t = table[:, 0]
     kept = table[t >= WARM_UP * t[-1]] if len(t) else table
