@@ -2,8 +2,7 @@
 
 SciPy's are `share`, `draws`, and what is made of them: `bootstrap`. Drawn here, by NumPy's generator, are index arrays:
 `stretches`, since SciPy draws no blocks of neighbours; `singles`, which are stretches of one, since several samples are
-looked up by the same index; `weights`, of which SciPy would make intervals that nobody asked for; and `nested_means`,
-since SciPy knows no bootstrap in two stages."""
+looked up by the same index; and `weights`, of which SciPy would make intervals that nobody asked for."""
 
 from __future__ import annotations
 
@@ -89,21 +88,6 @@ def singles(units: int, seed: Seed, count: int = 1000) -> np.ndarray:
     """[count, units] index of the units of each resample, drawn singly: for a statistic that compares several samples
     over the same resamples."""
     return stretches(units, 1, seed, count)
-
-
-def nested_means(groups: Sequence[np.ndarray], picks: np.ndarray, seed: Seed) -> np.ndarray:
-    """[count] averages of a two-stage bootstrap (Davison and Hinkley, 1997, section 3.8): `picks` [count, G] are the
-    groups of each resample (`singles(G, ...)`; the same for two sets of groups that are paired), and the values of each
-    picked group are drawn anew within it. groups: G arrays of values, of any length each; a group's mean counts once,
-    however many values it has."""
-    rng, out = np.random.default_rng(seed), np.zeros(len(picks))
-    for pick in picks.T:
-        for k, own in enumerate(groups):
-            chosen = pick == k
-            if not chosen.any():
-                continue
-            out[chosen] += own[singles(len(own), rng, int(chosen.sum()))].mean(1)
-    return out / picks.shape[1]
 
 
 def wins(losses: np.ndarray, index: np.ndarray, within: float) -> np.ndarray:

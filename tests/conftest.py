@@ -54,8 +54,8 @@ def pytest_collection(session) -> None:
 
 
 def pytest_collection_finish(session) -> None:
-    """Freeze what is loaded by now (torch, Warp, MuJoCo, some million objects) stays until the end: looking through it
-    for garbage again and again took a tenth of all tests' processor time. A deployment's loop thaws what it froze, and
+    """Freeze what is loaded by now (torch, Warp, MuJoCo, some million objects) until the end: looking through it for
+    garbage again and again took a tenth of all tests' processor time. A deployment's loop thaws what it froze, and
     would thaw this too."""
     gc.enable()
     gc.collect()

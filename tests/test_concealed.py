@@ -57,6 +57,7 @@ def test_plant_imports_nothing_of_the_simulator():
         assert names <= {"__future__", "numpy", "dataclasses", "collections"}, names
 
 
+@pytest.mark.slow
 def test_pendulum_swings_at_its_own_frequency():
     """Both inertias count, and the period grows with the amplitude: T = T0 (1 + a^2/16 + 11 a^4/3072)."""
     amplitude = np.array([0.05, 0.9])
@@ -101,6 +102,7 @@ def test_links_of_an_arm_move_as_lagrange_says():
     assert h[:, 0, 1] == pytest.approx(s * va**2 + lower)
 
 
+@pytest.mark.slow
 def test_friction_holds_below_its_level_and_play_is_as_wide_as_said():
     # the weight asks for 0.115 N.m
     q = run(2, 2000, q0=[0.9, 0.9], driven=False, **(SMOOTH | {"coulomb": np.array([0.05, 0.2])}))["position"]

@@ -13,6 +13,8 @@ from benchmarks.concealed import effects, generate, laws, plant, score, touch, t
 from dexsim.errors import UserError
 from dexsim.recording import read
 
+pytestmark = pytest.mark.slow  # a benchmark's own machine
+
 FREE = {"coulomb": 0.0, "viscous": 0.0, "kp": 20.0, "kd": 0.5, "torque_limit": 50.0, "no_load_speed": 1e6}
 HEAVY = FREE | {"rotor": 1e6, "kp": 1.0, "kd": 0.0}  # does not move: what the drive gives is seen by itself
 NOWHERE = np.zeros(3)

@@ -80,6 +80,7 @@ def test_a_plan_keeps_its_limits(plan):
     assert (run.position > low).all() and (run.position < high).all()
 
 
+@pytest.mark.slow
 def test_every_kind_comes_and_one_repeats(plan):
     kinds = [s.kind for s in plan.segments]
     assert set(kinds) == set(KINDS) and len(kinds) == len(KINDS) + 1

@@ -77,22 +77,6 @@ def test_singles_are_what_a_generator_draws():
     np.testing.assert_array_equal(intervals.singles(7, 4, 20), by_hand)
 
 
-def test_nested_means_vary_by_groups_and_within_them():
-    """Variance of the average of G groups of n: what the groups' means vary by, and what values do within a group."""
-    rng = np.random.default_rng(5)
-    groups = [rng.normal(mean, 2.0, 25) for mean in rng.normal(0, 1.0, 40)]
-    means = np.array([g.mean() for g in groups])
-    drawn = intervals.nested_means(groups, intervals.singles(40, 6, 4000), 7)
-    within = np.mean([g.var() / len(g) for g in groups])
-    assert drawn.mean() == pytest.approx(means.mean(), abs=0.02)
-    assert drawn.var() == pytest.approx((means.var() + within) / 40, rel=0.1)
-    # a group counts once, however many values it has; groups that are picked as one set are
-    assert intervals.nested_means([np.zeros(3), np.ones(300)], np.array([[0, 1]]), 0).tolist() == [0.5]
-    picks = intervals.singles(2, 8, 50)
-    same = intervals.nested_means([np.zeros(4), np.ones(4)], picks, 9)
-    np.testing.assert_array_equal(same, picks.mean(1))
-
-
 def test_stretches_are_neighbours_in_a_circle():
     index = intervals.stretches(10, 4, 0, 500)
     assert index.shape == (500, 12) and set(np.unique(index)) == set(range(10))

@@ -68,7 +68,7 @@ def still(r):
 
 
 def dangles(r):
-    """Return a joint whose target does not move, and the joint is turned by hand, three turns."""
+    """Return a joint whose target does not move, and which is turned by hand, three turns."""
     r.commands.value[:, 0] = 0.1
     r.states.position.value[:, 0] = 6 * np.pi * np.sin(0.4 * r.states.position.t)
 

@@ -95,7 +95,7 @@ def test_a_setpoint_is_known_at_any_time_and_goes_on_from_there():
         assert np.abs(np.array(on) - whole[k:]).max() < 2e-3
 
 
-@pytest.mark.parametrize("profile", [{"profile_speed": 1.2}, BOTH])
+@pytest.mark.parametrize("profile", [pytest.param({"profile_speed": 1.2}, marks=pytest.mark.slow), BOTH])
 def test_what_begins_in_the_middle_of_a_motion_goes_on_as_it_did(profile):
     """A replay, a world of a batch and a search's window from any time on move as what began with the recording: their
     setpoint is where the commands until then have brought it, by each guess's own profile."""

@@ -664,7 +664,7 @@ mujoco.mj_step(model, data)
 """
 
 
-@pytest.mark.parametrize("which", ["mujoco", "dexsim"])
+@pytest.mark.parametrize("which", [pytest.param("mujoco", marks=pytest.mark.slow), "dexsim"])
 def test_mujoco_leaves_no_log_in_the_users_folder(tmp_path, which):
     """Alone it does: a world that diverges writes MUJOCO_LOG.TXT where the user is."""
     here = Path(__file__).parent

@@ -38,7 +38,7 @@ from dexsim.errors import UserError
 Drive = Literal["torque", "voltage"]
 Side = Literal["joint", "motor"]
 Loop = Literal["position", "velocity"]
-DRIVES, SIDES = get_args(Drive), get_args(Side)
+SIDES = get_args(Side)
 KEYS = (
     "drive",
     "joints",

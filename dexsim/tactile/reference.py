@@ -69,23 +69,6 @@ def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None,
     return g / np.linalg.norm(g, axis=-1, keepdims=True)
 
 
-def sampled_depth(taxels: np.ndarray, points: np.ndarray, normals: np.ndarray, nearest: int = 1) -> np.ndarray:
-    """Return depth [n] (m, 0 without contact) of taxels [n, 3] in a surface given by samples, as the paper words it: v
-    = taxel - sample, contact when v . n < 0; the `nearest` samples are blended with weights 1 / |v|^2 (one: the paper's
-    p_o).
-
-    The depth along the normal, -v . n, is blended rather than |v|, which would add the distance between samples.
-    """
-    from scipy.spatial import cKDTree
-
-    far, idx = cKDTree(points).query(taxels, k=nearest)
-    far, idx = far.reshape(len(taxels), -1), idx.reshape(len(taxels), -1)
-    v = taxels[:, None] - points[idx]
-    w = 1.0 / np.maximum(far, 1e-9) ** 2
-    d = -(v * normals[idx]).sum(-1)
-    return np.maximum((w * d).sum(1) / w.sum(1), 0.0)
-
-
 # -- laws ----------------------------------------------------------------------------------------------------------
 
 
@@ -120,7 +103,3 @@ def spread(force: float, d: np.ndarray, area: np.ndarray, reach: float) -> np.nd
     reach, 0)."""
     w = area * np.maximum(np.maximum(d.min() + reach, 0.0) - d, 0.0) ** 2
     return force * w / w.sum()
-
-
-def centre_of_pressure(f: np.ndarray, point: np.ndarray, pad_centre: np.ndarray) -> np.ndarray:
-    return f @ point / f.sum() if f.sum() > 0.0 else np.asarray(pad_centre)
