@@ -27,7 +27,7 @@ class Lift(Task):
             "baked_scales": [1.0, 1.15],
         },
         "presets": {
-            "cuda": {"worlds": 8192, "iterations": 2500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+            "cuda": {"worlds": 8192, "iterations": 500, "sim": {"control_period": 0.042}, "first_actions": 0.01,
                      "agent": {"num_steps_per_env": 16, "algorithm": {"entropy_coef": 0.002}}},
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
         },

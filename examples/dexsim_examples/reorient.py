@@ -18,7 +18,7 @@ class Reorient(Task):
         "evaluation": {"cap_s": 200.0},
         "presets": {
             "cuda": {
-                "worlds": 8192, "iterations": 3600, "sim": {"control_period": 0.042}, "first_actions": 0.01,
+                "worlds": 8192, "iterations": 3800, "sim": {"control_period": 0.042}, "first_actions": 0.01,
                 "agent": {"num_steps_per_env": 12, "algorithm": {"gamma": 0.99, "entropy_coef": 0.003}},
             },
             "cpu": {"worlds": 128, "iterations": 200, "sim": {"control_period": 0.042}},
