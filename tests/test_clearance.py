@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from worlds import grasp_env
 
 from dexsim.assets.objects import library
 from dexsim.cli import start
@@ -72,16 +71,3 @@ def test_emphasis_counts_in_training_and_not_elsewhere(env):
     now = env._chances.diff(prepend=torch.zeros(1))
     box = sum(float(p) for p, m in zip(now, names, strict=True) if m == "box")
     assert box == pytest.approx(1.5 / 3.5, abs=1e-6)
-
-
-def test_generated_solids_are_half_of_what_is_met_in_training_and_none_of_what_is_judged(tmp_path, monkeypatch):
-    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-    settings = ("train=[box,sphere]", "emphasis={box:3}", "generated=2")
-    few = grasp_env(*(f"task.objects.{x}" for x in settings), worlds=2)
-    names = [v.shape.name for v in few.objects.scene.variants]
-    chance = few._chances.diff(prepend=torch.zeros(1))
-    share = {n: sum(float(p) for p, i in zip(chance, few._rows, strict=True) if names[int(i)] == n) for n in set(names)}
-    assert share["box"] == pytest.approx(3 / 8) and share["sphere"] == pytest.approx(1 / 8)
-    assert share["generated_0"] == pytest.approx(0.25) and share["generated_1"] == pytest.approx(0.25)
-    assert {names[int(i)] for i in few.train_rows} == {"box", "sphere"}
-    assert not any(names[int(i)].startswith("generated") for i in few.held_rows)

@@ -13,7 +13,6 @@ from scipy.spatial import ConvexHull
 
 from dexsim.assets.objects import library, load_mesh, names, primitive_mass_properties
 from dexsim.assets.objects.baking import UNIT, bake_grid, pack, shape_from_hulls, unpack
-from dexsim.assets.objects.generated import generated
 from dexsim.assets.objects.geometry import (
     hull_planes,
     hull_vertices,
@@ -421,14 +420,3 @@ def test_contact_sees_the_surface_that_touch_sees(name):
         ball = model.geom("ball").id
         seen = [mujoco.mj_geomDistance(model, data, ball, g, 0.2, None) for g in range(model.ngeom) if g != ball]
         assert abs(min(seen) - (distance - radius)) < 1e-7
-
-
-@pytest.mark.parametrize("number", range(10))
-def test_generated_solids_are_like_those_of_the_library(number):
-    hulls = generated(number)
-    volume, centre, inertia = mass_properties(union_boundary(hulls))
-    assert 1 <= len(hulls) <= 3 and all(4 <= len(hull_vertices(h)) <= 32 for h in hulls) and volume > 0
-    assert np.ptp(np.concatenate(hulls), axis=0).max() == pytest.approx(0.060)
-    assert np.abs(centre).max() < 1e-9
-    assert np.abs(inertia - np.diag(np.diag(inertia))).max() < 1e-6 * inertia.max()
-    assert all(np.array_equal(a, b) for a, b in zip(hulls, generated(number), strict=True))

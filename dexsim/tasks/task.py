@@ -31,7 +31,6 @@ import torch
 
 from dexsim import rotation, yaml_text
 from dexsim.assets.objects import library
-from dexsim.assets.objects.generated import GENERATED
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 from dexsim.tasks import registry
@@ -246,8 +245,6 @@ class Task(HandEnv):
             torch.tensor([i for i, x in enumerate(names) if x in group], dtype=torch.long, device=dev)
             for group in groups
         )
-        more = [i for i, x in enumerate(names) if x.startswith(GENERATED)]
-        self._learned_rows = torch.cat([self.train_rows, torch.tensor(more, dtype=torch.long, device=dev)])
         self._odds = torch.tensor([1.0 / names.count(x) for x in names], device=dev)
         emphasis = t["objects"].get("emphasis", {})
         for name, times in emphasis.items():
@@ -257,14 +254,11 @@ class Task(HandEnv):
                     " 0, at most 100"
                 )
         self.emphasis = torch.tensor([float(emphasis.get(x, 1.0)) for x in names], device=dev)
-        if more:  # together as often as all that are named
-            named = (self._odds * self.emphasis)[self.train_rows].sum()
-            self.emphasis[more] = named / self._odds[more].sum()
         self.judge_kept_out(False)
 
     def judge_kept_out(self, kept_out: bool) -> None:
         """Begin episodes with objects kept out of the training from now on, or with those of it."""
-        self.draw_from(self.held_rows) if kept_out else self.draw_from(self._learned_rows, self.emphasis)
+        self.draw_from(self.held_rows) if kept_out else self.draw_from(self.train_rows, self.emphasis)
 
     def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
         """Draw objects of new episodes from these rows of the scene's table [R]: every shape equally often, or by

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 
 from dexsim import files
-from dexsim.assets.objects.baking import shape_from_hulls
-from dexsim.assets.objects.generated import GENERATED, MOST, SPACING, generated
 from dexsim.assets.objects.shape import Grid, Shape
 from dexsim.errors import UserError
 
@@ -33,7 +31,7 @@ def is_own(name: str) -> bool:
 
 def named(objects: Mapping[str, Any]) -> dict[str, Shape]:
     """Return the shapes that a task's `objects` name, by name, those trained on first: of the library, or a user's own
-    (`own`: their scale and parts); then its `generated`. Raises UserError for a name that is neither."""
+    (`own`: their scale and parts). Raises UserError for a name that is neither."""
     from dexsim.assets.objects import library
 
     known, out = library(), {}
@@ -55,19 +53,7 @@ def named(objects: Mapping[str, Any]) -> dict[str, Shape]:
             raise UserError(
                 f"task.objects: no shape '{name}'; shapes: {', '.join(known)}, or a mesh file ({', '.join(MESHES)})"
             )
-    count = objects.get("generated", 0)
-    if type(count) is not int or not 0 <= count <= MOST:
-        raise UserError(f"task.objects.generated={count}: must be a whole number from 0 to {MOST}")
-    return out | {f"{GENERATED}{k}": _generated(k) for k in range(count)}
-
-
-@lru_cache(maxsize=MOST)
-def _generated(number: int) -> Shape:
-    """Return a generated shape, from the cache if it was baked before."""
-    name, hulls = f"{GENERATED}{number}", generated(number)
-    digest = hashlib.sha256(b"".join(h.tobytes() for h in hulls)).hexdigest()
-    shape = _from_cache(f"{name}_{digest[:16]}", lambda: shape_from_hulls(name, hulls, spacing=SPACING))
-    return replace(shape, true_size=False)
+    return out
 
 
 def expand(names: list[str]) -> list[str]:
@@ -118,18 +104,13 @@ def _cached(path: Path, stamp: int, scale: float, parts: int) -> Shape:
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256")
     digest.update(f"{FORMAT} {scale!r} {parts} {THRESHOLD} {ITERATIONS} {NODES} {RESOLUTION}".encode())
-    return _from_cache(digest.hexdigest(), lambda: replace(load_mesh(path, scale, parts), true_size=True))
-
-
-def _from_cache(key: str, make: Callable[[], Shape]) -> Shape:
-    """Return the shape that the cache has under `key`, or make it and put it there."""
-    kept = cache_folder() / f"{key}.npz"
+    kept = cache_folder() / f"{digest.hexdigest()}.npz"
     if kept.is_file():
         try:
             return _read(kept)
         except UserError:
             pass  # broken off or of another version: made anew
-    shape = make()
+    shape = replace(load_mesh(path, scale, parts), true_size=True)
     try:
         kept.parent.mkdir(parents=True, exist_ok=True)
         save(shape, kept)
