@@ -291,7 +291,7 @@ def test_what_was_fitted_goes_before_what_a_recording_says_but_for_what_differs(
         assert full_model.rows_of(table, run, ["joint"])[0] == pytest.approx(written[0], nan_ok=True)
 
 
-@pytest.mark.parametrize("budget, share", [(1e6, 1.0), (12.0, 0.5), (3.0, 0.25)])
+@pytest.mark.parametrize("budget, share", [(1e6, 1.0), (12.0, 0.8), (3.0, 0.25)])
 def test_the_choice_keeps_to_the_time_there_is(budget, share, monkeypatch):
     """A world takes a second for each second of it: two candidates over 4 s."""
     runs = [plant_run(f"r{k}", k, 4.0, {"lag": 0.02}, seed=k) for k in (0, 1)]
@@ -309,6 +309,8 @@ def test_the_choice_keeps_to_the_time_there_is(budget, share, monkeypatch):
     room = lambda: budget - clock[0]  # noqa: E731
     w = best_of(mechanism_of(runs[0].servo), runs, case, {"refitted": none, "believed": none}, room=room)
     assert clock[0] <= budget and w.by_replay and w.share == pytest.approx(share, abs=0.2)
+    monkeypatch.setattr(full_model, "LEAST", 0.5)
+    assert best_of(mechanism_of(runs[0].servo), runs, case, {"refitted": none}, room=lambda: 1e-3).by_replay is False
 
 
 def test_a_joint_that_anothers_choice_harms_is_not_left_worse_than_plain():

@@ -78,6 +78,7 @@ def diagnosed(job: tuple[Converted, Path, float | None]) -> dict[str, Any]:
 def play(part: Converted, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Return by joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
     from dexsim.cli import recorded
+    from dexsim.gap.read.channels import own_readings
     from dexsim.paths import CONFIGS
     from dexsim.recording import read
 
@@ -89,11 +90,14 @@ def play(part: Converted, folder: Path, files: dict[str, Path], parts: Sequence[
         with contextlib.redirect_stdout(io.StringIO()):
             recorded.run(recorded.settings(argv, CONFIGS))
         said = json.loads((folder / "play" / str(k) / "metrics.json").read_text(encoding="utf-8"))
-        state = read(files[x["recording"]]).states.position
+        recording = read(files[x["recording"]])
+        state = recording.states.position
         on = (state.t >= x["start"] - 1e-9) & (state.t <= x["end"] + 1e-3)
         for joint, error in said["position_rmse_rad"].items():
             if error is not None and joint not in said["follow_their_recording"]:
-                total[joint] = total.get(joint, np.zeros(2)) + np.array([error**2 * on.sum(), on.sum()])
+                seen = np.asarray(state.value[:, recording.joints.index(joint)], float)
+                count = (on & own_readings(state.t, seen)).sum()  # one sent again tells nothing
+                total[joint] = total.get(joint, np.zeros(2)) + np.array([error**2 * count, count])
     return {joint: float(np.sqrt(a / b)) for joint, (a, b) in total.items()}
 
 

@@ -162,6 +162,7 @@ class Drives(Steps):
     judged where nothing is touched."""
 
     modelling = 0.0  # s that the model along the motion took
+    engine = "none"  # in which what is written was chosen, and is replayed
 
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
@@ -582,10 +583,14 @@ class Drives(Steps):
             self.written = best(s.device, engine, lambda: w.limit.until(1 - PLANNING))
         except UserError as error:
             w.notes.append(f"not replayed in the engine that trains: {error}")
-            self.written = best(engine="none")
+            engine = "none"
+            self.written = best(engine=engine)
         else:
-            if cases and self.written.share < 1:
+            if cases and engine != "none" and not self.written.by_replay:
+                w.limit.leave_out("what is written is chosen in the search's own plant")
+            elif cases and self.written.share < 1:
                 w.limit.leave_out(f"what is written is chosen by {_first_part(self.written.share)} held out")
+        self.engine = engine
         w.clock.lap("choice in the engine that trains")
 
     def report(self, d: Diagnosis) -> None:
@@ -646,7 +651,7 @@ class Drives(Steps):
         """The files as they are, over all that was held out, by the function of `play replay=`: the number of the
         report."""
         w, p = self.w, self.parts
-        if not self.written.by_replay or d.servo is None:
+        if self.engine == "none" or d.servo is None:
             return
         spec = w.m.spec if d.model_spec is None else d.model_spec
         cases = [x.case for x in self.searched]

@@ -53,8 +53,9 @@ if TYPE_CHECKING:
 REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
 PROBE = 1.0  # s of what was held out that are replayed first, for how long all of it takes
-KINDS = 0.5  # of the time that there is for the choice: what every joint as its own kind may take
+KINDS = 0.7  # of the time that there is for the choice: what every joint as its own kind may take
 MORE = 2.0  # times as much of it is replayed, or none again
+LEAST = 0.1  # of each part held out: by less nothing is chosen
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
@@ -569,7 +570,8 @@ def write_best(
 ) -> Written:
     """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
     engine: of `REPLAY`; none: by the search's own plant; room: s that there are for it; too few: by the begin of each
-    part held out. Raises UserError where the model or a drive does not serve the engine."""
+    part held out, by the search's own plant where that is less than `LEAST`. Raises UserError where the model or a
+    drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if engine == "none" or not cases or not len(windows[0].window):
@@ -624,6 +626,8 @@ def write_best(
         if share >= 1.0 or more < MORE:
             break
         share = min(1.0, share * more)
+    if share < LEAST:
+        return write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
     chosen = composed(by, errors, noise, done, replayed, lambda count: count * pace > room())
     return Written(candidates, errors, chosen, True, share=share)
 
