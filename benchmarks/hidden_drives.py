@@ -96,7 +96,10 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
 
     quiet_warp("cpu")
     hand = load_hand(which)
-    servo = of_hand(hand).table.to_dict() | {"loop_encoder": "motor", "current_per_torque": CURRENT_PER_TORQUE}
+    slides = hand.compiled.jnt_type[[hand.compiled.joint(j).id for j in hand.joints]] == mujoco.mjtJoint.mjJNT_SLIDE
+    radius = np.where(slides, np.ptp(hand.limits, axis=1) / (2 * np.pi), 1.0)  # m a rad of the motor
+    amperes = CURRENT_PER_TORQUE * float(radius.mean())  # a N m of a hinge, a N of a slide
+    servo = of_hand(hand).table.to_dict() | {"loop_encoder": "motor", "current_per_torque": amperes}
     believed, true = of_hand(hand, servo), of_hand(hand, servo)
     hidden = str(rng.choice(drives(hand)))
     others = [j for j in hand.joints if j != hidden]
@@ -110,8 +113,6 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     believed.table.save(folder / "servo.yaml")
     plans = [plan(believed, moved, kinds, seed=int(rng.integers(1 << 30))) for kinds in RECORDINGS.values()]
-    slides = hand.compiled.jnt_type[[hand.compiled.joint(j).id for j in hand.joints]] == mujoco.mjtJoint.mjJNT_SLIDE
-    radius = np.where(slides, np.ptp(hand.limits, axis=1) / (2 * np.pi), 1.0)  # m a rad of the motor
     least = float(rng.uniform(*LARGE)) * NOISE * float(radius[k])
     bus = Hardware(position_lsb=np.append(radius, np.ones(len(hand.sensed))) * Hardware.position_lsb)
     for kind in rng.permutation(list(KINDS)).tolist():  # a light finger shows no spring in its tendon: then another
@@ -122,7 +123,7 @@ def make(folder: Path, which: Path, rng: np.random.Generator) -> dict[str, Any]:
     for name, p in zip(RECORDINGS, plans, strict=True):
         run = drive(true, Series(p.t, p.value), hand.joints, float(p.t[-1]), initial=p.home)
         dense = recorded(run, believed, Series(p.t, p.value, COMMANDS), hand.joints, rate=500.0)
-        seen = realistic(dense, seed=int(rng.integers(1 << 30)), hardware=bus)
+        seen = realistic(dense, seed=int(rng.integers(1 << 30)), hardware=bus, current_per_torque=amperes)
         seen.meta["source"] = "real"
         write(folder / f"{name}.mcap", seen)
     return {"hand": str(which), "kind": kind, "effect": KINDS[kind], "joint": hidden, "moved": moved, **changed,
