@@ -30,10 +30,10 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
             stream.reconfigure(errors="backslashreplace")
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # libraries', to their programmers
-    if about and {"-h", "--help"} & set(argv):
-        print(about.strip())
-        return 0
     try:
+        if about and {"-h", "--help"} & set(argv):
+            print(about.strip(), flush=True)
+            return 0
         os.getcwd()
         folders.caches()
         status = main(argv)
