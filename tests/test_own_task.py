@@ -352,8 +352,20 @@ def test_what_provides_a_row_on_a_hand_stands_in_the_manifest():
         def joint_position(self):
             return self.q
 
-    rows = of_terms.parts(made(Seen, worlds=1))["rows"]
-    assert [row[:4] for row in rows] == [("joint_position", 12, "rad", "encoders of the drives")]
+        @command("rad", only="critic")
+        def aim(self):
+            return torch.full((self.num_envs, 2), 0.5)
+
+        @observe("rad")
+        def away(self):
+            return self.commands["aim"] - self.q[:, :2]
+
+    parts = of_terms.parts(made(Seen, worlds=1))
+    assert [row[:4] for row in parts["rows"]] == [
+        ("joint_position", 12, "rad", "encoders of the drives"), ("away", 2, "rad", ""),
+    ]  # fmt: skip
+    # a command that no column of its own shows
+    assert parts["terms"]["commands"] == {"aim": [0.5, 0.5]} and "command aim" in parts["terms"]["signals"]
 
 
 def test_another_world_takes_a_task_of_ones_own():

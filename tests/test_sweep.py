@@ -43,6 +43,19 @@ def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
     assert "servo=ideal seed=3" in table and "iterations=7" not in table and "1" in table
 
 
+@pytest.mark.slow
+def test_a_task_of_ones_own_is_swept_over_what_it_declares(script, tmp_path, monkeypatch):
+    (tmp_path / "mine_swept.py").write_text(
+        "from dexsim.tasks import Task, reward\n\n\nclass Mine(Task):\n    @reward\n    def one(self):\n"
+        "        return self.age\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    argv = ["-m", "task=mine_swept:Mine", "task.rewards.one=1,2"]
+    assert sweep.run(argv, CONFIGS, [sys.executable, str(script)]) == 0
+    runs = sorted(p.read_text().split("\n")[1:3] for p in tmp_path.glob("runs/mine/sweep_*/*/argv.txt"))
+    assert runs == [["task=mine_swept:Mine", f"task.rewards.one={k}"] for k in (1, 2)]
+
+
 def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
     assert sweep.run(["-m", "seed=1,2,3", f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)]) == 1
     assert [json.loads((tmp_path / "s" / "jobs" / f"{k}.json").read_text())["status"] for k in range(3)] == [0, 3, 0]

@@ -1,19 +1,19 @@
 """Several runs from one command: dexsim train --multirun seed=1,2,3 servo=xhand,ideal.
 
-Hydra's sweeper expands the lists; each of its jobs is `dexsim train` in a process of its own, here or on a cluster
+Hydra's grammar expands the lists; each run is `dexsim train` in a process of its own, here or on a cluster
 (:mod:`dexsim.console.jobs`).
 """
 
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from dexsim.console import jobs
 from dexsim.console.tables import table
@@ -43,8 +43,8 @@ def run(argv: list[str], config_dir: Path, program: Sequence[str] = PROGRAM) -> 
                 f"{name}=: a sweep names its run folders itself, <sweep>/<number>; choose the place with sweep=FOLDER"
             )
     given = [a.partition("=")[2] for a in argv if a.startswith("sweep=")]
-    argv = [a for a in argv if not a.startswith("sweep=")]
-    task = next((a.partition("=")[2] for a in reversed(argv) if a.startswith("task=")), "grasp").replace(",", "_")
+    runs = _expanded([a for a in argv if not a.startswith("sweep=")])
+    task = "_".join(_tasks(runs, config_dir))
     folder = (
         Path(given[-1] if given else Path("runs") / task / time.strftime("sweep_%Y-%m-%d_%H-%M-%S"))
         .expanduser()
@@ -52,25 +52,12 @@ def run(argv: list[str], config_dir: Path, program: Sequence[str] = PROGRAM) -> 
     )
     if folder.exists() and any(folder.iterdir()):
         raise UserError(f"{folder} already holds a sweep: choose another sweep=")
-    places = [
-        f"hydra.sweep.dir={folder}",
-        "hydra.sweep.subdir=${hydra.job.num}",
-        "hydra.output_subdir=null",
-        "hydra.job.chdir=false",
-        "hydra/job_logging=disabled",
-        "hydra/hydra_logging=none",
-    ]
     wanted: list[jobs.Job] = []
-
-    def add(_cfg: Any) -> None:
-        from hydra.core.hydra_config import HydraConfig
-
-        hydra = HydraConfig.get()
-        settings, place = list(hydra.overrides.task), Path(hydra.runtime.output_dir)
-        print(f"job {place.name}: {' '.join(settings)}", flush=True)
+    for number, settings in enumerate(runs):
+        place = folder / str(number)
+        place.mkdir(parents=True)
+        print(f"job {number}: {' '.join(settings)}", flush=True)
         wanted.append(jobs.Job((("train", *settings, f"out={place}"),), place, tuple(program), resumes=True))
-
-    _hydra(argv, places, config_dir, add)
     jobs.run(wanted, engine)
     rows, failed = _collect(folder)
     print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
@@ -87,26 +74,37 @@ def _cuda() -> list[str]:
     return [str(k) for k in range(machine.cuda_devices())]
 
 
-def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Callable[[Any], None]) -> None:
-    """Run Hydra's own entry with our settings file; its one-line refusals become UserError."""
-    from hydra._internal.utils import _run_hydra, get_args_parser
+def _expanded(argv: list[str]) -> list[list[str]]:
+    """Return the settings of each run: every combination of the lists. Raises UserError."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
 
-    parser = get_args_parser()
-    args = parser.parse_args(["--multirun", *argv, *places])
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors as exceptions, to be said our way
     try:
-        _run_hydra(
-            args=args,
-            args_parser=parser,
-            task_function=job,
-            config_path=str(config_dir.resolve()),
-            config_name="config",
-        )
-    except (HydraException, OmegaConfBaseException) as error:
+        given = OverridesParser.create().parse_overrides(argv)
+        lists = {
+            key: [f"{key}={value}" for value in x.sweep_string_iterator()] if x.is_sweep_override() else [x.input_line]
+            for x in given
+            for key in (x.get_key_element(),)
+        }
+    except HydraException as error:
         lines = [x.strip() for x in str(error).splitlines() if x.strip()]
         raise UserError(f"sweep: {' '.join(lines[:3])}") from None
+    return [list(each) for each in itertools.product(*lists.values())]
+
+
+def _tasks(runs: list[list[str]], config_dir: Path) -> list[str]:
+    """Return the names of the runs' tasks. Raises UserError for a setting of any, before the first run starts."""
+    from dexsim.cli import start
+
+    names: dict[str, None] = {}
+    seen: set[str] = set()
+    for settings in runs:
+        if not names or not seen.issuperset(settings):  # each value once, not each combination
+            if (ready := start.for_train(settings, config_dir)) is None:
+                raise UserError("a sweep shows no settings: leave --cfg and --help out, or --multirun")
+            names[ready.cfg["task"]["name"]] = None
+            seen.update(settings)
+    return [*names]
 
 
 def _collect(folder: Path) -> tuple[list[tuple], bool]:

@@ -70,7 +70,7 @@ class Measured:
             raise UserError(
                 f"observation {self._term}: asks for {name}, which a real hand does not tell; a hand tells"
                 f" {', '.join(given)}, and what the policy is told (@command). Let only the critic see it"
-                " (only=\"critic\"), or build it from those"
+                ' (only="critic"), or build it from those'
             )
         return getattr(task, name)
 
@@ -129,7 +129,8 @@ def check(m: Any, source: object, again: str) -> None:
     """Raise UserError for a manifest that lacks what a task of terms needs."""
     if m.terms is None:
         raise UserError(f"{source}: task={m.task} is none of this dexsim's, and the manifest has no terms; {again}")
-    wide = sum(r.width * r.frames for r in m.terms.rows) + sum(len(v) for v in m.terms.commands.values())
+    seen = {r.name for r in m.observation}  # a command may be known to other rows only
+    wide = sum(r.width * r.frames for r in m.terms.rows) + sum(len(v) for k, v in m.terms.commands.items() if k in seen)
     if wide * m.terms.history != m.policy.observation_size:
         raise UserError(f"{source}: terms give {wide * m.terms.history} numbers, policy.observation_size is"
                         f" {m.policy.observation_size}; {again}")  # fmt: skip
@@ -161,7 +162,7 @@ def parts(env: Task) -> dict[str, Any]:
             "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
             "rows": [{"name": r.term.name, "width": r.width, "frames": r.frames} for r in of.rows],
             "history": int(env.history),
-            "commands": {k: floats(v[0]) for k, v in commanded.items()},
+            "commands": {k: floats(v[0]) for k, v in env.commands.items() if f"command {k}" in of.names},
         },
         "perception": {"object_pose": "something that sees where the object is and how it is turned, palm frame"
                        if "object_pose" in of.names else "none", "critic": "not deployed"},
