@@ -288,8 +288,8 @@ class Diagnose:
         paths = sorted(self.folder.glob("motion_*.mcap"))
         model, servo = (str(self.folder / f"rig{end}") for end in (".xml", ".yaml"))
         quick = {"replay": "none", "next_recording": False, "allowed": {"command_delay"}}
-        asked = Settings(paths, self.out, None, model, servo, **quick)
-        d = diagnose(asked, say=lambda _: None)
+        requested = Settings(paths, self.out, None, model, servo, **quick)
+        d = diagnose(requested, say=lambda _: None)
         save(d, self.out)
         shared.tell(1.0)
         for k in range(10**6):

@@ -127,12 +127,12 @@ def count(env: Any, actions: torch.Tensor) -> dict[str, Counter[str]]:
 
 def main(argv: list[str]) -> dict:
     rest: list[str] = []
-    shown = options(argv, {"lines": 25}, rest)["lines"]
+    displayed = options(argv, {"lines": 25}, rest)["lines"]
     cfg = tools.config(["device=cpu", "worlds=4", "sim.engine=warp", *rest])
     env = make_env(cfg, cfg["worlds"], "cpu", 0, "warp")
     found = count(env, torch.zeros(env.num_envs, env.num_actions))
     lines = sum(found.values(), Counter())
-    for line, n in lines.most_common(shown):
+    for line, n in lines.most_common(displayed):
         print(f"  {n:4d}  {line}")
     out = {name: sum(part.values()) for name, part in found.items()}
     return tools.report({"benchmark": "launches", "task": cfg["task"]["name"], **out, "launches": sum(out.values())})

@@ -188,8 +188,8 @@ def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarr
             ill = np.linalg.norm(places[:, None] - places[None], axis=-1).max() >= mine
             out["ill" if ill else "off"] += 1
             if not ill:
-                told = described(model, poses, int(i), got)
-                out["poses_off"].append(told | {"off_m": mine, "exact_place": at.tolist()})
+                reported = described(model, poses, int(i), got)
+                out["poses_off"].append(reported | {"off_m": mine, "exact_place": at.tolist()})
         elif theirs <= LIMIT:
             out["equal"] += 1
     rest = apart[near & (apart <= LIMIT)]

@@ -68,8 +68,8 @@ def one_node(folder: Path) -> Iterator[Path]:
                 started.append(subprocess.Popen(command, stdout=out, stderr=out))
             time.sleep(1)
         limit = time.monotonic() + 60
-        asked = ["sinfo", "-h", "-o", "%T"]
-        while "idle" not in (said := subprocess.run(asked, capture_output=True, text=True).stdout):
+        requested = ["sinfo", "-h", "-o", "%T"]
+        while "idle" not in (said := subprocess.run(requested, capture_output=True, text=True).stdout):
             logs = "".join(p.read_text(errors="replace")[-1500:] for p in folder.glob("*.log"))
             assert time.monotonic() < limit, said + (folder / "out.txt").read_text() + logs
             time.sleep(0.5)

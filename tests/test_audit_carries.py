@@ -54,9 +54,9 @@ def test_repeats_that_disagree_are_named_by_motion_and_joint(tmp_path, capsys):
     lines = [line for line in said.splitlines() if "repeats_disagree" in line]
     assert len(lines) == 1 and " b: 2 recordings" in lines[0] and "m1_0.csv, m1_1.csv" in lines[0]
     rows = [line.split() for line in said.splitlines() if line.strip().startswith(("m0_0.csv, m0", "m1_0.csv, m1"))]
-    apart = {(r[0], r[2]): float(r[3]) for r in rows}
-    assert apart["m0_0.csv,", "a"] < 0.4 and apart["m0_0.csv,", "b"] < 0.4 and apart["m1_0.csv,", "a"] < 0.4
-    assert 12 < apart["m1_0.csv,", "b"] < 18  # 30 mrad over half of the time, by the square root of two
+    distance = {(r[0], r[2]): float(r[3]) for r in rows}
+    assert distance["m0_0.csv,", "a"] < 0.4 and distance["m0_0.csv,", "b"] < 0.4 and distance["m1_0.csv,", "a"] < 0.4
+    assert 12 < distance["m1_0.csv,", "b"] < 18  # 30 mrad over half of the time, by the square root of two
 
 
 def test_a_position_that_is_renewed_seldom_is_said_and_the_next_command_is_complete(tmp_path, capsys):

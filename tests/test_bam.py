@@ -123,9 +123,9 @@ def both(tmp_path, file: dict, terms) -> tuple[float, dict[str, float]]:
 def test_the_motion_is_bams_within_a_hundredth(tmp_path, model):
     """Also that each term of the model matters to it: BAM's own motion without it is another. The terms of m3 and m5
     are among those of m4 and m6."""
-    apart, without = both(tmp_path, of(model), OF[model] or ("friction_base",))
-    assert apart < 0.002, "a fifth of what is asked, so that each term can be told"
-    assert min(without.values()) > 5 * apart, without
+    distance, without = both(tmp_path, of(model), OF[model] or ("friction_base",))
+    assert distance < 0.002, "a fifth of what is asked, so that each term can be told"
+    assert min(without.values()) > 5 * distance, without
 
 
 def test_the_search_believes_a_bam_table_as_the_servo_moves_by_it(tmp_path):
@@ -145,14 +145,14 @@ def test_the_search_believes_a_bam_table_as_the_servo_moves_by_it(tmp_path):
         q = plant.simulate(params, plant.windows(None))[0][0]
         return float(np.sqrt(np.mean((q - run.position[rows, 0]) ** 2)) / np.ptp(run.position))
 
-    apart = off()
-    assert apart < 0.01
-    assert min(off(**{name: 0.0}) for name in bam.LOADED if name != "load_friction_backdriven") > 2 * apart
+    distance = off()
+    assert distance < 0.01
+    assert min(off(**{name: 0.0}) for name in bam.LOADED if name != "load_friction_backdriven") > 2 * distance
 
 
 def test_the_motion_of_a_published_fit_is_bams_within_a_hundredth(tmp_path):
-    apart, without = both(tmp_path, FITTED, ("load_friction_motor", "load_friction_external"))
-    assert apart < 0.01 < 0.02 < min(without.values())
+    distance, without = both(tmp_path, FITTED, ("load_friction_motor", "load_friction_external"))
+    assert distance < 0.01 < 0.02 < min(without.values())
 
 
 @pytest.mark.parametrize("model", list(OF))

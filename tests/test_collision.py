@@ -298,10 +298,10 @@ def test_what_was_nearest_before_does_not_decide_what_is_nearest_now(two_poses):
     for start in ("none", "before", "others"):
         worlds.put(before)
         worlds.collide()
-        kept = worlds.narrow.simplex.numpy().copy()  # on a CPU that is no copy by itself
+        saved = worlds.narrow.simplex.numpy().copy()  # on a CPU that is no copy by itself
         worlds.put(after)
         if start != "none":
-            worlds.narrow.simplex.assign(kept if start == "before" else np.roll(kept, 7, axis=0))
+            worlds.narrow.simplex.assign(saved if start == "before" else np.roll(saved, 7, axis=0))
         worlds.collide()
         found[start] = worlds.found()
     cold = found["none"]
@@ -412,12 +412,12 @@ def _launched(program) -> list:
         seen.append((kernel, dim))
         return launch(kernel, dim, *args, **kwargs)
 
-    kept = wp.launch
+    saved = wp.launch
     wp.launch = context.launch = spy
     try:
         program()
     finally:
-        wp.launch, context.launch = kept, launch
+        wp.launch, context.launch = saved, launch
     return [(k, d) for k, d in seen if np.prod(d) and not k.is_generic]
 
 

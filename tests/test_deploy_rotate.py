@@ -159,8 +159,8 @@ def test_goals_move_on_as_the_object_turns(made):
     for k in range(200):
         q = np.array([np.cos((heading + 0.02 * k) / 2), 0, 0, np.sin((heading + 0.02 * k) / 2)])
         m.observe(state(k * 0.021), q, 0.0, np.zeros(12), np.zeros(12))
-    left = np.radians(90) - m.task["reward"]["delta_rot"]
-    assert m.goals == int(0.02 * 199 / left) and m.goals >= 2
+    remaining = np.radians(90) - m.task["reward"]["delta_rot"]
+    assert m.goals == int(0.02 * 199 / remaining) and m.goals >= 2
     assert float(rotation.error(m.goal, torch.tensor(q, dtype=torch.float32)[None])) < np.radians(90) + 1e-4
     m.reset()
     assert m.goal is None and m.goals == 0

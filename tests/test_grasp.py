@@ -262,7 +262,7 @@ def test_reward_terms_by_hand(posed):
 
 def test_tracking_against_hand_computed_values(posed):
     env, r = posed, posed.task["reward"]
-    kept, f_max = dict(r), env.f_max
+    saved, f_max = dict(r), env.f_max
     r |= {"force_sigma": 0.25, "force_low": 0.02, "force_high": 1.3, "contact_threshold": 0.1}
     env.f_max = 8.0
     try:
@@ -271,7 +271,7 @@ def test_tracking_against_hand_computed_values(posed):
         env.tip_force[1] = torch.tensor([0.12, 4.0, 0.12, 4.0, 0.05])
         got = env.rewards()["force"][:2] / env.task["rewards"]["force"]
     finally:
-        r |= kept
+        r |= saved
         env.f_max = f_max
     first = 1.0 + 1.0 + math.exp(-0.5 * (2 / 2) ** 2) + 0.0 + 0.0  # on target; 1 sigma off; no contact; over the band
     second = 0.0 + 1.0 + 0.0 + 1.0 + 0.0  # thumb under its band; exact; under the band; exact; no contact
@@ -298,7 +298,7 @@ def test_fingers_on_fingers_are_no_contact_with_the_object(env):
     """A fist with the object far away: fingers press each other, yet no force counts."""
     far = torch.zeros(N, 7)
     far[:, 0], far[:, 2], far[:, 3] = 0.05, 0.9, 1.0
-    env.task["termination"]["distance"], kept = 10.0, env.task["termination"]["distance"]
+    env.task["termination"]["distance"], saved = 10.0, env.task["termination"]["distance"]
     try:
         env.place(torch.ones(N, dtype=torch.bool), env.pose0.expand(N, 12), far, torch.zeros(N, 6))
         env.engine.field("opt.gravity").zero_()
@@ -314,16 +314,16 @@ def test_fingers_on_fingers_are_no_contact_with_the_object(env):
         assert float(pressed.median()) > 0.5, "no finger touched another: the test says nothing"
         assert not reward["force"].any() and not reward["torque"].any() and not reward["grip"].any()
     finally:
-        env.task["termination"]["distance"] = kept
+        env.task["termination"]["distance"] = saved
 
 
 def test_weights_scale_their_terms_and_the_sum_is_the_reward(env):
     for _ in range(25):
         _, reward, done, extras = env.step(act(env, 0.4))
     total = torch.stack(list(env.rewards().values())).sum(0)
-    kept = ~done.bool()
-    assert kept.any()
-    torch.testing.assert_close(reward[kept], total[kept], rtol=1e-5, atol=1e-6)
+    saved = ~done.bool()
+    assert saved.any()
+    torch.testing.assert_close(reward[saved], total[saved], rtol=1e-5, atol=1e-6)
     assert set(env.rewards()) == set(env.task["rewards"])
 
 

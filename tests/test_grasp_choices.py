@@ -29,15 +29,15 @@ def rows(env):
 
 
 def test_without_touch_the_actor_lacks_its_rows_and_the_critic_does_not():
-    felt, blind = grasp_env(*FEW), grasp_env(*FEW, "task.observe.touch=false")
+    measured, blind = grasp_env(*FEW), grasp_env(*FEW, "task.observe.touch=false")
     names = [row[0] for row in rows(blind)]
-    assert [row[0] for row in rows(felt) if row[0] not in names] == ["contact_force", "contact_centre"]
-    a, b = steps(felt, 2)[-1], steps(blind, 2)[-1]
-    assert b["actor"].shape[1] == sum(row[1] for row in rows(blind)) == a["actor"].shape[1] - 4 * felt.pads
+    assert [row[0] for row in rows(measured) if row[0] not in names] == ["contact_force", "contact_centre"]
+    a, b = steps(measured, 2)[-1], steps(blind, 2)[-1]
+    assert b["actor"].shape[1] == sum(row[1] for row in rows(blind)) == a["actor"].shape[1] - 4 * measured.pads
     assert b["critic"].shape == a["critic"].shape
     assert ["contact_force" in [r[0] for r in blind.describe()["observations"][k]] for k in ("actor", "critic")] == [
         False, True]  # fmt: skip
-    felt.close(), blind.close()
+    measured.close(), blind.close()
 
 
 def test_the_thumb_has_a_command_of_its_own():

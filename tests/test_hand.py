@@ -203,7 +203,7 @@ def test_a_hand_goes_to_another_process():
     """The simulated hand in real time runs in a process of its own, and is handed the hand."""
     import pickle
 
-    left = load_hand("xhand", mirror=True, scale=1.1)
-    again = pickle.loads(pickle.dumps(left))
-    assert (again.mirror, again.scale, again.joints) == (True, 1.1, left.joints)
-    assert again.compiled.nq == left.compiled.nq and (again.limits == left.limits).all()
+    remaining = load_hand("xhand", mirror=True, scale=1.1)
+    again = pickle.loads(pickle.dumps(remaining))
+    assert (again.mirror, again.scale, again.joints) == (True, 1.1, remaining.joints)
+    assert again.compiled.nq == remaining.compiled.nq and (again.limits == remaining.limits).all()

@@ -631,13 +631,13 @@ def test_arguments(argv, said, tmp_path, monkeypatch):
 
 
 def test_check_of_the_mirror_image(claw, tmp_path, capsys, monkeypatch):
-    shown = []
-    monkeypatch.setattr(moves, "_show", lambda hand, out, seconds, film: shown.append(hand) or [])
+    displayed = []
+    monkeypatch.setattr(moves, "_show", lambda hand, out, seconds, film: displayed.append(hand) or [])
     for k, mirror in enumerate(("false", "true")):
         assert moves.main([str(claw), f"out={tmp_path / str(k)}", f"hand_mirror={mirror}"]) == 0
     plain, mirrored = capsys.readouterr().out.split("joint  ")[1:]
     assert plain == mirrored  # joint angles keep their meaning
-    assert [hand.mirror for hand in shown] == [False, True]
+    assert [hand.mirror for hand in displayed] == [False, True]
     with pytest.raises(UserError, match="hand_mirror=left: must be true or false"):
         moves.main([str(claw), f"out={tmp_path / 'x'}", "hand_mirror=left"])
 

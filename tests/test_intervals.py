@@ -99,5 +99,5 @@ def test_who_loses_least_wins_and_who_is_near_shares():
     losses = np.array([np.ones(12), np.full(12, 1.02), np.full(12, 9.0)])
     won = intervals.wins(losses, intervals.stretches(12, 4, 0, 100), 0.02)
     assert won == pytest.approx(np.array([1, np.exp(-1), 0]) / (1 + np.exp(-1)))
-    apart = np.where(np.arange(12) < 6, [[0.0], [2.0]], [[2.0], [0.0]]) + 1.0  # each better in its half
-    assert intervals.wins(apart, intervals.stretches(12, 4, 0, 4000), 1e-6) == pytest.approx([0.5, 0.5], abs=0.03)
+    distance = np.where(np.arange(12) < 6, [[0.0], [2.0]], [[2.0], [0.0]]) + 1.0  # each better in its half
+    assert intervals.wins(distance, intervals.stretches(12, 4, 0, 4000), 1e-6) == pytest.approx([0.5, 0.5], abs=0.03)

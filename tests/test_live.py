@@ -78,30 +78,30 @@ def test_colours_darken_with_force():
 
 def test_a_pressed_taxel_shows_on_its_own_fingertip_only():
     layout = hand_layout(load_hand())
-    shown = panels.TaxelMap(layout)
+    displayed = panels.TaxelMap(layout)
     force = np.zeros(layout.area.shape)
-    calm = shown.image(force, 1.0)
+    calm = displayed.image(force, 1.0)
     for finger in range(5):
         force[:] = 0
         force[finger, 60] = 1.0
-        changed = (shown.image(force, 1.0) != calm).any(-1)
+        changed = (displayed.image(force, 1.0) != calm).any(-1)
         columns = np.flatnonzero(changed.any(0))
-        left = finger * (panels.PAD_WIDTH + panels.GAP)
+        remaining = finger * (panels.PAD_WIDTH + panels.GAP)
         assert 4 <= changed.sum() <= 0.1 * panels.PAD_WIDTH * panels.PAD_HEIGHT
-        assert left <= columns.min() and columns.max() < left + panels.PAD_WIDTH
-    every = {tuple(p) for f in range(5) for p in np.unique(shown._nearest[f][shown._inside[f]])[:, None]}
+        assert remaining <= columns.min() and columns.max() < remaining + panels.PAD_WIDTH
+    every = {tuple(p) for f in range(5) for p in np.unique(displayed._nearest[f][displayed._inside[f]])[:, None]}
     assert len(every) == 120  # each taxel has a place
 
 
 def test_the_end_of_the_finger_is_up():
     layout = hand_layout(load_hand())
-    shown = panels.TaxelMap(layout)
+    displayed = panels.TaxelMap(layout)
     force = np.zeros(layout.area.shape)
-    calm = shown.image(force, 1.0)
+    calm = displayed.image(force, 1.0)
     for finger, axis in enumerate((1, 2, 2, 2, 2)):  # the thumb's distal link points along y, the others' along z
         force[:] = 0
         force[finger, layout.point[finger, :, axis].argmax()] = 1.0
-        rows = np.flatnonzero((shown.image(force, 1.0) != calm).any(-1).any(1))
+        rows = np.flatnonzero((displayed.image(force, 1.0) != calm).any(-1).any(1))
         assert rows.mean() < 0.35 * panels.PAD_HEIGHT, layout.names[finger]
 
 
@@ -180,12 +180,12 @@ def test_pause_step_world_policy_command_and_restart(view, env):
     view.run(seconds=1.5)
     assert view.steps == 7 and int(env.episode_length_buf[0]) == 7
     assert "paused" in view._facts.content and 'data-fact="step">7<' in view._facts.content
-    shown = view._object[0].vertices.copy()
+    displayed = view._object[0].vertices.copy()
     w.world, w.steps = 1, 1
     view.run(seconds=0.7)
     assert "1 of 2" in view._facts.content
     # the other world's object
-    assert len(view._object[0].vertices) != len(shown) or not np.allclose(view._object[0].vertices, shown)
+    assert len(view._object[0].vertices) != len(displayed) or not np.allclose(view._object[0].vertices, displayed)
     w.policy, w.command, w.steps = "zero", 0.75, 2
     view.run(seconds=0.7)
     assert view.name == "zero" and view.steps == 2 and float(env.command[1]) == 0.75
@@ -199,17 +199,17 @@ def test_touch_is_shown_where_it_is_felt(view, env):
     view.wishes.speed = "fastest"
     blank = view._image.image.copy()
     give_up = time.monotonic() + 60.0
-    felt = np.zeros((5, 120))
+    measured = np.zeros((5, 120))
     # how far "fastest" comes is the machine's affair; an object between two throws is not felt
-    while view.steps <= 60 or felt.sum() == 0:
+    while view.steps <= 60 or measured.sum() == 0:
         assert time.monotonic() < give_up, f"{view.steps} steps, none of the last of a second felt anything"
         view.run(seconds=1.0)
-        felt = env.touch.raw[0].numpy()
+        measured = env.touch.raw[0].numpy()
     view.draw(panels_too=True)
     assert (view._image.image != blank).any()
-    finger = int(felt.sum(1).argmax())
+    finger = int(measured.sum(1).argmax())
     pressed = view._points[finger].colors.astype(int)
-    assert pressed[felt[finger].argmax()].sum() < pressed[felt[finger].argmin()].sum()
+    assert pressed[measured[finger].argmax()].sum() < pressed[measured[finger].argmin()].sum()
     assert {k for k in view._terms if env.task["rewards"][k]} == {row[0] for row in env.describe()["rewards"]}
 
 

@@ -33,12 +33,12 @@ def locked(*names: str) -> dict[str, list[str]]:
 )
 def test_what_is_asked_for_is_locked(name, extras):
     there = locked(name, "torch")
-    asked = [
+    requested = [
         *PROJECT["dependencies"],
         *(r for e in extras for r in PROJECT["optional-dependencies"][e]),
         "setuptools>=77",
     ]
-    for text in asked:
+    for text in requested:
         requirement = Requirement(text)
         versions = there.get(requirement.name.lower().replace("_", "-"), [])
         assert versions and all(requirement.specifier.contains(v) for v in versions), f"{text}: {versions}; {AGAIN}"

@@ -130,10 +130,10 @@ def test_training_draws_near_what_was_found(tmp_path):
 def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
     nominal = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     for name in worlds.SEEDS:
-        kept = yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
+        saved = yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
         drawn = worlds.draw(name)
-        assert kept["servo"]["joints"] == drawn["servo"]["joints"]
-        for joint, p in kept["servo"]["joints"].items():
+        assert saved["servo"]["joints"] == drawn["servo"]["joints"]
+        for joint, p in saved["servo"]["joints"].items():
             b = nominal["joints"]["*"] | nominal["joints"].get(joint, {})
             assert 0.95 < p["torque_limit"] / b["torque_limit"] < 1.05
             assert (
@@ -220,8 +220,8 @@ def test_presses_are_the_realitys_sensor(tmp_path):
     z, cell = r.tactile.value[..., 2], r.external_force.value[:, 0]
     assert np.array_equal(z, np.round(z)) and z[:, 3].max() > 3 and not z[:, [0, 1, 2, 4]].any()
     fine = np.arange(r.tactile.t[0], r.tactile.t[-1], 1e-3)
-    felt, real = np.interp(fine, r.tactile.t, z[:, 3].sum(1)), np.interp(fine, r.tactile.t, cell)
-    late = max(range(60), key=lambda k: np.corrcoef(felt[60:], real[60 - k : len(real) - k])[0, 1])
+    measured, real = np.interp(fine, r.tactile.t, z[:, 3].sum(1)), np.interp(fine, r.tactile.t, cell)
+    late = max(range(60), key=lambda k: np.corrcoef(measured[60:], real[60 - k : len(real) - k])[0, 1])
     assert 0.014 < late * 1e-3 < 0.032  # hysteresis leads, the wait for a reading lags
 
 

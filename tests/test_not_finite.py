@@ -85,8 +85,8 @@ def test_one_diverged_world_leaves_the_others_as_they_are(made):
     state = [x.clone() for x in (t.qpos, t.qvel, t.time, made.engine._warmstart, made.servo.state)]
     results = []
     for bad in (False, True):
-        for own, kept in zip((t.qpos, t.qvel, t.time, made.engine._warmstart, made.servo.state), state):
-            own.copy_(kept)
+        for own, saved in zip((t.qpos, t.qvel, t.time, made.engine._warmstart, made.servo.state), state):
+            own.copy_(saved)
         if bad:
             t.qpos[3, 5] = NAN
         made.engine.step(2, made.servo.before_each)

@@ -104,8 +104,8 @@ def test_a_recording_of_a_play(place, capfd, monkeypatch, worlds, name):
 
     path = mine(place / name)
     monkeypatch.setattr(play, "replay", never)
-    asked = ["policy=zero", "task=grasp", "device=cpu", "episodes=2", "video=false", "out=o"]
-    refused(capfd, main(["play", *asked, "record=mine.mcap", f"record_worlds={worlds}"]), path)
+    requested = ["policy=zero", "task=grasp", "device=cpu", "episodes=2", "video=false", "out=o"]
+    refused(capfd, main(["play", *requested, "record=mine.mcap", f"record_worlds={worlds}"]), path)
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "simulated.mcap", "position.png", "video.mp4"])

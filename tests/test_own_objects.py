@@ -136,8 +136,8 @@ def test_what_was_worked_out_is_kept_and_a_broken_cache_is_made_anew(tmp_path, m
     np.testing.assert_allclose(np.concatenate(first.hulls), np.concatenate(again.hulls), atol=1e-9)
     monkeypatch.undo()
     monkeypatch.setenv("DEXSIM_CACHE", str(own.cache_folder().parent))
-    for kept in own.cache_folder().glob("*.npz"):
-        kept.write_bytes(kept.read_bytes()[:100])
+    for saved in own.cache_folder().glob("*.npz"):
+        saved.write_bytes(saved.read_bytes()[:100])
     own._cached.cache_clear()
     monkeypatch.setattr(decompose, "decompose", lambda *a: u_shape())
     assert own.own_shape(str(path)).volume == pytest.approx(first.volume)

@@ -9,9 +9,9 @@ from dexsim.tasks.recorded import Constants, unrecordable
 
 
 def test_constants_equal_what_torch_makes_and_are_copies():
-    kept = Constants("cpu")
+    saved = Constants("cpu")
     for _ in range(2):
-        with kept:
+        with saved:
             a = torch.tensor([0.05, 0.0, 1])
             b = torch.as_tensor(np.arange(4.0), dtype=torch.float32)
             c = torch.tensor([1, 2], dtype=torch.long)
@@ -23,11 +23,11 @@ def test_constants_equal_what_torch_makes_and_are_copies():
 
 def test_the_device_is_copied_to_once(monkeypatch):
     """The second run of a step makes no tensor of Python numbers, which a recording could not."""
-    kept, made = Constants("cpu"), []
+    saved, made = Constants("cpu"), []
     for _ in range(3):
-        with kept:
+        with saved:
             made.append((torch.tensor([1.0, 2.0]), torch.tensor(2.0), torch.tensor(True), torch.tensor([[1], [2]])))
-    assert len(kept.made) == 4
+    assert len(saved.made) == 4
     assert all(torch.equal(x, y) for x, y in zip(made[0], made[2], strict=True))
 
 

@@ -77,8 +77,8 @@ def test_so_is_one_that_was_broken_off_in_a_rollout(tmp_path):
     """Ctrl-C comes anywhere: what is saved is the end of the last iteration, its running normalization too."""
     whole = runner("grasp", "mujoco", *ENDS)
     whole.learn(3)
-    half, asked = runner("grasp", "mujoco", *ENDS), []
-    assert half.learn(9, stop=lambda: len(asked) > 19 or asked.append(1)) is False and half.iteration == 2
+    half, requested = runner("grasp", "mujoco", *ENDS), []
+    assert half.learn(9, stop=lambda: len(requested) > 19 or requested.append(1)) is False and half.iteration == 2
     path = checkpoint.save(tmp_path / "half.pt", half.payload())
     half.learn(3)  # the one that was stopped could itself go on
     same(whole, half)

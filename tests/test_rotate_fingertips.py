@@ -125,12 +125,12 @@ def test_the_actor_does_not_know_size_mass_or_friction(env):
     state = env.rng.get_state()
     before = {k: v.clone() for k, v in env.observe(advance=False).items()}
     o = env.objects
-    kept = [v.clone() for v in (o.size, o.mass, o.friction, o.com)]
+    saved = [v.clone() for v in (o.size, o.mass, o.friction, o.com)]
     for v in (o.size, o.mass, o.friction, o.com):
         v.mul_(1.7).add_(0.01)
     env.rng.set_state(state)
     after = env.observe(advance=False)
-    for v, old in zip((o.size, o.mass, o.friction, o.com), kept, strict=True):
+    for v, old in zip((o.size, o.mass, o.friction, o.com), saved, strict=True):
         v.copy_(old)
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])

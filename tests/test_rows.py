@@ -26,7 +26,7 @@ def test_claims_name_rows_of_their_table():
 
 
 def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
-    asked = []
+    requested = []
 
     def attempt(job, env=None):
         status = max(run([*job.program, *command]) for command in job.commands)
@@ -35,10 +35,10 @@ def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
         return status
 
     def run(command):
-        asked.append(command[3:])
+        requested.append(command[3:])
         out = next(a.removeprefix("out=") for a in command if a.startswith("out="))
         if command[3] == "play":
-            value = 20.0 + len(asked) + 10 * ("full" in out)
+            value = 20.0 + len(requested) + 10 * ("full" in out)
             folder = rows.Path(out)
             folder.mkdir(parents=True)
             (folder / "metrics.json").write_text(json.dumps({"consecutive_successes": {"average": value}}))
@@ -47,10 +47,10 @@ def test_what_was_judged_is_not_repeated(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(rows.jobs, "attempt", attempt)
     argv = ["table=rotation", "rows=full,no_touch", "seeds=1,2", f"out={tmp_path}", "worlds=8", "judge=episodes=4"]
     first = rows.main(argv)
-    assert len(asked) == 8 and {"task=rotate", "device=cpu", "seed=1", "worlds=8"} <= set(asked[0])
-    assert {"seed=1001", "episodes=4"} <= set(asked[1])
+    assert len(requested) == 8 and {"task=rotate", "device=cpu", "seed=1", "worlds=8"} <= set(requested[0])
+    assert {"seed=1001", "episodes=4"} <= set(requested[1])
     assert "| everything, 6D orientation > no touch at all |" in capsys.readouterr().out
-    assert rows.main(argv) == first and len(asked) == 8
+    assert rows.main(argv) == first and len(requested) == 8
 
 
 def test_wrong_table_and_row_are_one_line():

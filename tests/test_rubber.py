@@ -105,8 +105,8 @@ def test_stiffness_holds_over_mass_load_and_posture(kind, seed, twin):
     carried = e.t.pair_force[:, FINGER] + given["load"] + DRAG * v
     assert torch.allclose(e.t.pair_normal[:, 5 + FINGER], normal, rtol=1e-3), "nothing but the tip touches"
     assert bool((carried.norm(dim=1) < 0.01 * given["load"].norm(dim=1)).all()), carried
-    felt = env.touch.force_clean[:, FINGER]
-    assert torch.allclose(felt, normal, rtol=1e-3)
+    measured = env.touch.force_clean[:, FINGER]
+    assert torch.allclose(measured, normal, rtol=1e-3)
     aligned = normal / given["load"].norm(dim=1)  # friction holds the rest where the contact's normal is not the pad's
     assert float(aligned.max()) < 1.01 and float(aligned.median()) > 0.9
     lit = [f for f in range(5) if f != FINGER]

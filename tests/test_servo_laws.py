@@ -410,12 +410,12 @@ def test_a_gears_load_from_both_sides_is_one_law_in_servo_and_plant():
     targets = 0.5 * np.sin(2 * np.pi * times) + 0.1 * np.sin(2 * np.pi * 2.3 * times)
     run_by = lambda motion, c, dt: motion(c, times, targets, 2.0, dt=dt, gravity=40.0)[:, 0]  # noqa: E731
     q = run_by(servo_motion, columns | LOADED, 2.5e-4)
-    apart = np.abs(run_by(plant_motion, columns | LOADED, 2.5e-4) - q).max()
+    distance = np.abs(run_by(plant_motion, columns | LOADED, 2.5e-4) - q).max()
     coarse = run_by(plant_motion, columns | LOADED, 1e-3) - run_by(servo_motion, columns | LOADED, 1e-3)
-    assert apart < 0.007 and apart < 0.4 * np.abs(coarse).max()
+    assert distance < 0.007 and distance < 0.4 * np.abs(coarse).max()
     for name in LOADED:
         without = np.abs(run_by(servo_motion, columns | LOADED | {name: 0.0}, 2.5e-4) - q).max()
-        assert without > 3 * apart, name
+        assert without > 3 * distance, name
 
 
 def test_what_the_encoder_is_off_by_is_marked_as_the_encoders():
@@ -423,8 +423,8 @@ def test_what_the_encoder_is_off_by_is_marked_as_the_encoders():
     q = np.linspace(-1.5, 1.5, 7)
     neutral = {c.name: c.neutral for c in COLUMNS}
     for c in COLUMNS:
-        shown, slope = measured_position(neutral | {c.name: min(c.neutral + c.usual, c.high)}, q)
-        assert c.encoder == (np.abs(np.diff(shown, 2)).max() > 1e-3) == (np.ptp(slope + 0.0 * q) > 1e-3), c.name
+        displayed, slope = measured_position(neutral | {c.name: min(c.neutral + c.usual, c.high)}, q)
+        assert c.encoder == (np.abs(np.diff(displayed, 2)).max() > 1e-3) == (np.ptp(slope + 0.0 * q) > 1e-3), c.name
 
 
 @wp.kernel

@@ -583,8 +583,8 @@ def test_what_a_dof_feels_from_outside(kind, tolerance):
                 friction[data.efc_id[r]] = data.efc_force[r]
         pushed = np.zeros(3)
         mujoco.mj_applyFT(model, data, data.xfrc_applied[2, :3], np.zeros(3), data.xipos[2], 2, pushed)
-        felt = -data.qfrc_bias + data.qfrc_spring + pushed + data.qfrc_constraint - friction
-        assert np.abs(e.t.outside.double().numpy() - felt).max() < tolerance * max(1.0, np.abs(felt).max()), k
+        measured = -data.qfrc_bias + data.qfrc_spring + pushed + data.qfrc_constraint - friction
+        assert np.abs(e.t.outside.double().numpy() - measured).max() < tolerance * max(1.0, np.abs(measured).max()), k
     assert len(seen) == 3, "dry friction, limit and contact"
     e.set_state(torch.tensor([True, False]), e.t.qpos.clone(), e.t.qvel.clone())
     assert not e.t.outside[0].any() and e.t.outside[1].any() and e.memory()["outside"] is e.t.outside

@@ -28,8 +28,8 @@ def rows(leak_mib: float = 0.0, files: int = 0, n: int = 400) -> list[tuple[floa
     rng, t = np.random.default_rng(0), np.arange(n) * 0.5
     heap = 400 + 200 * (1 - np.exp(-t / 5)) + 50 * (t % 3) / 3 + rng.normal(0, 2, n) + leak_mib * t / t[-1]
     opened = 5 + rng.integers(0, 2, n) + np.floor(files * t / t[-1])
-    kept = 350 + np.floor(leak_mib * t / t[-1])
-    return [(a, h, h + 300, f, 3, float("nan"), m, a / 10) for a, h, f, m in zip(t, heap, opened, kept, strict=True)]
+    saved = 350 + np.floor(leak_mib * t / t[-1])
+    return [(a, h, h + 300, f, 3, float("nan"), m, a / 10) for a, h, f, m in zip(t, heap, opened, saved, strict=True)]
 
 
 def test_a_leak_is_told_from_what_comes_and_goes():
@@ -74,14 +74,14 @@ def test_how_far_a_part_is_is_known_while_it_runs(tmp_path):
     (tmp_path / "run" / "progress.csv").write_text("iteration,steps,reward\n")
     assert soak.done(s, tmp_path, "training") is None
     (tmp_path / "run" / "progress.csv").write_text("iteration,steps,reward\n1,2400,0.5\n71,170400,0.7\n72,1728")
-    worked, kept = soak.done(s, tmp_path, "training")
-    assert worked == pytest.approx(71 * 100 * 24 * 0.021 / 3600) and np.isnan(kept)  # 72 is not whole
+    worked, saved = soak.done(s, tmp_path, "training")
+    assert worked == pytest.approx(71 * 100 * 24 * 0.021 / 3600) and np.isnan(saved)  # 72 is not whole
     (tmp_path / "deploy").mkdir()
     parts.tell(tmp_path / "deploy", 0.25, between=False)
     assert soak.done(s, tmp_path, "deploy")[0] == 0.25 and np.isnan(soak.done(s, tmp_path, "deploy")[1])
     parts.tell(tmp_path / "deploy", 0.5)
-    worked, kept = soak.done(s, tmp_path, "deploy")
-    assert worked == 0.5 and abs(kept - look(os.getpid())[0]) < 50
+    worked, saved = soak.done(s, tmp_path, "deploy")
+    assert worked == 0.5 and abs(saved - look(os.getpid())[0]) < 50
 
 
 LEAKS = """

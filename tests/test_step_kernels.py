@@ -88,28 +88,28 @@ def rewards(env) -> tuple[dict, dict]:
         "centre": beside.clamp(max=2.0),
     }
     late = env.episode_length_buf * env.dt > 2.0
-    shown = {
+    displayed = {
         "task/held": (opposed & pressed.any(1)).float(),
         "task/force_error": (force[:, env.others] - env.command[:, None] * env.f_max).abs().mean(1),
         "task/fingers_touching": pressed.float().sum(1),
         "task/force_other": env.self_force.sum(1),
     }
     count = late.sum().clamp(min=1)
-    return {k: w[k] * v for k, v in out.items()}, {k: (v * late).sum() / count for k, v in shown.items()}
+    return {k: w[k] * v for k, v in out.items()}, {k: (v * late).sum() / count for k, v in displayed.items()}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rewards_and_what_the_log_shows(env, seed):
     scatter(env, seed)
-    want, shown = rewards(env)
+    want, displayed = rewards(env)
     got = env.rewards()
     assert set(got) == set(env.task["rewards"]) == set(want)
     for name, value in want.items():
         torch.testing.assert_close(got[name], value, rtol=1e-5, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
         assert float(value.std()) > 0, f"{name} is the same everywhere: nothing was compared"
     metrics = env.metrics()
-    assert set(metrics) == set(shown)
-    for name, value in shown.items():
+    assert set(metrics) == set(displayed)
+    for name, value in displayed.items():
         torch.testing.assert_close(metrics[name], value, rtol=1e-5, atol=1e-6)
     dropped = env.terminated()["dropped"]
     assert torch.equal(dropped.float() * env.task["rewards"]["termination"], want["termination"])
@@ -121,10 +121,10 @@ def test_a_number_that_is_not_finite_is_not_hidden_by_a_bound(env):
     for memory, terms in ((env.tip_force, ("force_near", "worst")), (env.self_force, ("self",)),
                           (env.object_velocity, ("still",)), (env.object_pose, ("centre",)),
                           (env.clearance.distance, ("reach",))):  # fmt: skip
-        kept = memory.clone()
+        saved = memory.clone()
         memory[3] = float("nan")
         got = env.rewards()
-        memory.copy_(kept)
+        memory.copy_(saved)
         for name in terms:
             assert bool(got[name][3].isnan()) and bool(got[name][:3].isfinite().all()), name
 
@@ -179,7 +179,7 @@ def test_nothing_is_felt_where_an_episode_begins(env):
 @pytest.mark.parametrize("mode", ["relative", "absolute"])
 def test_actions_become_targets(env, mode):
     setting = env.task["action"]
-    kept = setting["mode"]
+    saved = setting["mode"]
     setting["mode"] = mode
     try:
         env.target.copy_(random(env, N, 12, seed=2)), env.q.copy_(random(env, N, 12, seed=3))
@@ -198,7 +198,7 @@ def test_actions_become_targets(env, mode):
         target = torch.maximum(torch.minimum(target, env.q_high), env.q_low)
         torch.testing.assert_close(env.target, target, rtol=0, atol=2e-7)
     finally:
-        setting["mode"] = kept
+        setting["mode"] = saved
         env.reset_all()
 
 
@@ -226,7 +226,7 @@ def test_who_ends_and_what_is_earned(env):
     state, blind = torch.arange(n) == 3, torch.arange(n) == 4
     env.nan.copy_(state), env._blind[0].copy_(blind)
     env.episode_length_buf = torch.where(torch.arange(n) % 3 == 0, env.max_episode_length, 1)
-    counted, env._wrong, kept = env.nan_count.clone(), None, env._wrong
+    counted, env._wrong, saved = env.nan_count.clone(), None, env._wrong
     rates, reward = env._judge(ends, {k: v.clone() for k, v in terms.items()})
     bad = (torch.arange(n) >= 1) & (torch.arange(n) <= 4)
     dead = ends["x"] | ends["y"] | bad
@@ -238,7 +238,7 @@ def test_who_ends_and_what_is_earned(env):
     torch.testing.assert_close(env.reward, total, rtol=1e-6, atol=1e-7)
     assert torch.equal(rates, torch.stack([ends["x"], ends["y"], bad, late]).float())
     torch.testing.assert_close(reward.sum(0), total, rtol=1e-6, atol=1e-6)
-    env._wrong = kept
+    env._wrong = saved
     env.reset_all()
 
 

@@ -44,12 +44,12 @@ def ball(cfg: dict, n: int = 2, **kw):
         **kw,
     )
     touch.shape_id[:], touch.shape_size[:] = 1, torch.tensor([RADIUS, 0.0, 0.0])
-    felt = layout.lifted(tips)
+    measured = layout.lifted(tips)
 
     def press(depth: float = 0.8e-3, time: float = 0.0, force: float = FORCE, pad: int = INDEX) -> None:
         engine.t.xpos[:, :5] = 10.0 * torch.arange(1, 6)[None, :, None]
         engine.t.xpos[:, pad] = 0.0
-        at = felt.point[pad, MIDDLE] + felt.normal[pad, MIDDLE] * (RADIUS - depth)
+        at = measured.point[pad, MIDDLE] + measured.normal[pad, MIDDLE] * (RADIUS - depth)
         engine.t.xpos[:, 5] = torch.as_tensor(at, dtype=torch.float32)
         engine.t.pair_normal[:] = 0.0
         engine.t.pair_normal[:, pad] = force
@@ -57,8 +57,8 @@ def ball(cfg: dict, n: int = 2, **kw):
         touch.launch()
 
     def distance(depth: float = 0.8e-3, pad: int = INDEX) -> np.ndarray:
-        at = felt.point[pad, MIDDLE] + felt.normal[pad, MIDDLE] * (RADIUS - depth)
-        return ref.sd_sphere(felt.point[pad] - at, RADIUS)
+        at = measured.point[pad, MIDDLE] + measured.normal[pad, MIDDLE] * (RADIUS - depth)
+        return ref.sd_sphere(measured.point[pad] - at, RADIUS)
 
     return touch, press, distance
 
@@ -242,9 +242,9 @@ def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
         "delay": 2 / 90,
     }
     on = run.z.max(1) > 0
-    felt = run.z.max(0) > 0.3
+    measured = run.z.max(0) > 0.3
     rms = [
-        float(np.sqrt(np.mean((touch_plant.readings(run, p)[on] - run.z[on])[:, felt] ** 2)))
+        float(np.sqrt(np.mean((touch_plant.readings(run, p)[on] - run.z[on])[:, measured] ** 2)))
         for p in (v, touch_plant.neutral())
     ]
     assert rms[0] < 0.055 and rms[1] > 3 * rms[0], rms

@@ -75,18 +75,18 @@ class ShapeSet:
 
 
 _LaidOut = tuple[dict[int, tuple[int, Grid, tuple]], int, wp.array]
-_kept: dict[tuple, tuple[list[Grid | None], _LaidOut]] = {}
+_cached_grids: dict[tuple, tuple[list[Grid | None], _LaidOut]] = {}
 """What was last laid out, with its grids, and for whom: tens of megabytes, which every environment of a process asks
 for again of the same objects and fingertips."""
-KEPT = 2
+CACHED = 2
 
 
 def _laid_out(shapes: list[Felt], device: str) -> _LaidOut:
     """Lay out, by the identity of each grid (variants of one shape share it) where its cells begin, the grid and what
     bounds its surface; the number of cells; all of them on the device, not to be written to."""
     key = (device, *(id(s.grid) for s in shapes))
-    if key in _kept:
-        return _kept[key][1]
+    if key in _cached_grids:
+        return _cached_grids[key][1]
     seen: dict[int, tuple[int, Grid, tuple]] = {}
     data: list[np.ndarray] = []
     at = 0
@@ -101,9 +101,9 @@ def _laid_out(shapes: list[Felt], device: str) -> _LaidOut:
     flat = np.concatenate(data) if data else np.zeros((2, 4), np.float32)
     found: _LaidOut = (seen, at, wp.array(flat, dtype=wp.vec4, device=device))
     if data and not any(s.grid.data.flags.writeable for s in shapes if s.grid is not None):  # others may change
-        while len(_kept) >= KEPT:
-            del _kept[next(iter(_kept))]
-        _kept[key] = [s.grid for s in shapes], found
+        while len(_cached_grids) >= CACHED:
+            del _cached_grids[next(iter(_cached_grids))]
+        _cached_grids[key] = [s.grid for s in shapes], found
     return found
 
 

@@ -125,9 +125,9 @@ class Tactile:
         self.columns = tuple(COLUMNS)
 
         with wp.ScopedDevice(self.device):
-            felt = layout.lifted(tips) if cfg.lift and tips is not None else layout
-            self._pads = _pads(engine, layout, felt)
-            self._groups = _groups(engine, layout, felt, members, rounds)
+            raised = layout.lifted(tips) if cfg.lift and tips is not None else layout
+            self._pads = _pads(engine, layout, raised)
+            self._groups = _groups(engine, layout, raised, members, rounds)
             self._law = _law(cfg, layout, needed=not solver or (others and selves is None))
             self.tips = ShapeSet(_link_shapes(near), self.device)
             a = SimpleNamespace(
@@ -311,8 +311,8 @@ class Tactile:
         xpos, xmat = self.engine.wp.xpos, self.engine.wp.xmat
         wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
         pad = self.by_pad
-        felt = a.felt if pad is None else pad.launch_skin(self, a.felt)
-        args = [felt, self._around, self._pads, m.effects, m.measured]
+        readings = a.felt if pad is None else pad.launch_skin(self, a.felt)
+        args = [readings, self._around, self._pads, m.effects, m.measured]
         wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
         if pad is not None:
             pad.launch_stuck(self)
@@ -341,33 +341,33 @@ def _link_shapes(links: Sequence[tuple[str, np.ndarray]]) -> list[TouchShape]:
     return [TouchShape(body, "grid", _baked(np.ascontiguousarray(x, dtype=float).tobytes())) for body, x in links]
 
 
-def _rows(layout: TaxelLayout, felt: TaxelLayout, f: int, rounds: int) -> np.ndarray:
-    """Return pad f's taxels, where `felt` has them, in rounds of 32 [32 rounds, 4]; see `Pads.taxel`."""
+def _rows(layout: TaxelLayout, raised: TaxelLayout, f: int, rounds: int) -> np.ndarray:
+    """Return pad f's taxels, where `raised` has them, in rounds of 32 [32 rounds, 4]; see `Pads.taxel`."""
     n = int(layout.count[f])
     out = np.zeros((LANES * rounds, 4), dtype=np.float32)
-    out[:, :3] = felt.point[f, 0]
-    out[:n, :3], out[:n, 3] = felt.point[f, :n], layout.area[f, :n]
+    out[:, :3] = raised.point[f, 0]
+    out[:n, :3], out[:n, 3] = raised.point[f, :n], layout.area[f, :n]
     return out
 
 
-def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
-    """Return the layout on the device, with its taxels where `felt` has them."""
+def _pads(engine: Posed, layout: TaxelLayout, raised: TaxelLayout) -> Pads:
+    """Return the layout on the device, with its taxels where `raised` has them."""
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
     out.count = wp.array(layout.count, dtype=int)
     width = -(-layout.taxels // LANES)
-    out.taxel = wp.array(np.stack([_rows(layout, felt, f, width) for f in range(layout.pads)]), dtype=wp.vec4)
+    out.taxel = wp.array(np.stack([_rows(layout, raised, f, width) for f in range(layout.pads)]), dtype=wp.vec4)
     out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
     return out
 
 
-def _groups(engine: Posed, layout: TaxelLayout, felt: TaxelLayout, members: list[list[int]], most: int) -> Groups:
+def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: list[list[int]], most: int) -> Groups:
     """Return groups of pads on the device, up to `most` rounds each."""
     taxel = np.zeros((len(members), LANES * most, 4), dtype=np.float32)
     round_ = np.zeros((len(members), most, 3), dtype=np.int32)
     box, bound, rounds = np.zeros((len(members), 2, 3)), np.zeros((len(members), 4)), []
     for g, pads in enumerate(members):
-        parts = [_rows(layout, felt, f, -(-int(layout.count[f]) // LANES)) for f in pads]
+        parts = [_rows(layout, raised, f, -(-int(layout.count[f]) // LANES)) for f in pads]
         rows = np.concatenate(parts)
         taxel[g, :, :3], taxel[g, : len(rows)] = rows[0, :3], rows
         each = zip(pads, parts, strict=True)

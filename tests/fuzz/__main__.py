@@ -91,9 +91,9 @@ def work(kinds: list[str], first: int, count: int, files: dict[str, list[Path]],
             what, text, path = one(kind, seed, files, cases)
             if what not in ("fine", "refused"):
                 out.mkdir(parents=True, exist_ok=True)
-                left = next((p for p in cases.iterdir()), path)
-                if left.is_file():
-                    shutil.copyfile(left, out / f"{kind}_{seed}{path.suffix}")
+                remaining = next((p for p in cases.iterdir()), path)
+                if remaining.is_file():
+                    shutil.copyfile(remaining, out / f"{kind}_{seed}{path.suffix}")
             send.send((seed, kind, what, text))
     send.close()
 

@@ -46,13 +46,13 @@ def recording(path: Path) -> str:
     used = _used(path)
     if used is None:
         return ""
-    r, runs, told = used
+    r, runs, reported = used
     for run in runs:
         run.smooth()
         assert np.isfinite(run.q).all() and np.isfinite(run.cmd).all() and (np.diff(run.t) > 0).all(), (
             "a run that cannot be simulated"
         )
-    return silence.of_recording(path, r, runs, told - _always())
+    return silence.of_recording(path, r, runs, reported - _always())
 
 
 def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
@@ -71,11 +71,11 @@ def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
     runs = channels.drop([run], out, notes, model)
     if blind:
         runs, _ = inputs.free_air(runs, [], inputs.merged_spans(blind), notes, "", "", (0.0, 0.0), inputs.SHORTEST)
-    told = {(f.topic, f.kind) for f in r.findings if f.severity != "info"}
-    told |= {(topic, "channel") for f in found for topic in f.topics} | {("", "pause") for _ in blind}
+    reported = {(f.topic, f.kind) for f in r.findings if f.severity != "info"}
+    reported |= {(topic, "channel") for f in found for topic in f.topics} | {("", "pause") for _ in blind}
     for word, topic in (("position", STATES), ("command", COMMANDS)):
-        told |= {(topic, n) for n in notes if word in n}
-    return r, runs, told
+        reported |= {(topic, n) for n in notes if word in n}
+    return r, runs, reported
 
 
 def _always() -> Told:
@@ -185,16 +185,16 @@ def overrides(path: Path) -> str:
 
 def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
     """Return the first typed setting that is another in the settings that a training would begin with."""
-    asked = {}
+    requested = {}
     for override in settings.parse([x for x in lines if "=" in x and x[:1] not in "~+-"], CONFIGS).values:
         if not override.is_sweep_override():
-            asked[override.key_or_group] = override.value()
-    for key, value in asked.items():
+            requested[override.key_or_group] = override.value()
+    for key, value in requested.items():
         here: Any = cfg
         for part in key.split("."):
             here = here.get(part) if isinstance(here, dict) else None
         group = isinstance(here, dict) and not isinstance(value, dict)
-        if group or any(other.startswith(f"{key}.") for other in asked):
+        if group or any(other.startswith(f"{key}.") for other in requested):
             continue  # a group, or a part of it is typed, too
         found = silence.of_settings(value, here, key)
         if found:

@@ -144,9 +144,9 @@ def test_a_recording_used_for_another_is_found(change, wrong, silent, tmp_path):
     r.states.position.value[:3] = silence.signal(r.states.position.t[:3] - 0.03)
     change(r)
     write(tmp_path / "x.mcap", r)
-    _, runs, told = targets._used(tmp_path / "x.mcap")
-    told -= targets._always()
-    for words, expected in ((set(), wrong), (told, silent)):
+    _, runs, reported = targets._used(tmp_path / "x.mcap")
+    reported -= targets._always()
+    for words, expected in ((set(), wrong), (reported, silent)):
         found = silence.of_recording(tmp_path / "x.mcap", r, runs, words)
         assert found.startswith(expected) and bool(found) == bool(expected), found
 

@@ -80,8 +80,8 @@ def done(s: dict[str, str], out: Path, name: str) -> tuple[float, float] | None:
     where it has none); None before its first turn."""
     try:
         if name != "training":
-            worked, kept, *_ = [*map(float, (out / name / "done").read_text().split()), math.nan]
-            return worked, kept
+            worked, saved, *_ = [*map(float, (out / name / "done").read_text().split()), math.nan]
+            return worked, saved
         with open(out / "run" / "progress.csv", "rb") as file:
             header = file.readline().decode().strip().split(",")
             file.seek(max(file.tell(), os.fstat(file.fileno()).st_size - 4096))

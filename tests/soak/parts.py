@@ -24,9 +24,9 @@ TOLD = 5000
 def tell(folder: Path, done: float, between: bool = True) -> None:
     """Tell how much of its work a part has done, and where it is `between` two pieces of it (all that they had is given
     back), the memory that the process then keeps [MiB], in a file `done`, for who watches it."""
-    kept = look(os.getpid()) if between else None
+    saved = look(os.getpid()) if between else None
     part = folder / "done.tmp"
-    part.write_text(f"{done:.6g} {kept[0]:.6g}" if kept else f"{done:.6g}")
+    part.write_text(f"{done:.6g} {saved[0]:.6g}" if saved else f"{done:.6g}")
     part.replace(folder / "done")
 
 
@@ -138,7 +138,7 @@ def diagnoses(count: float, folder: Path) -> str:
         effect = hidden[k % len(hidden)]
         paths, model, servo = made[effect]
         out = folder / effect / "out"
-        asked = Settings(
+        requested = Settings(
             paths,
             out,
             None,
@@ -148,7 +148,7 @@ def diagnoses(count: float, folder: Path) -> str:
             next_recording=False,
             allowed=set(hidden) if k % 20 else None,
         )
-        d = diagnose(asked, say=lambda _: None)
+        d = diagnose(requested, say=lambda _: None)
         save(d, out)
         tell(folder, k + 1)
         named += any(f["effect"] == effect for f in d.data["findings"])
@@ -161,9 +161,9 @@ def plays(count: float, folder: Path) -> str:
 
     heaps = []
     for k in range(int(count)):
-        asked = ["episodes=2", "device=cpu", "video=false", f"seed={k % NEXT}", f"out={folder / 'play'}"]
+        requested = ["episodes=2", "device=cpu", "video=false", f"seed={k % NEXT}", f"out={folder / 'play'}"]
         with contextlib.redirect_stdout(io.StringIO()):
-            status = main(["play", f"checkpoint={ROOT / 'checkpoints' / 'grasp.pt'}", *asked,
+            status = main(["play", f"checkpoint={ROOT / 'checkpoints' / 'grasp.pt'}", *requested,
                            f"record={folder / 'recordings' / f'{k}.mcap'}"])  # fmt: skip
         if status:
             raise SystemExit(f"play {k}: status {status}")

@@ -71,16 +71,16 @@ class Watch(threading.Thread):
     def run(self) -> None:
         while self.done() is None and self.child.poll() is None:
             time.sleep(self.every)  # it is still being started
-        self.begun, asked, gpu = time.monotonic(), -math.inf, math.nan
+        self.begun, requested, gpu = time.monotonic(), -math.inf, math.nan
         with open(self.path, "w", buffering=1) as file:
             file.write(",".join(COLUMNS) + "\n")
             while self.child.poll() is None:
-                if self.gpu and time.monotonic() > asked + GPU_EVERY:
-                    gpu, asked = gpu_mib(), time.monotonic()
+                if self.gpu and time.monotonic() > requested + GPU_EVERY:
+                    gpu, requested = gpu_mib(), time.monotonic()
                 seen, done = look(self.child.pid), self.done()
                 if seen is not None and seen[0] > 0:  # one that has ended, and was not waited for, has no memory
-                    worked, kept = (math.nan, math.nan) if done is None else done
-                    row = (time.monotonic() - self.begun, *seen, gpu, kept, worked)
+                    worked, saved = (math.nan, math.nan) if done is None else done
+                    row = (time.monotonic() - self.begun, *seen, gpu, saved, worked)
                     self.rows.append(row)
                     file.write(",".join(f"{x:.6g}" for x in row) + "\n")
                 time.sleep(self.every)
@@ -93,22 +93,22 @@ def judge(rows: list[tuple[float, ...]]) -> dict[str, dict[str, float]]:
     where there are too few samples."""
     table = np.array(rows[:], float).reshape(-1, len(COLUMNS))
     t = table[:, 0]
-    kept = table[t >= WARM_UP * t[-1]] if len(t) else table
-    if len(kept) < LEAST:
+    saved = table[t >= WARM_UP * t[-1]] if len(t) else table
+    if len(saved) < LEAST:
         return {}
-    blocks = np.array_split(kept, BLOCKS)
+    blocks = np.array_split(saved, BLOCKS)
     x = np.array([b[:, 0].mean() for b in blocks])
     worked = blocks[-1][:, -1].mean() - blocks[0][:, -1].mean()
     out = {}
     for k, name in enumerate(COLUMNS[1:-1], 1):
-        if not np.isfinite(kept[:, k]).all():
+        if not np.isfinite(saved[:, k]).all():
             continue
         y = np.array([b[:, k].mean() for b in blocks])
         line = stats.linregress(x, y)
         half = float(stats.t.ppf(0.975, BLOCKS - 2) * line.stderr) if np.ptp(y) else 0.0
         span = x[-1] - x[0]
         slopes = {"": line.slope, "low": line.slope - half, "high": line.slope + half}
-        out[name] = {"mean": float(kept[:, k].mean()), "most": float(kept[:, k].max())}
+        out[name] = {"mean": float(saved[:, k].mean()), "most": float(saved[:, k].max())}
         out[name] |= {end or "growth": float(x * span) for end, x in slopes.items()}
         out[name] |= {"_".join(filter(None, ("per_hour", end))): float(3600 * x) for end, x in slopes.items()}
         if worked > 0:
