@@ -83,6 +83,7 @@ def test_a_replay_fails_again_and_a_sound_world_repeats_its_step(tmp_path, capsy
     torch.testing.assert_close(again.qvel[0], env.engine.t.qvel[3], rtol=0, atol=1e-3)
 
 
+@pytest.mark.limits
 def test_a_file_that_is_none(tmp_path, capsys):
     (tmp_path / "x.npz").write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(UserError, match="x.npz"):
