@@ -173,10 +173,9 @@ def case(job: tuple[int, dict[str, Any], Path, float]) -> dict[str, Any] | None:
     if said is None:
         return None
     first = next(({"effect": f[0], "indistinguishable": f[3]} for f in said["findings"]), None)
-    hidden = truth["effect"] != "none"
+    right = first is None if truth["effect"] == "none" else score.named_right(first, truth["effect"])
     return {"set": "planted", "number": number, **truth, **said,
-            "sure_and_wrong": answers.sure_and_wrong(said, [truth["effect"]]),
-            "right": score.named_right(first, truth["effect"]) if hidden else first is None}  # fmt: skip
+            "sure_and_wrong": answers.sure_and_wrong(said, [truth["effect"]]), "right": right}  # fmt: skip
 
 
 def words(folder: Path) -> list[str]:
@@ -199,8 +198,8 @@ def main(argv: Sequence[str]) -> int:
     s, engine = answers.settings(argv, SETTINGS)
     ends = time.time() + (s["until"] or 1e9)
     out = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
-    jobs = {("planted", k): (k, s, out, ends) for k in range(s["cases"])}
-    rows = answers.each(case, jobs, out / "cases.jsonl", engine)
+    cases = {("planted", k): (k, s, out, ends) for k in range(s["cases"])}
+    rows = answers.each(case, cases, out / "cases.jsonl", engine)
     for r in sorted(rows, key=lambda r: (r["effect"], r["times_noise"])):
         found = ", ".join(f"{f[0]} {f[2]:.2f}" for f in r["findings"][:3]) or "-"
         print(f"{r['number']:>4} {r['effect']:<20}{r['tier']:<8}{r['times_noise']:>6.1f} {' ' if r['right'] else '*'}"

@@ -33,7 +33,6 @@ from dexsim.gap.rules import TOUCH
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 
-ROOT = Path(__file__).parents[2]
 SETS = 3  # recordings of a fingertip; diagnose keeps the last out of the fit
 RATE, INNER = 90.0, 4  # readings a second; times the sensor itself runs between two
 ALONG, ACROSS = (-5.0e-3, 0.0, 5.0e-3), (-11.0e-3, -5.5e-3, 0.0, 5.5e-3)  # m from the pad's middle: places

@@ -15,7 +15,6 @@ import numpy as np
 from benchmarks.loop.presses import world_of
 from dexsim.paths import CONFIGS
 
-ROOT = Path(__file__).parents[2]
 EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 """The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of
 the `used` speeds that they may reach; chirps tell a delay from a lag. Faster, a drive that is late swings into the ends

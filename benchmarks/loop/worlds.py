@@ -12,7 +12,6 @@ back, since nothing of it takes away what the drives are able to do (lab/results
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import yaml
@@ -20,7 +19,6 @@ import yaml
 from dexsim.paths import CONFIGS
 
 SEEDS = {"late": 4102, "stiff": 4104}
-ROOT = Path(__file__).parents[2]
 
 
 def draw(name: str) -> dict:

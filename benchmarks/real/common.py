@@ -15,7 +15,8 @@ from dexsim.recording import Recording, Series, States, schema, write
 @dataclass
 class Converted:
     """Converted files of a data set, or a part of it. groups: its recordings by gain or by run, where there are such.
-    name, judged: of a part, and its joints that are judged (None: all that are driven)."""
+    late: motions whose commands were logged a period late, and are put right. name, judged: of a part, and its joints
+    that are judged (None: all that are driven)."""
 
     recordings: list[Path]
     model: Path
@@ -23,7 +24,6 @@ class Converted:
     held_out: list[Path] = field(default_factory=list)
     groups: dict[Any, list[Path]] = field(default_factory=dict)
     late: list[str] = field(default_factory=list)
-    """Motions whose commands were logged a period late, and are put right."""
     name: str = ""
     judged: tuple[str, ...] | None = None
 
