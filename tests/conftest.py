@@ -43,9 +43,9 @@ def pytest_collection_modifyitems(items) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item) -> None:
-    """Tests that are not of the limits on strangers' files (mark `limits`) read them in their own process: each reader
-    would be a fork of it, which takes longer than most of these tests."""
-    guard.inside = item.get_closest_marker("limits") is None
+    """Let quick tests that are not of the limits on strangers' files (mark `limits`) read them in their own process:
+    each reader would be a fork of it, which takes longer than most of these tests."""
+    guard.inside = not {mark.name for mark in item.iter_markers()} & {"limits", "slow"}
 
 
 def pytest_collection(session) -> None:

@@ -183,7 +183,9 @@ def best_of(m, runs, case, trials, **more):
             False,
             marks=pytest.mark.slow,
         ),
-        ("compliance", "", {"softness": 0.4}, [0.4, 0.1], {"loop_encoder": "motor"}, False),
+        pytest.param(
+            "compliance", "", {"softness": 0.4}, [0.4, 0.1], {"loop_encoder": "motor"}, False, marks=pytest.mark.slow
+        ),
         ("lag", "velocity filter", {"speed_lag": 0.03}, [0.03], None, False),
         pytest.param(
             "position_scale",

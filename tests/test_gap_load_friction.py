@@ -74,6 +74,7 @@ def searched():
     return search, search_joint(search)
 
 
+@pytest.mark.slow
 def test_it_is_named_where_dry_friction_and_a_share_of_the_motors_torque_leave_much(searched):
     _, found = searched
     assert [m.id for m in found.best.members] == ["load_friction"]
@@ -81,6 +82,7 @@ def test_it_is_named_where_dry_friction_and_a_share_of_the_motors_torque_leave_m
     assert size == pytest.approx(1.3, rel=0.2)
 
 
+@pytest.mark.slow
 def test_training_is_given_a_share_of_the_torque_from_outside(searched):
     search, found = searched
     given = columns_beside(search.case, found.best, ["joint"])

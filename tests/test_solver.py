@@ -113,6 +113,7 @@ def test_forces_of_a_catch_are_those_of_mujoco_warp(catching):
     assert contacts > 5 * 4 * WORLDS  # there was something to solve
 
 
+@pytest.mark.slow
 def test_worlds_of_many_rows_are_solved_by_the_kernel_with_room_for_them(catching):
     """The limit between the two kernels decides nothing but where a world is solved: to the bit."""
     e = catching.engine
