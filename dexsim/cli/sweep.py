@@ -82,7 +82,7 @@ def _expanded(argv: list[str]) -> list[list[str]]:
     try:
         given = OverridesParser.create().parse_overrides(argv)
         lists = {
-            key: [f"{key}={value}" for value in x.sweep_string_iterator()] if x.is_sweep_override() else [x.input_line]
+            key: [f"{key}={v}" for v in x.sweep_string_iterator()] if x.is_sweep_override() else [x.input_line or key]
             for x in given
             for key in (x.get_key_element(),)
         }
