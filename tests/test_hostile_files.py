@@ -265,6 +265,7 @@ def test_an_archive_that_holds_code_runs_none(payload, trap, tmp_path, kind):
     assert not trap.exists()
 
 
+@pytest.mark.limits
 def test_a_part_that_unpacks_without_end_is_refused_soon(tmp_path):
     file = tmp_path / "bomb.pt"
     file.write_bytes(zipped({"archive/data.pkl": bytes(200 << 20)}, zipfile.ZIP_DEFLATED))
