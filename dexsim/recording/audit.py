@@ -48,20 +48,8 @@ KINDS: dict[str, str] = {
 def audit(recording: Recording) -> list[Finding]:
     """Return findings about the signals of a recording, in order of topic and time; [] for a clean one."""
     r = recording
-    series: list[Series] = [
-        s
-        for s in (
-            r.temperature,
-            r.duty,
-            r.enabled,
-            r.supply_voltage,
-            r.tactile,
-            r.external_force,
-            r.object_pose,
-            r.imu,
-        )
-        if s is not None
-    ]
+    others = (r.temperature, r.duty, r.enabled, r.supply_voltage, r.tactile, r.external_force, r.object_pose, r.imu)
+    series: list[Series] = [s for s in others if s is not None]
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         for s in series:

@@ -28,15 +28,8 @@ def timing(series: Series) -> Iterator[Finding]:
     period = float(np.median(dt[dt > 0])) if (dt > 0).any() else 0.0
     same = np.flatnonzero(dt == 0)
     if len(same) and not series.lines:
-        yield Finding(
-            "time_repeated",
-            topic,
-            float(t[same[0]]),
-            len(same),
-            f"{len(same)} samples have the host time of the one before",
-            "error" if len(same) > len(t) / 2 else "warning",
-            end=float(t[same[-1]]),
-        )
+        text = f"{len(same)} samples have the host time of the one before"
+        yield series.finding("time_repeated", text, "error" if len(same) > len(t) / 2 else "warning", at=same)
     if period == 0.0:
         return
     period = max(period, 0.5 * float(dt.mean()))  # where most come in bursts, the median says nothing
@@ -45,39 +38,18 @@ def timing(series: Series) -> Iterator[Finding]:
     # a command may be sent only when it changes: then its pauses say nothing
     if len(gaps) and regular and (topic != COMMANDS or len(gaps) < 0.02 * len(t)):
         longest = gaps[np.argmax(dt[gaps])]
-        yield Finding(
-            "gap",
-            topic,
-            float(t[gaps[0]]),
-            len(gaps),
-            f"{len(gaps)} gaps of more than {GAP:g} periods ({period * 1e3:.3g} ms);"
-            f" the longest is {dt[longest] * 1e3:.4g} ms at {t[longest]:.3f} s",
-            "info" if topic == COMMANDS else "warning",
-            end=float(t[gaps[-1] + 1]),
-        )
+        text = (f"{len(gaps)} gaps of more than {GAP:g} periods ({period * 1e3:.3g} ms);"
+                f" the longest is {dt[longest] * 1e3:.4g} ms at {t[longest]:.3f} s")  # fmt: skip
+        severity = "info" if topic == COMMANDS else "warning"
+        yield series.finding("gap", text, severity, at=(gaps[0], gaps[-1] + 1), count=len(gaps))
     dropped = np.flatnonzero((dt > 1.6 * period) & (dt <= GAP * period))
     if len(dropped) and regular and len(dropped) > 0.001 * len(t):
-        yield Finding(
-            "dropped",
-            topic,
-            float(t[dropped[0]]),
-            len(dropped),
-            f"{len(dropped)} samples or so are missing singly ({100 * len(dropped) / len(t):.2g} %)",
-            "info",
-            end=float(t[dropped[-1]]),
-        )
+        text = f"{len(dropped)} samples or so are missing singly ({100 * len(dropped) / len(t):.2g} %)"
+        yield series.finding("dropped", text, "info", at=dropped)
     burst = np.flatnonzero((dt > 0) & (dt < 0.1 * period))
     if len(burst) > 0.05 * len(t):
-        yield Finding(
-            "burst",
-            topic,
-            float(t[burst[0]]),
-            len(burst),
-            f"{len(burst)} samples came within a tenth of a period of the one before:"
-            " read from a buffer, not when measured",
-            "warning",
-            end=float(t[burst[-1]]),
-        )
+        yield series.finding("burst", f"{len(burst)} samples came within a tenth of a period of the one before:"
+                                      " read from a buffer, not when measured", "warning", at=burst)  # fmt: skip
 
 
 def stamps(all_series: list[Series]) -> Iterator[Finding]:
@@ -86,83 +58,42 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
     for s in all_series:
         if s.stamp is None:
             continue
-        ok = np.isfinite(s.stamp)
-        t, stamp = s.t[ok], s.stamp[ok]
-        if len(t) < 5:
+        series = s.take(np.isfinite(s.stamp))
+        t, stamp = series.t, series.stamp
+        if len(t) < 5 or stamp is None:
             continue
-        topic, late = s.topic, t - stamp
+        late = t - stamp
         middle = float(np.median(late))
         again = np.flatnonzero((np.diff(stamp) == 0) & (np.diff(t) > 0))
         if len(again):
-            yield Finding(
-                "held",
-                topic,
-                float(t[again[0] + 1]),
-                len(again),
-                f"{len(again)} messages carry the header.stamp of the one before: repeated",
-                "warning",
-                end=float(t[again[-1] + 1]),
-            )
+            text = f"{len(again)} messages carry the header.stamp of the one before: repeated"
+            yield series.finding("held", text, "warning", at=(again[0] + 1, again[-1] + 1), count=len(again))
         back = np.flatnonzero(np.diff(stamp) < 0)
         if len(back):
-            yield Finding(
-                "time_not_monotonic",
-                topic,
-                float(t[back[0] + 1]),
-                len(back),
-                f"header.stamp goes backwards {len(back)} times",
-                "warning",
-                end=float(t[back[-1] + 1]),
-            )
+            text = f"header.stamp goes backwards {len(back)} times"
+            yield series.finding("time_not_monotonic", text, "warning", at=(back[0] + 1, back[-1] + 1), count=len(back))
         other_epoch = abs(middle) > EPOCH_S
         if not other_epoch:
-            offsets[topic] = middle
+            offsets[s.topic] = middle
             if abs(middle) > SKEW_S:
-                yield Finding(
-                    "clock_skew",
-                    topic,
-                    float(t[0]),
-                    len(t),
-                    f"header.stamp is {abs(middle) * 1e3:.4g} ms {'behind' if middle > 0 else 'ahead of'}"
-                    " host time (median); host time is used",
-                    "warning",
-                    end=float(t[-1]),
-                )
+                text = (f"header.stamp is {abs(middle) * 1e3:.4g} ms {'behind' if middle > 0 else 'ahead of'}"
+                        " host time (median); host time is used")  # fmt: skip
+                yield series.finding("clock_skew", text)
         rate = _slope(t, late)
         if len(t) > 50 and abs(rate) * 1e6 > DRIFT_PPM and abs(rate) * (t[-1] - t[0]) > 0.5 * SKEW_S:
-            yield Finding(
-                "clock_skew",
-                topic,
-                float(t[0]),
-                len(t),
-                f"header.stamp drifts against host time by {rate * 1e6:+.0f} ppm:"
-                f" {rate * (t[-1] - t[0]) * 1e3:+.3g} ms over the recording",
-                "error",
-                end=float(t[-1]),
-            )
+            text = (f"header.stamp drifts against host time by {rate * 1e6:+.0f} ppm:"
+                    f" {rate * (t[-1] - t[0]) * 1e3:+.3g} ms over the recording")  # fmt: skip
+            yield series.finding("clock_skew", text, "error")
         jumps = np.flatnonzero(np.abs(np.diff(late)) > 5 * SKEW_S)
         if len(jumps) and abs(np.median(late[: jumps[0] + 1]) - np.median(late[jumps[-1] + 1 :])) > 5 * SKEW_S:
-            yield Finding(
-                "clock_skew",
-                topic,
-                float(t[jumps[0] + 1]),
-                len(jumps),
-                f"header.stamp jumps against host time by {np.diff(late)[jumps[0]] * -1e3:+.4g} ms",
-                "error",
-                end=float(t[jumps[-1] + 1]),
-            )
+            text = f"header.stamp jumps against host time by {np.diff(late)[jumps[0]] * -1e3:+.4g} ms"
+            yield series.finding("clock_skew", text, "error", at=(jumps[0] + 1, jumps[-1] + 1), count=len(jumps))
     if len(offsets) > 1:
         low, high = min(offsets, key=offsets.__getitem__), max(offsets, key=offsets.__getitem__)
         skew = offsets[high] - offsets[low]
         if skew > 2 * SKEW_S:
-            yield Finding(
-                "clock_skew",
-                high,
-                0.0,
-                1,
-                f"the clocks that stamp {high} and {low} are {skew * 1e3:.4g} ms apart",
-                "warning",
-            )
+            text = f"the clocks that stamp {high} and {low} are {skew * 1e3:.4g} ms apart"
+            yield Finding("clock_skew", high, 0.0, 1, text)
 
 
 def between_topics(r: Recording) -> Iterator[Finding]:
@@ -178,42 +109,21 @@ def between_topics(r: Recording) -> Iterator[Finding]:
         spans = float(other.t[-1] - other.t[0]), float(state.t[-1] - state.t[0])
         longer = max(spans) / max(min(spans), 1e-12)
         if any(abs(longer / unit - 1) < 0.2 for unit in TIME_UNITS):
-            yield Finding(
-                "clock_skew",
-                other.topic,
-                float(other.t[0]),
-                len(other),
-                f"spans {spans[0]:.4g} s, {state.topic} {spans[1]:.4g} s: the times of one are of another unit",
-                "error",
-                end=float(other.t[-1]),
-            )
+            text = f"spans {spans[0]:.4g} s, {state.topic} {spans[1]:.4g} s: the times of one are of another unit"
+            yield other.finding("clock_skew", text, "error")
         elif (
             min(abs(first), abs(last)) > SHIFT_S
             and first * last > 0
             and abs(first - last) < 0.3 * max(abs(first), abs(last))
         ):
-            yield Finding(
-                "clock_skew",
-                other.topic,
-                float(other.t[0]),
-                len(other),
-                f"begins {first:+.3g} s and ends {last:+.3g} s from {state.topic}:"
-                " shifted as a whole, so their host times may be of two clocks",
-                "warning",
-                end=float(other.t[-1]),
-            )
+            text = (f"begins {first:+.3g} s and ends {last:+.3g} s from {state.topic}:"
+                    " shifted as a whole, so their host times may be of two clocks")  # fmt: skip
+            yield other.finding("clock_skew", text)
     lead = command_lead(r)
     if lead is not None and lead > LEAD_S + 0.5 * float(np.median(np.diff(state.t))):
-        yield Finding(
-            "clock_skew",
-            state.topic,
-            0.0,
-            len(state),
-            f"motion comes {lead * 1e3:.3g} ms before its command (median over joints):"
-            f" the host times of {state.topic} and {COMMANDS} are not of one clock",
-            "error",
-            end=float(state.t[-1]),
-        )
+        text = (f"motion comes {lead * 1e3:.3g} ms before its command (median over joints):"
+                f" the host times of {state.topic} and {COMMANDS} are not of one clock")  # fmt: skip
+        yield Finding("clock_skew", state.topic, 0.0, len(state), text, "error", end=float(state.t[-1]))
 
 
 def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float | None:

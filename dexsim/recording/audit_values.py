@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, TACTILE, Finding, Recording, Series
+from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, Finding, Recording, Series
 from dexsim.recording.spikes import of_effort, spiked
 
 NAN = float("nan")
@@ -46,8 +46,8 @@ def is_integer(x: np.ndarray) -> bool:
     return len(x) > 0 and bool((x == np.round(x)).all()) and float(np.abs(x).max()) > 1
 
 
-def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarray]]:
-    """Yield (topic, quantity, joint, t, values [T]) of every per-joint signal."""
+def channels(r: Recording) -> Iterator[tuple[Series, str, str, np.ndarray]]:
+    """Yield (series, quantity, joint, values [T]) of every per-joint signal."""
     s = r.states
     for series, name in (
         (r.commands, "command"),
@@ -60,7 +60,7 @@ def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarr
     ):
         if series is not None and len(series):
             for j, joint in enumerate(r.joints):
-                yield series.topic, name, joint, series.t, series.value[:, j]
+                yield series, name, joint, series.value[:, j]
 
 
 def commanded(r: Recording) -> Iterator[Finding]:
@@ -115,7 +115,7 @@ def order(r: Recording) -> Iterator[Finding]:
             f"command of {r.joints[j]} is not what it follows: that is the command of {r.joints[k]} (correlation "
             f"{like[k, j]:.2f}, with its own {like[j, j]:.2f}); {cure}"
         )
-        yield Finding("joint_order", COMMANDS, float(grid[0]), len(grid), text, "error", r.joints[j], float(grid[-1]))
+        yield Series(grid, commands, COMMANDS).finding("joint_order", text, "error", r.joints[j])
 
 
 def _together(r: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,43 +143,28 @@ def _follows(command: np.ndarray, position: np.ndarray) -> float:
 
 def finite(r: Recording) -> Iterator[Finding]:
     """Yield values that are missing or infinite."""
-    for topic, name, joint, t, x in channels(r):
+    for series, name, joint, x in channels(r):
         bad = ~np.isfinite(x)
         if not bad.any():
             continue
         at = np.flatnonzero(bad)
         if bad.all():
             severity = "warning" if name == "position" else "info"
-            yield Finding("absent", topic, float(t[0]), len(x), f"no {name} of {joint}", severity, joint, float(t[-1]))
+            yield series.finding("absent", f"no {name} of {joint}", severity, joint)
         elif np.isinf(x).any() or name not in ("command", "enabled"):
-            yield Finding(
-                "nan",
-                topic,
-                float(t[at[0]]),
-                len(at),
-                f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples",
-                "warning",
-                joint,
-                float(t[at[-1]]),
-            )
-    for series in (r.tactile, r.supply_voltage, r.external_force, r.object_pose, r.imu):
-        if series is not None:
-            bad = np.flatnonzero(~np.isfinite(series.value.reshape(len(series), -1)).all(1))
+            text = f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples"
+            yield series.finding("nan", text, "warning", joint, at)
+    for whole in (r.tactile, r.supply_voltage, r.external_force, r.object_pose, r.imu):
+        if whole is not None:
+            bad = np.flatnonzero(~np.isfinite(whole.value.reshape(len(whole), -1)).all(1))
             if len(bad):
-                yield Finding(
-                    "nan",
-                    series.topic,
-                    float(series.t[bad[0]]),
-                    len(bad),
-                    f"{len(bad)} of {len(series)} samples hold values that are not finite",
-                    "warning",
-                    end=float(series.t[bad[-1]]),
-                )
+                text = f"{len(bad)} of {len(whole)} samples hold values that are not finite"
+                yield whole.finding("nan", text, "warning", at=bad)
 
 
 def wraps(r: Recording) -> Iterator[Finding]:
     """Yield a signed number read as unsigned, or an angle that starts again after a turn."""
-    for topic, name, joint, t, x in channels(r):
+    for series, name, joint, x in channels(r):
         if name not in ("temperature", "enabled"):
             found = wrapped(x)
             if found is not None:
@@ -189,16 +174,7 @@ def wraps(r: Recording) -> Iterator[Finding]:
                     if m in (2 * np.pi, 360.0)
                     else f"a signed number was read as unsigned (modulus {m:g})"
                 )
-                yield Finding(
-                    "wrap",
-                    topic,
-                    float(t[at[0]]),
-                    len(at),
-                    f"{name} of {joint} jumps by {m:.6g}: {what}",
-                    "error",
-                    joint,
-                    float(t[at[-1]]),
-                )
+                yield series.finding("wrap", f"{name} of {joint} jumps by {m:.6g}: {what}", "error", joint, at)
     if r.tactile is not None and len(r.tactile) > 5:
         value = r.tactile.value
         for axis, label in enumerate(("fx", "fy", "fz")):
@@ -210,16 +186,9 @@ def wraps(r: Recording) -> Iterator[Finding]:
             # -1 as 255: large values, with hardly any between them and the small ones, reached in one step
             if jumps.any() and axis < 2 and (x[~high & ~low].size < 0.2 * high.sum()):
                 at = np.flatnonzero(high.any(1))
-                yield Finding(
-                    "wrap",
-                    TACTILE,
-                    float(r.tactile.t[at[0]]),
-                    int(high.sum()),
-                    f"{label} holds values near 255 beside values near 0 and no negative ones:"
-                    " signed bytes were read as unsigned",
-                    "error",
-                    end=float(r.tactile.t[at[-1]]),
-                )
+                text = (f"{label} holds values near 255 beside values near 0 and no negative ones:"
+                        " signed bytes were read as unsigned")  # fmt: skip
+                yield r.tactile.finding("wrap", text, "error", at=at, count=int(high.sum()))
 
 
 def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
@@ -255,17 +224,9 @@ def spikes(r: Recording) -> Iterator[Finding]:
             x = series.value[:, j]
             at = np.flatnonzero(of_effort(r, j) if name == "effort" else spiked(x, name))
             if len(at) and wrapped(x) is None:
-                yield Finding(
-                    "spike",
-                    series.topic,
-                    float(series.t[at[0]]),
-                    len(at),
-                    f"{name} of {joint}: {len(at)} single samples ({100 * len(at) / len(x):.2g} %) far from their "
-                    "neighbours",
-                    "warning",
-                    joint,
-                    float(series.t[at[-1]]),
-                )
+                text = (f"{name} of {joint}: {len(at)} single samples ({100 * len(at) / len(x):.2g} %) far from their "
+                        "neighbours")  # fmt: skip
+                yield series.finding("spike", text, "warning", joint, at)
 
 
 def held(r: Recording) -> Iterator[Finding]:
@@ -286,43 +247,20 @@ def held(r: Recording) -> Iterator[Finding]:
         alone[j] = late & ~same_row
     if stale.sum() >= 3:
         at = np.flatnonzero(stale)
-        yield Finding(
-            "held",
-            s.topic,
-            float(s.t[at[0]]),
-            len(at),
-            f"{len(at)} whole samples repeat the one before while joints move",
-            "warning",
-            end=float(s.t[at[-1]]),
-        )
+        yield s.finding("held", f"{len(at)} whole samples repeat the one before while joints move", "warning", at=at)
     for j, late in alone.items():
         at = np.flatnonzero(late)
         if len(at) >= (5 if effort is not None else 12):
-            yield Finding(
-                "held",
-                s.topic,
-                float(s.t[at[0]]),
-                len(at),
-                f"{r.joints[j]}: {len(at)} samples repeat the one before while it moves and others go on",
-                "warning",
-                r.joints[j],
-                float(s.t[at[-1]]),
-            )
+            text = f"{r.joints[j]}: {len(at)} samples repeat the one before while it moves and others go on"
+            yield s.finding("held", text, "warning", r.joints[j], at)
     if r.tactile is not None and len(r.tactile) > 10:
         x = r.tactile.value.reshape(len(r.tactile), -1)
         total = np.nansum(np.abs(x), axis=1)
         late = repeats(r.tactile.t, total) & np.append(False, (np.diff(x, axis=0) == 0).all(1))
         if late.sum() >= 3:
             at = np.flatnonzero(late)
-            yield Finding(
-                "held",
-                TACTILE,
-                float(r.tactile.t[at[0]]),
-                len(at),
-                f"{len(at)} samples repeat the one before while the force changes",
-                "warning",
-                end=float(r.tactile.t[at[-1]]),
-            )
+            text = f"{len(at)} samples repeat the one before while the force changes"
+            yield r.tactile.finding("held", text, "warning", at=at)
 
 
 def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -366,17 +304,8 @@ def stuck(r: Recording) -> Iterator[Finding]:
         if len(s) > 20 and np.isfinite(x).any() and np.nanmax(x) == np.nanmin(x) and len(r.commands):
             c = r.commands.value[:, j]
             if np.isfinite(c).any() and np.nanmax(c) - np.nanmin(c) > 0.1:
-                yield Finding(
-                    "stuck",
-                    STATES,
-                    float(s.t[0]),
-                    len(s),
-                    f"position of {joint} is {x[0]:.4g} throughout while its command spans"
-                    f" {np.nanmax(c) - np.nanmin(c):.3g}",
-                    "error",
-                    joint,
-                    float(s.t[-1]),
-                )
+                yield s.finding("stuck", f"position of {joint} is {x[0]:.4g} throughout while its command spans"
+                                         f" {np.nanmax(c) - np.nanmin(c):.3g}", "error", joint)  # fmt: skip
     e = r.states.effort
     if e is not None and len(e) > 20:
         for j, joint in enumerate(r.joints):
@@ -386,21 +315,13 @@ def stuck(r: Recording) -> Iterator[Finding]:
             drive = np.abs(_drive(r, j, e.t))
             # what drives it is beyond what a deadband or dry friction may hide
             if (drive[np.isfinite(drive)] > 0.05).mean() > 0.05 and np.ptp(s.value[:, j]) > 0.05:
-                yield Finding(
-                    "stuck",
-                    STATES,
-                    float(e.t[0]),
-                    len(e),
-                    f"effort of {joint} is {x[np.isfinite(x)][0]:.4g} throughout while it moves",
-                    "error",
-                    joint,
-                    float(e.t[-1]),
-                )
+                text = f"effort of {joint} is {x[np.isfinite(x)][0]:.4g} throughout while it moves"
+                yield e.finding("stuck", text, "error", joint)
 
 
 def saturation(r: Recording) -> Iterator[Finding]:
     """Yield values that pile up at their largest."""
-    for topic, name, joint, t, x in channels(r):
+    for series, name, joint, x in channels(r):
         if name not in ("effort", "duty"):
             continue
         x = np.where(np.isfinite(x), x, 0.0)
@@ -416,16 +337,8 @@ def saturation(r: Recording) -> Iterator[Finding]:
             long = [run for run in runs if len(run) >= 3]
             near = ((np.abs(x - limit) < 0.05 * np.ptp(x)) & (x != limit)).sum()
             if len(long) >= 2 and sum(map(len, long)) > near:
-                yield Finding(
-                    "saturation",
-                    topic,
-                    float(t[long[0][0]]),
-                    len(at),
-                    f"{name} of {joint} is at its {side} value, {limit:.4g}, in {len(at)} samples",
-                    "info",
-                    joint,
-                    float(t[long[-1][-1]]),
-                )
+                text = f"{name} of {joint} is at its {side} value, {limit:.4g}, in {len(at)} samples"
+                yield series.finding("saturation", text, "info", joint, (long[0][0], long[-1][-1]), count=len(at))
     if r.tactile is not None and r.meta["tactile_unit"] == "count" and is_integer(r.tactile.value):
         v = r.tactile.value
         full = np.stack(
@@ -433,15 +346,8 @@ def saturation(r: Recording) -> Iterator[Finding]:
         )
         if full.any():
             at = np.flatnonzero(full.any((0, 2, 3)))
-            yield Finding(
-                "saturation",
-                TACTILE,
-                float(r.tactile.t[at[0]]),
-                int(full.sum()),
-                f"taxels at the end of their 8-bit range ({full.any((0, 1)).sum()} of them)",
-                "warning",
-                end=float(r.tactile.t[at[-1]]),
-            )
+            text = f"taxels at the end of their 8-bit range ({full.any((0, 1)).sum()} of them)"
+            yield r.tactile.finding("saturation", text, "warning", at=at, count=int(full.sum()))
 
 
 def signs(r: Recording) -> Iterator[Finding]:
@@ -457,48 +363,23 @@ def signs(r: Recording) -> Iterator[Finding]:
         ok = np.isfinite(x) & np.isfinite(drive)
         if ok.sum() < 50 or stated[j] == 0 or np.ptp(x[ok]) == 0 or drive[ok].std() == 0:
             continue
-        x, d, t = x[ok], drive[ok], e.t[ok]
+        x, d = x[ok], drive[ok]
         strong = np.abs(d) > 0.25 * np.percentile(np.abs(d), 95)
         both = min((d[strong] > 0).mean(), (d[strong] < 0).mean()) if strong.any() else 0.0
         plain, absolute = _corr(x, d), _corr(x, np.abs(d))
         if both > 0.15 and (x >= 0).all() and absolute > 0.3 and absolute > plain * stated[j] + 0.2:
             lost.append(j)
-            yield Finding(
-                "lost_sign",
-                STATES,
-                float(t[0]),
-                len(x),
-                f"effort of {joint} is never negative and follows the size, not the sign, of what drives it"
-                f" (correlation {absolute:.2f} against {plain:.2f})",
-                "error",
-                joint,
-                float(t[-1]),
-            )
+            text = (f"effort of {joint} is never negative and follows the size, not the sign, of what drives it"
+                    f" (correlation {absolute:.2f} against {plain:.2f})")  # fmt: skip
+            yield e.take(ok).finding("lost_sign", text, "error", joint)
         elif both > 0.15 and not (x >= 0).all() and plain * stated[j] < -0.5:
-            yield Finding(
-                "sign_mismatch",
-                STATES,
-                float(t[0]),
-                len(x),
-                f"effort of {joint} is opposite to what effort_sign={int(stated[j]):+d} says"
-                f" (correlation {plain * stated[j]:.2f} with target minus position)",
-                "error",
-                joint,
-                float(t[-1]),
-            )
+            text = (f"effort of {joint} is opposite to what effort_sign={int(stated[j]):+d} says"
+                    f" (correlation {plain * stated[j]:.2f} with target minus position)")  # fmt: skip
+            yield e.take(ok).finding("sign_mismatch", text, "error", joint)
     if lost and not (e.value < 0).any():
         rest = [r.joints[j] for j in range(len(r.joints)) if j not in lost and np.nanmax(e.value[:, j]) > 0]
         if rest:
-            yield Finding(
-                "lost_sign",
-                STATES,
-                float(e.t[0]),
-                len(e),
-                f"effort of {', '.join(rest)} is never negative either",
-                "warning",
-                "",
-                float(e.t[-1]),
-            )
+            yield e.finding("lost_sign", f"effort of {', '.join(rest)} is never negative either")
 
 
 def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
@@ -522,9 +403,7 @@ def units(r: Recording) -> Iterator[Finding]:
     limits = {} if r.hand is None else dict(zip(r.hand.joints, r.hand.limits, strict=True))
 
     def finding(series: Series, text: str, joint: str = "", severity: str = "error") -> Finding:
-        return Finding(
-            "unit", series.topic, float(series.t[0]), len(series), text, severity, joint, float(series.t[-1])
-        )
+        return series.finding("unit", text, severity, joint)
 
     for series, name in ((s.position, "position"), (c, "command")):
         for j, joint in enumerate(r.joints):
@@ -602,17 +481,10 @@ def units(r: Recording) -> Iterator[Finding]:
         if name == "duty":  # a wrapped one is found as such
             bad[:, [wrapped(x) is not None for x in series.value.T]] = False
         if bad.any():
-            t = series.t[bad.reshape(len(series), -1).any(1)]
-            yield Finding(
-                "unit",
-                series.topic,
-                float(t[0]),
-                int(bad.sum()),
-                f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
-                f" {low:g} .. {high:g} is possible",
-                "error",
-                end=float(t[-1]),
-            )
+            at = np.flatnonzero(bad.reshape(len(series), -1).any(1))
+            text = (f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
+                    f" {low:g} .. {high:g} is possible")  # fmt: skip
+            yield series.finding("unit", text, "error", at=at, count=int(bad.sum()))
     if (
         r.tactile is not None
         and r.meta["tactile_unit"] == "N"

@@ -48,17 +48,11 @@ def unreachable(r: Recording, known: set[tuple[str, str]]) -> Iterator[Finding]:
             at = np.flatnonzero(far)
             worst = x[at[np.argmax(np.abs(x[at]))]]
             moves = "it moves" if name == "command" else "its commands lie"
-            yield Finding(
-                "unit",
-                series.topic,
-                float(series.t[at[0]]),
-                len(at),
+            text = (
                 f"{name} of {joint} is up to {worst:.4g} rad in {len(at)} of {len(x)} samples, where {moves} between"
-                f" {low:.3g} and {high:.3g} rad: of another unit, or none of this joint's",
-                "error",
-                joint,
-                float(series.t[at[-1]]),
+                f" {low:.3g} and {high:.3g} rad: of another unit, or none of this joint's"
             )
+            yield series.finding("unit", text, "error", joint, at)
 
 
 def _near(x: np.ndarray, other: np.ndarray) -> bool:

@@ -178,25 +178,21 @@ class _Reading:
             self._first(s.messages) for theirs, _ in self.sources.values() for s in self.streams[theirs] if s.messages
         )
 
+    def _note(self, kind: str, text: str, severity: str = "warning", topic: str = "", count: int = 1) -> None:
+        """Add a finding of no time of its own."""
+        self.findings.append(Finding(kind, topic, NAN, count, text, severity))
+
     def _damage(self, c: Container) -> None:
         where = f"{c.path.name}: " if c.path != self.path else ""
         for ns, count, text in c.damage:
-            self.findings.append(Finding("damage", "", NAN, max(count, 1), where + text + _at(ns), "error"))
+            self._note("damage", where + text + _at(ns), "error", count=max(count, 1))
         orphans: dict[int, int] = {}
         for m in c.messages:
             if m.channel_id not in c.channels:
                 orphans[m.channel_id] = orphans.get(m.channel_id, 0) + 1
         for channel_id, count in orphans.items():
-            self.findings.append(
-                Finding(
-                    "damage",
-                    "",
-                    NAN,
-                    count,
-                    f"{where}{count} messages of channel {channel_id}, whose record (topic and type) is lost",
-                    "error",
-                )
-            )
+            text = f"{where}{count} messages of channel {channel_id}, whose record (topic and type) is lost"
+            self._note("damage", text, "error", count=count)
 
     def _first(self, messages: list[Message]) -> int:
         """Return the earliest host time [ns] of those that can be true."""
@@ -234,22 +230,10 @@ class _Reading:
                 fits = [t for t in self.streams if t not in taken and self._is_a(t, kind, strict=True)]
             if len(fits) == 1:
                 out[ours] = (fits[0], "")
-                self.findings.append(
-                    Finding(
-                        "topic", ours, NAN, 1, f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info"
-                    )
-                )
+                self._note("topic", f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info", ours)
             elif len(fits) > 1:
-                self.findings.append(
-                    Finding(
-                        "topic",
-                        ours,
-                        NAN,
-                        len(fits),
-                        f"could be any of {', '.join(fits)}; none is used (say which with remap.{ours}=TOPIC)",
-                        "warning",
-                    )
-                )
+                text = f"could be any of {', '.join(fits)}; none is used (say which with remap.{ours}=TOPIC)"
+                self._note("topic", text, "warning", ours, len(fits))
         self._of_controllers(out)
         if schema.STATES not in out and schema.COMMANDS not in out:
             raise UserError(
@@ -257,7 +241,7 @@ class _Reading:
                 f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}" + self._losses()
             )
         if schema.STATES not in out:  # without commands: the audit says so, of CSV and NPZ files too
-            self.findings.append(Finding("missing_topic", schema.STATES, NAN, 0, "not in the recording", "warning"))
+            self._note("missing_topic", "not in the recording", "warning", schema.STATES, 0)
         return out
 
     def _of_controllers(self, out: dict[str, tuple[str, str]]) -> None:
@@ -282,10 +266,10 @@ class _Reading:
             if len(fits) == 1:
                 out[ours] = fits[0]
                 text = f"read from {fits[0][0]} ({what}; say otherwise with remap.{ours}=TOPIC)"
-                self.findings.append(Finding("topic", ours, NAN, 1, text, "info"))
+                self._note("topic", text, "info", ours)
             elif fits:
                 text = f"could be any of {', '.join(t for t, _ in fits)}; none is used (say which: remap.{ours}=TOPIC)"
-                self.findings.append(Finding("topic", ours, NAN, len(fits), text, "warning"))
+                self._note("topic", text, "warning", ours, len(fits))
 
     def _is_a(self, topic: str, kind: str, strict: bool = False) -> bool:
         s = self.streams[topic][0]
@@ -318,9 +302,7 @@ class _Reading:
             except decode.Unreadable as error:
                 if ours in (schema.COMMANDS, schema.STATES):
                     raise UserError(f"recording {self.path}: topic {theirs} cannot be read: {error}") from None
-                self.findings.append(
-                    Finding("unreadable", ours, NAN, len(stream.messages), f"{theirs}: {error}", "error")
-                )
+                self._note("unreadable", f"{theirs}: {error}", "error", ours, len(stream.messages))
                 continue
             first = len(times)
             rows = reader.together([m.data for m in stream.messages])
@@ -348,9 +330,8 @@ class _Reading:
         parts = [p for p in parts if len(p)]
         out = parts[0] if len(parts) == 1 else [x for p in parts for x in p]
         if bad:
-            self.findings.append(
-                Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error")
-            )
+            text = f"{bad} messages cannot be decoded: {why}"
+            self.findings.append(Finding("unreadable", ours, when, bad, text, "error"))
             if not out and ours == schema.STATES:
                 raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
         return self._in_order(ours, np.array(times), out, written)
@@ -370,26 +351,16 @@ class _Reading:
             what = f"goes back by up to {-back:.3g} s" if back < -timeline.REORDERED else "jumps"
             around = t[keep] if keep.any() else np.zeros(1)
             near = np.clip(np.searchsorted(np.flatnonzero(keep), lost[[0, -1]]), 0, len(around) - 1)
-            self.findings.append(
-                Finding(
-                    "time_not_monotonic",
-                    ours,
-                    float(around[near[0]]),
-                    len(lost),
-                    f"host time {what}: {len(lost)} of {len(t)} samples, whose time cannot be theirs, are left out",
-                    "error",
-                    end=float(around[near[1]]),
-                )
-            )
+            text = f"host time {what}: {len(lost)} of {len(t)} samples, whose time cannot be theirs, are left out"
+            there = Series(around, around, ours)
+            self.findings.append(there.finding("time_not_monotonic", text, "error", at=near, count=len(lost)))
             t, out = t[keep], _taken(out, np.flatnonzero(keep))
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
             if not len(lost) and (written is None or len(written) == 1):
-                self.findings.append(
-                    Finding("time_not_monotonic", ours, float(t[back[0] + 1]), len(back),
-                            f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
-                            " samples are returned in order of time", "error", end=float(t[back[-1] + 1]))
-                )  # fmt: skip
+                text = (f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
+                        " samples are returned in order of time")  # fmt: skip
+                self.findings.append(Series(t, t, ours).finding("time_not_monotonic", text, "error", at=back + 1))
             order = np.argsort(t, kind="stable")
             t, out = t[order], _taken(out, order)
         return t, out
@@ -415,16 +386,8 @@ class _Reading:
         has_tactile = schema.TACTILE in self.sources or schema.TACTILE in self.arrays
         self.findings += metadata.complete(stated, has_effort, has_tactile)
         if "joint_names" not in stated:
-            self.findings.append(
-                Finding(
-                    "missing_metadata",
-                    "",
-                    NAN,
-                    1,
-                    f"joint_names is not stated; the messages' own is used: {', '.join(theirs)}",
-                    "info",
-                )
-            )
+            text = f"joint_names is not stated; the messages' own is used: {', '.join(theirs)}"
+            self._note("missing_metadata", text, "info")
         sign = schema.per_joint_sign(stated["effort_sign"], tuple(theirs), str(self.path))
         source = {int(c): i for i, c in reversed(list(enumerate(column)))}
         stated["effort_sign"] = ",".join(f"{int(sign[source[k]]):+d}" for k in range(len(ours)))
@@ -464,7 +427,7 @@ class _Reading:
             setattr(out, name, self._vectors(topic))
         if reason := attached.fault(self.config, f"the attached {schema.ATTACHMENT}"):
             out.config = None
-            self.findings.append(Finding("damage", "", NAN, 1, f"{reason}; it is not used", "error"))
+            self._note("damage", f"{reason}; it is not used", "error")
         out.findings = self.findings
         out.breaks = sorted(self.breaks)
         return out
@@ -506,17 +469,8 @@ class _Reading:
                 if unnamed == len(self.hand.joints) and joints is None
                 else [f"joint{i}" for i in range(unnamed)]
             )
-        self.findings.append(
-            Finding(
-                "missing_metadata",
-                "",
-                NAN,
-                1,
-                "neither the messages nor joint_names name the joints; assumed:"
-                f" {', '.join(names_)} (state meta.joint_names=...)",
-                "warning",
-            )
-        )
+        self._note("missing_metadata", "neither the messages nor joint_names name the joints; assumed:"
+                                       f" {', '.join(names_)} (state meta.joint_names=...)", "warning")  # fmt: skip
         return names_
 
     def _match(self, theirs: list[str], joints: Sequence[str] | None) -> dict[str, str]:
@@ -541,14 +495,10 @@ class _Reading:
         renamed = [f"{a} is {b}" for a, b in mapping.items() if a != b]
         foreign = [n for n in theirs if n not in mapping]
         if renamed:
-            self.findings.append(Finding("joint_names", "", NAN, len(renamed), "; ".join(renamed), "info"))
+            self._note("joint_names", "; ".join(renamed), "info", count=len(renamed))
         if foreign:
-            self.findings.append(
-                Finding(
-                    "joint_names", "", NAN, len(foreign), f"not joints of the model, left out: {', '.join(foreign)}",
-                    "info",
-                )
-            )
+            text = f"not joints of the model, left out: {', '.join(foreign)}"
+            self._note("joint_names", text, "info", count=len(foreign))
         return mapping
 
     def _convert(self, r: Recording, units: Units, theirs: Mapping[str, str]) -> None:
@@ -599,7 +549,7 @@ class _Reading:
             line = f"{what} in {text}: converted to SI"
             if why:
                 line = f"{what}: no unit is stated; taken for {text} {why}, {then}"
-            self.findings.append(Finding("unit", "", NAN, len(joints), line, "warning" if why else "info"))
+            self._note("unit", line, "warning" if why else "info", count=len(joints))
 
     def milliamperes(self, r: Recording, effort: np.ndarray) -> bool:
         """Return whether a current of no stated unit [S] can only be in mA; never of messages, whose effort is in
@@ -615,18 +565,9 @@ class _Reading:
         carried = np.zeros(value.shape, bool)
         bad = _placed(value, carried, samples, name, place)
         if bad:
-            self.findings.append(
-                Finding(
-                    "malformed",
-                    topic,
-                    float(t[bad[0]]),
-                    len(bad),
-                    f"{name}: as many values as names are expected (of messages without names, as joints are known: "
-                    "meta.joint_names=a,b,... states whose they are); samples left out",
-                    "error",
-                    end=float(t[bad[-1]]),
-                )
-            )
+            text = (f"{name}: as many values as names are expected (of messages without names, as joints are known: "
+                    "meta.joint_names=a,b,... states whose they are); samples left out")  # fmt: skip
+            self.findings.append(Series(t, value, topic).finding("malformed", text, "error", at=bad))
         stamp = self._stamps(samples)
         partly = not carried[:, carried.any(0)].all()
         return Series(t, value, topic, None if np.isnan(stamp).all() else stamp,
@@ -663,7 +604,7 @@ class _Reading:
                 before = (after, q, v)
         text = f"trajectories of up to {most} points: each is a target at its message's header.stamp (or receipt)" + (
             " + time_from_start" if late else "") + ", joined by lines"  # fmt: skip
-        self.findings.append(Finding("trajectory", schema.COMMANDS, NAN, len(samples), text, "info"))
+        self._note("trajectory", text, "info", schema.COMMANDS, len(samples))
         out.sort(key=lambda x: x[0])
         return np.array([x for x, _ in out]), [s for _, s in out], True
 
@@ -673,7 +614,7 @@ class _Reading:
             if len(theirs) > 1 and not stated and any(not len(s.names) for s in _unlike(group)):
                 order = f"taken in the order {', '.join(theirs)}; state theirs with meta.joint_names=a,b,..."
                 text = f"{len(group)} messages carry no joint names: {order}"
-                self.findings.append(Finding("joint_names", topic, NAN, len(group), text, "warning"))
+                self._note("joint_names", text, "warning", topic, len(group))
 
     def _stamps(self, samples: Sequence[JointSample]) -> np.ndarray:
         """Return [T] `header.stamp` in s from the recording's start, NaN where there is none."""
@@ -703,16 +644,8 @@ class _Reading:
                 keep.append(i)
         if len(keep) < len(messages):
             first = next((k for k, i in enumerate(keep) if k != i), len(keep))
-            self.findings.append(
-                Finding(
-                    "malformed",
-                    topic,
-                    float(t[first]),
-                    len(messages) - len(keep),
-                    f"values of an unexpected number ({len(messages[first][1])}); samples left out",
-                    "error",
-                )
-            )
+            text = f"values of an unexpected number ({len(messages[first][1])}); samples left out"
+            self.findings.append(Finding("malformed", topic, float(t[first]), len(messages) - len(keep), text, "error"))
         return Series(t[keep], np.array(rows, dtype=float), topic) if rows else None
 
     def _vectors(self, topic: str) -> Series | None:
@@ -804,7 +737,7 @@ class _TableReading(_Reading):
     def _match(self, theirs: list[str], joints: Sequence[str] | None) -> dict[str, str]:
         if self.table.unnamed and joints is not None and len(joints) == 1 and not self.joint_remap:
             text = f"the columns name no joint: they are taken for the model's one, {joints[0]}"
-            self.findings.append(Finding("joint_names", "", NAN, 1, text, "info"))
+            self._note("joint_names", text, "info")
             return {theirs[0]: joints[0]}
         return super()._match(theirs, joints)
 

@@ -204,6 +204,14 @@ class Series:
             self, t=self.t[which], value=self.value[which], stamp=part(self.stamp), carried=part(self.carried)
         )
 
+    def finding(
+        self, kind: str, text: str, severity: str = "warning", joint: str = "", at: Any = None, count: int | None = None
+    ) -> Finding:
+        """Return a finding about samples `at` (indices, in order; None: all). count: where not each of them is one."""
+        first, last = (0, -1) if at is None else (at[0], at[-1])
+        count = count if count is not None else len(self if at is None else at)
+        return Finding(kind, self.topic, float(self.t[first]), count, text, severity, joint, float(self.t[last]))
+
     @classmethod
     def empty(cls, topic: str, *shape: int) -> Series:
         """Return no samples of values of this shape."""
