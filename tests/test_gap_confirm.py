@@ -44,6 +44,18 @@ def test_worlds_of_a_batch_move_as_a_replay_of_each_does():
     for q, (t, c) in zip(together, given, strict=True):
         alone = drive(m, Series(t, c[:, None], COMMANDS, t), ["joint"], 2.0, np.array([c[0]]), timestep=1e-3)
         assert np.abs(q[:2000, 0] - alone.position[:, 0]).max() < 1e-9
+    # with the armature, damping and dry friction of its own model each
+    t, c = given[0]
+    for k, (armature, damping, friction) in enumerate(((0.0, 0.0, 0.01), (0.02, 0.05, 0.0))):
+        other = mechanism_of(table)
+        joint = other.spec.joint("joint")
+        joint.armature, joint.damping, joint.frictionloss = armature, [damping, 0.0, 0.0], friction
+        assert full_model.frame_of(m, other.spec) == full_model.frame_of(m, m.spec)
+        own = world(table, t, c, 2.0, c[0])
+        own.figures = np.array([[damping], [friction], [armature]])
+        q = free_runs(m.spec, ["joint"], [world(table, t, c, 2.0, c[0]), own], timestep=1e-3)[1]
+        alone = drive(other, Series(t, c[:, None], COMMANDS, t), ["joint"], 2.0, np.array([c[0]]), timestep=1e-3)
+        assert np.abs(q[:2000, 0] - alone.position[:, 0]).max() < 1e-9 < np.abs(q - together[0]).max(), k
 
 
 def test_a_run_begun_in_its_middle_goes_on_as_it_did():

@@ -588,8 +588,9 @@ class Drives(Steps):
         else:
             if cases and engine != "none" and not self.written.by_replay:
                 w.limit.leave_out("what is written is chosen in the search's own plant")
-            elif cases and self.written.share < 1:
-                w.limit.leave_out(f"what is written is chosen by {_first_part(self.written.share)} held out")
+            if cases and self.written.share < 1:
+                which = "chosen and replayed" if self.written.by_replay else "replayed"
+                w.limit.leave_out(f"what is written is {which} over {_first_part(self.written.share)} held out")
         self.engine = engine
         w.clock.lap("choice in the engine that trains")
 
@@ -655,14 +656,10 @@ class Drives(Steps):
             return
         spec = w.m.spec if d.model_spec is None else d.model_spec
         cases = [x.case for x in self.searched]
-        room = lambda: w.limit.until(1 - 0.5 * PLANNING)  # noqa: E731
-        found = full_model.replay_files(w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test, room)
+        what = w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test
+        found = full_model.replay_files(*what, self.written.share)
         if found is None:
             return
-        if len(found.parts) < found.of:
-            w.limit.leave_out(f"the files are replayed over {len(found.parts)} of {found.of} parts held out")
-        if found.share < 1:
-            w.limit.leave_out(f"the files are replayed over {_first_part(found.share)} held out")
         self.written.replayed = found
         d.data["held_out"]["replayed"] = found.entry()
         if d.data["held_out"]["error"].startswith("position"):

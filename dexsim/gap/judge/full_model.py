@@ -15,7 +15,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -40,8 +40,6 @@ from dexsim.recording.mechanism import (
     Mechanism,
     begun,
     held_joints,
-    of_recording,
-    replay,
     setpoints_at,
 )
 from dexsim.recording.schema import Recording, Series
@@ -91,7 +89,8 @@ class World:
     position and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K,
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
     from where a joint that drags another is counted (None: q); setpoint: None or of `setpoints_at`; led: joints that
-    follow their recording, in every world of a batch the same."""
+    follow their recording, in every world of a batch the same; figures [3, J]: `FIELDS` of the joints in the world's
+    own model (None: as in the batch's)."""
 
     rows: np.ndarray
     table: ServoTable
@@ -107,22 +106,22 @@ class World:
     home: np.ndarray | None = None
     setpoint: np.ndarray | None = None
     led: Led | None = None
+    figures: np.ndarray | None = None
 
 
 @dataclass
 class Replayed:
     """What the files leave of what was held out, replayed as they are by the function of `play replay=`: rms [rad or m]
-    over all judged joints, by joint, and by recording and joint; engine; step_s; parts: (recording, start s, end s), of
-    so many that were held out."""
+    over all judged joints, by joint, and by recording and joint; engine; step_s; parts: (recording, start s, end s);
+    share: of each part, from its begin."""
 
     error: float
     joints: dict[str, float]
     recordings: dict[str, dict[str, float]]
     parts: list[tuple[str, float, float]]
-    of: int = 0
     engine: str = "C MuJoCo"
     step_s: float = STEP
-    share: float = 1.0  # of each part, from its begin
+    share: float = 1.0
 
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
@@ -144,7 +143,7 @@ class Written:
     chosen: dict[str, str]
     by_replay: bool = False
     replayed: Replayed | None = None
-    share: float = 1.0  # of each part held out, from its begin, that the choice was made by
+    share: float = 1.0  # of each part held out, from its begin, that is replayed
 
     def candidate(self, joint: str) -> Candidate:
         """Return what is written of a joint."""
@@ -169,7 +168,6 @@ class Written:
             f"a plain least squares follows what was held out to {k * mine['plain']:.3g} {unit}, what was found to "
             f"{k * min(x for n, x in mine.items() if n.startswith('found')):.3g} ({where})"
         )
-
 
     def text(self, unit: str = "mrad") -> str:
         """Return the headline in a sentence; unit: what a thousandth of the position's is called."""
@@ -257,8 +255,10 @@ def worlds_of(
     as `play replay=` begins. begins: how that is by window, filled where it is not known: it is the same of any
     table."""
     out, begins = [], {} if begins is None else begins
-    at_rest = m.spec.compile()
-    rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
+    model = m.spec.compile()
+    rest = np.array([model.qpos0[model.joint(j).qposadr[0]] for j in m.joints])
+    dofs = [model.joint(j).dofadr[0] for j in m.joints]
+    figures = np.stack([getattr(model, name)[dofs] for name in FIELDS])
     mine = Mechanism(m.spec, m.joints, table, m.robot)
     for w in range(len(windows.window)):
         run = runs[int(windows.run[w])]
@@ -307,9 +307,19 @@ def worlds_of(
                 home,
                 setpoints_at(recordings[run.name], mine, rows, Series(run.cmd_t, run.cmd), run.joints, start, STEP),
                 led if held else None,
+                figures,
             )
         )
     return out
+
+
+def frame_of(m: Mechanism, spec: mujoco.MjSpec) -> str:
+    """Return what worlds of one batch have in common of their models: all but the joints' `World.figures`."""
+    spec = spec.copy()
+    for joint in map(spec.joint, m.joints):
+        joint.armature, joint.frictionloss = 0.0, 0.0
+        joint.damping = [0.0, *np.ravel(joint.damping)[1:]]
+    return str(spec.to_xml())
 
 
 def free_runs(
@@ -372,6 +382,7 @@ def _batch(
     real = engine.t.qpos.dtype
     up = lambda x, dtype=real: torch.as_tensor(np.asarray(x), dtype=dtype, device=engine.t.qpos.device)  # noqa: E731
     servo.params.copy_(up(rows))
+    _own_figures(engine, servo, worlds, led)
     scale = rows[:, :, SERVO_INDEX["position_scale"]]
     address, dofs = engine.qpos_index(joints), engine.dof_index(joints)
     qpos, qvel = np.tile(engine.mjm.qpos0, (N, 1)), np.zeros((N, engine.mjm.nv))
@@ -400,6 +411,22 @@ def _batch(
     seen = _stepped(engine, servo, changes, seen, given, path)
     q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
     return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+
+def _own_figures(engine: Any, servo: Servo, worlds: Sequence[World], led: Sequence[str]) -> None:
+    """Gives each world the armature, damping and dry friction of its own model; those of `led` joints are `HEAVY`."""
+    dofs, own = engine.dof_index(servo.joints).tolist(), [i for i, w in enumerate(worlds) if w.figures is not None]
+    if not own:
+        return
+    figures = np.stack([w.figures for i in own if (w := worlds[i]).figures is not None], 1)
+    figures[FIELDS.index("dof_armature")][:, [servo.joints.index(j) for j in led]] = HEAVY
+    bases = {"dof_damping": "damping", "dof_frictionloss": "frictionloss", "dof_armature": "armature"}
+    for name, x in zip(FIELDS, figures, strict=True):
+        for values, columns in ((engine.field(name), dofs), (getattr(servo, f"base_{bases[name]}"), range(len(dofs)))):
+            values[np.ix_(own, columns)] = torch.as_tensor(x, dtype=values.dtype, device=values.device)
+    engine.set_const()
+    weight = engine.field("dof_invweight0")
+    servo.inertia.copy_((1.0 / weight[:, dofs]).expand_as(servo.inertia))
 
 
 def _path(
@@ -577,13 +604,9 @@ def write_best(
     if engine == "none" or not cases or not len(windows[0].window):
         return Written(candidates, errors, {j: choose(x, noise[j]) for j, x in errors.items()})
     by = {j: {c.name: c for c in given} for j, given in candidates.items()}
-    first, within = windows[0], cases[0].plant.t
-    of = [recordings[runs[int(r)].name] for r in first.run]
-    starts = [_start(r, float(t)) for r, t in zip(of, first.window_t, strict=True)]
-    ends = [float(within[first.sample_row[first.sample_window == k][-1]]) for k in range(len(starts))]
-    longest = max(b - a for a, b in zip(starts, ends, strict=True))
-    kinds, begins = kinds_of(by), dict[int, tuple]()
-    share, pace = min(1.0, PROBE / longest) if math.isfinite(room()) else 1.0, 0.0  # of each part; s of a choice
+    kept, kinds = Kept(m, runs, recordings, cases, windows[0]), kinds_of(by)
+    # of each part; s of a choice
+    share, pace = min(1.0, PROBE / max(kept.seconds)) if math.isfinite(room()) else 1.0, 0.0
 
     def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
         """Return rms by joint of each choice."""
@@ -591,34 +614,10 @@ def write_best(
         if not choices:
             return []
         begun = time.monotonic()
-        given = [files(m, cases, {j: by[j][name] for j, name in x.items()}) for x in choices]
-        groups: dict[str, list[int]] = {}  # those that change the model alike share an engine
-        for i, (_, spec, said) in enumerate(given):
-            groups.setdefault(spec.to_xml() if said else "", []).append(i)
-        found: dict[int, list[np.ndarray]] = {}
-        count = len(windows[0].window)
-        for group in groups.values():
-            worlds = [w for i in group for w in worlds_of(m, runs, recordings, cases, given[i][0], windows[0], begins)]
-            for w in worlds:
-                w.duration *= share
-            spec = given[group[0]][1]
-            q = free_runs(spec, m.joints, worlds, "cpu" if engine == "mujoco" else device, STEP, engine)
-            for k, i in enumerate(group):
-                found[i] = q[k * count : (k + 1) * count]
+        given = [files(m, cases, {j: by[j][name] for j, name in x.items()})[:2] for x in choices]
+        found = kept.replayed(given, share, device, engine)
         pace = (time.monotonic() - begun) / len(choices)
-        return [{c.joint: rms(c, found[i]) for c in cases} for i in range(len(choices))]
-
-    def rms(case: Case, q: Sequence[np.ndarray]) -> float:
-        """Return the error of a joint over all readings in recordings that tell of it."""
-        j = m.joints.index(case.joint)
-        times = [a + STEP * np.arange(round(share * (b - a) / STEP) + 1) for a, b in zip(starts, ends, strict=True)]
-        parts = [
-            _missed(r, case.joint, t, x[: len(t), j])
-            for r, t, x, run in zip(of, times, q, first.run, strict=True)
-            if int(run) not in case.plant.left_out and case.joint in r.joints
-        ]
-        square, count = np.sum(parts, 0) if parts else (0.0, 1.0)
-        return math.sqrt(square / max(count, 1.0))
+        return [{j: rms(x) for j, x in kept.missed(q).items()} for q in found]
 
     while True:
         done = list(zip(kinds, replayed(kinds), strict=True))
@@ -627,9 +626,88 @@ def write_best(
             break
         share = min(1.0, share * more)
     if share < LEAST:
-        return write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
+        out = write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
+        return replace(out, share=float(np.clip(share * room() / pace, share, 1.0)))
     chosen = composed(by, errors, noise, done, replayed, lambda count: count * pace > room())
     return Written(candidates, errors, chosen, True, share=share)
+
+
+def rms(missed: Sequence[np.ndarray]) -> float:
+    """Return the rms of parts, each (sum of squares, number)."""
+    square, count = np.sum(missed, 0)
+    return math.sqrt(square / max(count, 1.0))
+
+
+class Kept:
+    """What was held out of the fit, replayed. windows: of all of it; recordings, starts, ends [W] s of each part."""
+
+    def __init__(
+        self,
+        m: Mechanism,
+        runs: Sequence[Run],
+        recordings: Mapping[str, Recording],
+        cases: Sequence[Case],
+        windows: Windows,
+    ):
+        self.m, self.runs, self.cases, self.windows, self.by_name = m, runs, cases, windows, recordings
+        t = cases[0].plant.t
+        self.recordings = [recordings[runs[int(r)].name] for r in windows.run]
+        self.starts = [_start(r, float(x)) for r, x in zip(self.recordings, windows.window_t, strict=True)]
+        count = range(len(self.starts))
+        self.ends = [float(t[windows.sample_row[windows.sample_window == k][-1]]) for k in count]
+        self._begins: dict[int, tuple] = {}
+
+    @property
+    def seconds(self) -> list[float]:
+        """How long each part is [s]."""
+        return [b - a for a, b in zip(self.starts, self.ends, strict=True)]
+
+    def spans(self, share: float) -> list[tuple[float, float]]:
+        """Return begin and end [s] of the first share of each part."""
+        return [(a, a + share * (b - a)) for a, b in zip(self.starts, self.ends, strict=True)]
+
+    def replayed(
+        self,
+        given: Sequence[tuple[ServoTable, mujoco.MjSpec]],
+        share: float = 1.0,
+        device: str = "cpu",
+        engine: str = "mujoco",
+    ) -> list[list[np.ndarray]]:
+        """Return positions [T, J] along each part as files (servo table, model) have it. Those whose models differ in
+        armature, damping and friction alone run as one batch."""
+        groups: dict[str, list[int]] = {}
+        for i, (_, spec) in enumerate(given):
+            groups.setdefault(frame_of(self.m, spec), []).append(i)
+        found: dict[int, list[np.ndarray]] = {}
+        count = len(self.starts)
+        for group in groups.values():
+            worlds = []
+            for i in group:
+                m = replace(self.m, spec=given[i][1])
+                worlds += worlds_of(m, self.runs, self.by_name, self.cases, given[i][0], self.windows, self._begins)
+            for w in worlds:
+                w.duration *= share
+            device = "cpu" if engine == "mujoco" else device
+            q = free_runs(given[group[0]][1], self.m.joints, worlds, device, STEP, engine)
+            for k, i in enumerate(group):
+                found[i] = q[k * count : (k + 1) * count]
+        return [[x[: len(t)] for x, t in zip(found[i], self._times(share), strict=True)] for i in range(len(given))]
+
+    def _times(self, share: float) -> list[np.ndarray]:
+        return [a + STEP * np.arange(round((b - a) / STEP) + 1) for a, b in self.spans(share)]
+
+    def missed(self, q: Sequence[np.ndarray]) -> dict[str, list[np.ndarray]]:
+        """Return by joint, of each part: sum of squares and number of what free runs miss of its readings; none of
+        recordings that do not tell of a joint."""
+        out = {}
+        for case in self.cases:
+            j, mine = self.m.joints.index(case.joint), []
+            for r, start, x, run in zip(self.recordings, self.starts, q, self.windows.run, strict=True):
+                tells = int(run) not in case.plant.left_out and case.joint in r.joints
+                t = start + STEP * np.arange(len(x))
+                mine.append(_missed(r, case.joint, t, x[:, j]) if tells else np.zeros(2))
+            out[case.joint] = mine
+        return out
 
 
 def kinds_of(by: Mapping[str, Collection[str]]) -> list[dict[str, str]]:
@@ -708,53 +786,25 @@ def replay_files(
     cases: Sequence[Case],
     test: list[int],
     span_test: dict[int, tuple[float, float]] | None,
-    room: Callable[[], float] = lambda: math.inf,
+    share: float = 1.0,
 ) -> Replayed | None:
     """Replay the files over all that was held out, as `play replay=` does with each recording or part of one; None
-    where there is nothing to replay. room: s that there are for it; too few: a share of each part from its begin, or
-    not all parts."""
+    where there is nothing to replay. share: of each part, from its begin."""
     ws = cases[0].plant.windows(None, test, span=span_test, every_run=True) if cases else None
     if ws is None or not len(ws.window):
         return None
-    t = cases[0].plant.t
-    written = Mechanism(spec, m.joints, table, m.robot, m.hand, m.part_of)
-    judged = [c.joint for c in cases]
-    parts: list[tuple[str, float, float]] = []
-    total = {j: np.zeros(2) for j in judged}
-    each: dict[str, dict[str, np.ndarray]] = {}
-    spans = []
-    for w in range(len(ws.window)):
-        rows = ws.sample_row[ws.sample_window == w]
-        r = recordings[runs[int(ws.run[w])].name]
-        start, end = _start(r, float(ws.window_t[w])), float(t[rows[-1]])
-        whole = float(r.states.position.t[-1]) - end < STEP
-        spans.append((int(ws.run[w]), r, start, max(r.duration, end) if whole else end, whole))
-    share, (_, r, start, end, _) = 1.0, spans[0]
-    if math.isfinite(room()) and end - start > PROBE:
-        begun = time.monotonic()
-        replay(r, of_recording(written, r), start=start, end=start + PROBE)
-        pace = (time.monotonic() - begun) / PROBE
-        share = min(1.0, max(room(), 0.0) / (pace * sum(b - a for _, _, a, b, _ in spans)))
-    for run, r, start, end, whole in spans:
-        if parts and room() <= 0:
-            break
-        if share < 1.0:
-            end, whole = max(start + share * (end - start), min(end, start + PROBE)), False
-        done = replay(r, of_recording(written, r), start=start, end=None if whole else end)
-        parts.append((r.path.name, start, end))
-        for case in cases:
-            if run in case.plant.left_out or case.joint not in r.joints:
-                continue
-            mine = _missed(r, case.joint, done.t, done.position[:, m.joints.index(case.joint)])
-            total[case.joint] += mine
-            here = each.setdefault(r.path.name, {})
-            here[case.joint] = here.get(case.joint, np.zeros(2)) + mine
-    rms = lambda x: float(np.sqrt(x[0] / max(x[1], 1.0)))  # noqa: E731
+    kept = Kept(m, runs, recordings, cases, ws)
+    (q,) = kept.replayed([(table, spec)], share)
+    missed = kept.missed(q)
+    each: dict[str, dict[str, list[np.ndarray]]] = {}
+    for joint, parts in missed.items():
+        for r, x in zip(kept.recordings, parts, strict=True):
+            if x[1]:
+                each.setdefault(r.path.name, {}).setdefault(joint, []).append(x)
     return Replayed(
-        rms(sum(total.values())),
-        {j: rms(x) for j, x in total.items()},
+        rms([x for parts in missed.values() for x in parts]),
+        {j: rms(x) for j, x in missed.items()},
         {name: {j: rms(x) for j, x in given.items()} for name, given in each.items()},
-        parts,
-        len(ws.window),
+        [(r.path.name, *x) for r, x in zip(kept.recordings, kept.spans(share), strict=True)],
         share=share,
     )
