@@ -37,11 +37,11 @@ def config(**task):
     return {"task": {"steps": 20} | task, "agent": agent, "seed": 3, "save_interval": 10, "choices": {"task": "dummy"}}
 
 
-def runner(seed=3, worlds=8, **task):
+def runner(seed=3, worlds=8, average=0, **task):
     torch.manual_seed(seed)
     np.random.seed(seed)
     random.seed(seed)
-    cfg = config(**task)
+    cfg = config(**task) | {"average": average}
     return Runner(dummy_task.make_env(cfg, worlds, "cpu", seed, "none"), cfg, {"dexsim": "test"})
 
 
@@ -66,6 +66,25 @@ def test_first_actions_scales_the_actors_means_and_nothing_else(tmp_path):
     again.restore(checkpoint.load(tmp_path / "near.pt"), "near.pt")
     again.alg.get_policy().eval()
     assert torch.equal(again.alg.get_policy()(obs), b)
+
+
+def test_the_average_is_the_mean_of_the_weights_and_changes_nothing_of_what_is_learned(tmp_path):
+    plain, weights = runner(), []
+    plain.learn(4, lambda row: weights.append({k: v.clone() for k, v in plain.alg.get_policy().state_dict().items()}))
+    half = runner(average=100)
+    half.learn(2)
+    checkpoint.save(tmp_path / "half.pt", half.payload())
+    made = runner(seed=77, average=100)
+    made.restore(checkpoint.load(tmp_path / "half.pt"), "half.pt")
+    made.learn(4)
+    payload = made.payload()
+    for name, value in plain.payload()["actor"].items():
+        assert torch.equal(value, payload["learner"][name]), name
+        if value.is_floating_point():
+            torch.testing.assert_close(payload["actor"][name], torch.stack([w[name] for w in weights]).mean(0))
+    obs = made.env.get_observations()
+    saved = load_policy(checkpoint.policy_only(payload), made.env, "policy.pt")
+    assert torch.equal(made.policy()(obs), saved(obs)) and not torch.equal(saved(obs), plain.policy()(obs))
 
 
 @pytest.mark.parametrize("factor", [0, -1.0, 2, "little", True, math.nan])

@@ -19,7 +19,7 @@ N = 64
 @pytest.fixture(scope="module", params=["mujoco", "warp"])
 def env(request):
     env = grasp_env(worlds=N, engine=request.param)
-    env.task["rewards"] |= {"torque_near": 1.0, "torque_worst": 1.0}  # off by default
+    env.task["rewards"] |= {"torque_near": 1.0, "torque_worst": 1.0, "thumb_reach": 1.0}  # off by default
     yield env
     env.close()
 
@@ -66,7 +66,7 @@ def rewards(env) -> tuple[dict, dict]:
     dropped = (p - env.reach).norm(dim=1) > env.unit * end["distance"]
     dropped |= p[:, 2] < env.unit * end["below"] + env.rise
     bands = (r["force_sigma"], r["force_low"], r["force_high"]), (r["torque_sigma"], r["torque_low"], r["torque_high"])
-    near = -env.clearance.distance[:, env.others].clamp(min=0) / (env.unit * r["reach_length"])
+    near = (-env.clearance.distance.clamp(min=0) / (env.unit * r["reach_length"])).exp()
     beside = (p[:, 1] - env.beside).abs() / (env.unit * CENTRE_LENGTH)
     out = {
         "force": tracking(force, torch.cat([own, shared], 1), env.f_max, *bands[0], contact),
@@ -78,7 +78,8 @@ def rewards(env) -> tuple[dict, dict]:
         "velocity": env.qd.square().sum(1),
         "grip": opposed * pressed.float().mean(1),
         "force_near": (1 - aside.abs()).clamp(min=0).mean(1),
-        "reach": near.exp().mean(1),
+        "reach": near[:, env.others].mean(1),
+        "thumb_reach": near[:, 0],
         "self": (env.self_force.sum(1) / env.f_max).clamp(max=5.0),
         "still": env.object_velocity[:, :3].norm(dim=1).clamp(max=1.0),
         "worst": (1 - aside.abs().amax(1)).clamp(min=0),

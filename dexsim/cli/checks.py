@@ -23,6 +23,7 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "seed": (0, 2**31 - 1, True),
     "noise": (0, 2, False),
     "save_interval": (1, 10**9, True),
+    "average": (0, 10**6, True),
     "final_episodes": (0, 10**7, True),
     "sim.timestep": (1e-5, 0.02, False),
     "sim.control_period": (1e-4, 1.0, False),

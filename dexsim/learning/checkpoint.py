@@ -7,7 +7,8 @@ Keys (all of them always there in a ``train`` file; a ``policy`` file leaves out
   format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty[, note]});
   layout ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps); actor
   (state dict, its running normalization included); t critic, t optimizer, t env (the environment's counters, curriculum
-  and random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states.
+  and random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states, and
+  learner, the weights that learn on where ``actor`` is their average.
 """
 
 from __future__ import annotations

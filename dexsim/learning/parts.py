@@ -85,6 +85,7 @@ class Train(Policy):
     env: dict[str, Any]
     rng: Random
     worlds: dict[str, torch.Tensor] | None = None
+    learner: dict[str, torch.Tensor] | None = None
 
 
 def check(data: dict[str, Any], path: object) -> None:
@@ -99,8 +100,8 @@ def check(data: dict[str, Any], path: object) -> None:
         if not plain or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
             what = "all of whose numbers are stored (none that is sparse, quantized or expanded)"
             raise UserError(f"{path}: damaged checkpoint, {name} must be a plain tensor, {what}; {again}")
-    for group in ("actor", "critic"):
-        for name, tensor in data.get(group, {}).items():
+    for group in ("actor", "critic", "learner"):
+        for name, tensor in (data.get(group) or {}).items():
             if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
                 bad = int((~tensor.isfinite()).sum())
                 raise UserError(

@@ -14,7 +14,7 @@ from typing import Any
 
 from dexsim.learning import checkpoint, names, teacher, weights_and_biases
 from dexsim.learning.meter import Meter
-from dexsim.learning.ppo import agent_config, agent_errors, by_episode, scale_first_actions
+from dexsim.learning.ppo import agent_config, agent_errors, by_episode, load_policy, scale_first_actions
 from dexsim.learning.ranks import Ranks, seed_all
 from dexsim.tasks import worlds
 
@@ -68,6 +68,8 @@ class Runner(OnPolicyRunner):
         self._parts = [getattr(self.alg, f"_raw_{part}") for part in teacher.parts(cfg["agent"])]
         scale_first_actions(self.alg.get_policy(), cfg.get("first_actions", 1.0))
         self.iteration, self.steps = 0, 0
+        self._averaged, self._typed = int(cfg.get("average") or 0), typed
+        self._average = {name: value.clone() for name, value in self._parts[0].state_dict().items()}
         # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
         record = device.startswith("cuda") and cfg.get("graphed_update", True) and not graphed.unsupported(self.alg)
         self._updater = graphed.GraphedUpdate(self.alg) if record else self.alg
@@ -159,6 +161,8 @@ class Runner(OnPolicyRunner):
             losses = self._update()
             self.iteration += 1
             self.current_learning_iteration = self.iteration
+            if self._averaged:
+                self._follow()
             self.steps += self.steps_per_iteration
             row = self._meter.read(self.ranks.sum)
             row |= {f"Loss/{k}": float(v) for k, v in losses.items()}
@@ -235,6 +239,16 @@ class Runner(OnPolicyRunner):
             )
         return losses
 
+    def _follow(self) -> None:
+        """Let the averaged policy follow the one that learns (``average``): equal weights at first, then exponential.
+        Averages of an optimizer's path are better and vary less than its last point (Polyak and Juditsky, 1992)."""
+        share = 1.0 / min(self.iteration, self._averaged)
+        for name, value in self._parts[0].state_dict().items():
+            if value.is_floating_point():
+                self._average[name].lerp_(value, share)
+            else:
+                self._average[name].copy_(value)
+
     def _finite(self) -> bool:
         """Return whether the weights and the observations' running normalization are finite."""
         weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
@@ -260,7 +274,7 @@ class Runner(OnPolicyRunner):
     def payload(self) -> dict[str, Any]:
         """Return the everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         actor, critic = (part.state_dict() for part in self._parts)
-        return {
+        data = {
             "kind": "train",
             "config": self._config(),
             "versions": self._versions,
@@ -273,7 +287,10 @@ class Runner(OnPolicyRunner):
             "optimizer": self.alg.optimizer.state_dict(),
             "env": self.env.state_dict(),
             "rng": checkpoint.rng_state(),
-        } | ({"worlds": self._worlds()} if self.saves_worlds else {})
+        }
+        if self._averaged:  # what is played is the average, what learns on is "learner"
+            data |= {"actor": dict(self._average), "learner": actor}
+        return data | ({"worlds": self._worlds()} if self.saves_worlds else {})
 
     def restore(self, data: dict[str, Any], path: str) -> None:
         """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state, and the
@@ -286,12 +303,13 @@ class Runner(OnPolicyRunner):
             raise UserError(f"{path}: holds only a policy, nothing to resume; use the last.pt of its run folder")
         checkpoint.check_layout(data, self._layout, path)
         try:
-            kinds = zip(teacher.parts(self.cfg), (data["actor"], data["critic"]), strict=True)
+            kinds = zip(teacher.parts(self.cfg), (data.get("learner", data["actor"]), data["critic"]), strict=True)
             states = {f"{kind}_state_dict": state for kind, state in kinds}
             self.alg.load(states | {"optimizer_state_dict": data["optimizer"]}, None, True)
         except Exception as error:  # torch's optimizers meet a wrong state with any of Python's exceptions
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path}: does not fit the networks of this run ({reason})") from None
+        self._average = {name: value.to(self.device).clone() for name, value in data["actor"].items()}
         self.iteration, self.steps = int(data["iteration"]), int(data["steps"])
         try:
             self.env.load_state_dict(data["env"])
@@ -332,6 +350,9 @@ class Runner(OnPolicyRunner):
         self.resumed = "the worlds go on where they were" if self._resumed_worlds else anew
 
     def policy(self) -> Any:
-        """Return the actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
+        """Return the actor, the averaged one with ``average``, deterministic, in evaluation mode: observations
+        TensorDict -> actions [N, A]."""
+        if self._averaged:
+            return load_policy(self.payload(), self.env, "the average of this run", self._typed)
         self.alg.eval_mode()
         return by_episode(self.alg.get_policy(), self.env)

@@ -27,6 +27,7 @@ TERMS = {
     "torque_near": "ours: 1 - |tau_i / tau_max - F_cmd|, mean of the fingers",
     "torque_worst": "ours: torque_near of the finger that is furthest off",
     "thumb_near": "ours: the thumb's force near a command of its own (task.command.thumb)",
+    "thumb_reach": "ours: the thumb's pad near the object",
 }
 """Name of each reward and its words for the first screen."""
 AT = {name: k for k, name in enumerate(TERMS)}
@@ -267,13 +268,13 @@ def thumb_near(w: int, s: State, shape: Shape):
 
 
 @wp.func
-def reach(w: int, s: State, shape: Shape):
-    """Return how near the pads are to the object, mean of the others. Ours: a finger that does not touch has nothing
-    else that says which way the object lies."""
+def reach(fingers: wp.array(dtype=int), w: int, s: State, shape: Shape):
+    """Return how near the pads of these fingers are to the object, their mean. Ours: a finger that does not touch has
+    nothing else that says which way the object lies."""
     total = float(0.0)
-    for i in range(shape.others.shape[0]):
-        total += wp.exp(-at_least(s.clearance[w, shape.others[i]], 0.0) / shape.reach_length)
-    return total / float(shape.others.shape[0])
+    for i in range(fingers.shape[0]):
+        total += wp.exp(-at_least(s.clearance[w, fingers[i]], 0.0) / shape.reach_length)
+    return total / float(fingers.shape[0])
 
 
 @wp.func
@@ -330,7 +331,7 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[wp.static(AT["velocity"])] = velocity(w, s)
     value[wp.static(AT["grip"])] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
     value[wp.static(AT["force_near"])] = near(False, w, s, shape)
-    value[wp.static(AT["reach"])] = reach(w, s, shape)
+    value[wp.static(AT["reach"])] = reach(shape.others, w, s, shape)
     value[wp.static(AT["self"])] = at_most(squeeze / shape.f_max, 5.0)
     value[wp.static(AT["still"])] = still(w, s)
     value[wp.static(AT["worst"])] = worst(False, w, s, shape)
@@ -338,6 +339,7 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[wp.static(AT["torque_near"])] = near(True, w, s, shape)
     value[wp.static(AT["torque_worst"])] = worst(True, w, s, shape)
     value[wp.static(AT["thumb_near"])] = thumb_near(w, s, shape)
+    value[wp.static(AT["thumb_reach"])] = reach(shape.opposing, w, s, shape)
     for k in range(wp.static(len(TERMS))):
         out[k, w] = weight[k] * value[k]
 
