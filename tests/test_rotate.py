@@ -350,6 +350,20 @@ def test_while_learning_a_cube_may_not_go_as_far():
     assert not make("task.termination.training=null").terminated()["dropped"].any()
 
 
+def test_a_start_that_was_lost_is_met_again_while_learning_and_not_when_judged():
+    env = make("task.initial.again=0.999999", worlds=16)
+    start, lost = env.begun_with.clone(), torch.arange(16) % 2 == 0
+    env.dropped = lost
+    env.reset_all()
+    assert torch.equal(env.begun_with[lost], start[lost]) and bool((env.begun_with[~lost] != start[~lost]).any())
+    torch.testing.assert_close(env.object_pose[:, :3], env.grasps.pose[env.begun_with][:, :3], rtol=0, atol=1e-5)
+    env.reset(torch.zeros(16, dtype=torch.bool))
+    assert torch.equal(env.begun_with[lost], start[lost])
+    env.end_curriculum()
+    env.reset_all()
+    assert bool((env.begun_with[lost] != start[lost]).any())
+
+
 def test_quaternion_jumps_and_six_does_not():
     """A cube turned once round, its goal turning with it: the same relative rotation, but the quaternion's sign
     jumps."""

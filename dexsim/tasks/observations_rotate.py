@@ -193,6 +193,8 @@ def check(t: Mapping[str, Any]) -> None:
             f"task.termination.training={ends['training']}: must be above 0 and at most task.termination.distance,"
             f" {ends['distance']} m, or null for that one"
         )
+    if not 0 <= t["initial"].get("again", 0.0) < 1:
+        raise UserError(f"task.initial.again={t['initial']['again']}: must be at least 0 and below 1")
     if len(goal["axis"]) != 3 or not sum(float(x) ** 2 for x in goal["axis"]) > 0:
         raise UserError(f"task.goal.axis={goal['axis']}: must be three numbers, not all 0")
     if not 0 < abs(goal["angle"]) < 180:

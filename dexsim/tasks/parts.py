@@ -26,6 +26,7 @@ class Held(Task):
     """
 
     in_order = False
+    begun_with = memory(dtype=torch.long, reset=False)  # row of `grasps` that each world's episode began with
     holds: ClassVar[tuple[str, tuple[float, float]]]
     """Carrier of the object as an episode begins (`dexsim stable-grasps hold=`), usual edges of cubes, m."""
 
@@ -103,9 +104,20 @@ class Held(Task):
         if self.in_order:
             self._pick = torch.arange(self.num_envs, device=self.device)
         else:
-            self._pick = of[(self.sampler.uniform() * len(of)).long().clamp(max=len(of) - 1)]
+            drawn = of[(self.sampler.uniform() * len(of)).long().clamp(max=len(of) - 1)]
+            self._pick = self.once_more(drawn)
+            self.begun_with = torch.where(mask, self._pick, self.begun_with)
         self.draw_physics()
         self.give_object(mask, g.shape[self._pick], g.edge[self._pick][:, None] / 2 / self.box_half)
+
+    def memory(self) -> dict:
+        """Return the declared memory; a row within those of `grasps`."""
+        assert self.grasps is not None  # since setup
+        return super().memory() | {"begun_with": (self.begun_with, 0, len(self.grasps) - 1)}
+
+    def once_more(self, drawn: torch.Tensor) -> torch.Tensor:
+        """Return the rows of `grasps` [N] that episodes begin with, given those that were drawn."""
+        return drawn
 
     def begin_held(self, mask: torch.Tensor) -> torch.Tensor:
         """Place hand and object, where mask holds, in the pose that `draw_object` has drawn, the targets give or take

@@ -76,6 +76,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         shared.check(t)
         ends = t["termination"]
         self.farthest = torch.tensor(self.unit * (ends.get("training") or ends["distance"]), device=dev)
+        self.again = torch.tensor(float(t["initial"].get("again", 0.0)), device=dev)
         self.axis, self.turn = (x.to(dev) for x in shared.axis_and_turn(t["goal"], self.hand.mirror))
         self.taxel_point = None if t["observe"]["force_weighted"] else self.taxels()
 
@@ -88,6 +89,13 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         return [shared.relabelled(rotation.to_matrix(turn)) for turn in turns]
 
     # -- an episode begins
+    def once_more(self, drawn: torch.Tensor) -> torch.Tensor:
+        """Begin anew from the pose of the episode that was lost just now, with probability `initial.again`: a pose that
+        is lost in the first second is else met for a thousandth of the time."""
+        if not self.task["initial"].get("again", 0.0):
+            return drawn
+        return torch.where((self.dropped | self.tipped) & (self.sampler.uniform() < self.again), self.begun_with, drawn)
+
     def begin(self, mask: torch.Tensor) -> None:
         m1, pose = mask[:, None], self.begin_held(mask)
         self.goal = torch.where(m1, self.next_goal(pose[:, 3:]), self.goal)
@@ -101,8 +109,9 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     # -- how it goes and ends
     def end_curriculum(self) -> None:
-        """End the curriculum; the cube may go as far as `termination.distance`."""
+        """End the curriculum; the cube may go as far as `termination.distance`, and no start is met more often."""
         super().end_curriculum()
+        self.again.fill_(0.0)
         self.farthest.fill_(self.unit * self.task["termination"]["distance"])
 
     def update(self) -> None:
