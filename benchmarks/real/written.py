@@ -38,18 +38,16 @@ FOLDERS = {"sage": "sage_so101", "ergocub": "ergocub_fingers", "bam": "bam_xl330
 SETTINGS = {"sets": ",".join(SETS), "data": "../shared/realdata", "out": "out/real/written", "jobs": 1, "limit": 0,
             "hand": 300, "only": ""}  # fmt: skip
 AGREE, WORSE = 0.10, 1.05  # the two criteria
+SPLIT = 4  # processes that replay one part's recordings
 
 
 def diagnosed(job: tuple[Converted, Path, float | None]) -> dict[str, Any]:
-    """Diagnose one part, write its files and replay them."""
+    """Diagnose one part and write its files."""
     part, out, limit = job
     judged = None if part.judged is None else set(part.judged)
     d, said = fold.diagnosed(out, part.name, part.recordings, part.held_out, part, joints=judged, limit=limit)
-    folder = out / part.name
     reported = said["held_out"].get("replayed")
-    files = {p.name: p for p in (*part.recordings, *part.held_out)}
     rows, parts = {}, [] if reported is None else reported["parts"]
-    played = play(part, folder, files, parts) if parts else {}
     for joint, v in d.joints.items():
         w = d.written
         errors_of = {} if w is None else w.errors[joint]
@@ -60,7 +58,6 @@ def diagnosed(job: tuple[Converted, Path, float | None]) -> dict[str, Any]:
             "written": None if w is None else w.chosen[joint],
             "by_search": {"before": v["before"], "after": v["after"]},
             "reported": None if reported is None else reported["joints"].get(joint),
-            "replayed": played.get(joint),
         }
     result = {
         "part": part.name,
@@ -75,30 +72,47 @@ def diagnosed(job: tuple[Converted, Path, float | None]) -> dict[str, Any]:
     return result
 
 
-def play(part: Converted, folder: Path, files: dict[str, Path], parts: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return by joint the rms [rad or m] that `play.py replay=` prints with the files in `folder`, over all parts."""
+def play(job: tuple[Converted, Path, dict[int, dict[str, Any]]]) -> dict[str, list[float]]:
+    """Return by joint (sum of squares, number) of what `play.py replay=` misses with the files in a folder, by the rms
+    [rad or m] that it prints, of parts of recordings by their number."""
     from dexsim.cli import recorded
     from dexsim.gap.read.channels import own_readings
     from dexsim.paths import CONFIGS
     from dexsim.recording import read
+    from dexsim.sim.quiet import quiet_warp
 
-    total: dict[str, np.ndarray] = {}
+    part, folder, parts = job
+    quiet_warp("cpu")
+    files, missed = {p.name: p for p in (*part.recordings, *part.held_out)}, {}
     model = folder / "model.xml" if (folder / "model.xml").is_file() else part.model
-    for k, x in enumerate(parts):
+    for k, x in parts.items():
+        out = folder / "play" / str(k)
         argv = [f"replay={files[x['recording']]}", f"model={model}", f"servo={folder / 'servo.yaml'}", "video=false",
-                f"out={folder / 'play' / str(k)}", f"start={x['start']}", f"end={x['end']}"]  # fmt: skip
+                f"out={out}", f"start={x['start']}", f"end={x['end']}"]  # fmt: skip
         with contextlib.redirect_stdout(io.StringIO()):
             recorded.run(recorded.settings(argv, CONFIGS))
-        said = json.loads((folder / "play" / str(k) / "metrics.json").read_text(encoding="utf-8"))
-        recording = read(files[x["recording"]])
+        said, recording = json.loads((out / "metrics.json").read_text(encoding="utf-8")), read(files[x["recording"]])
         state = recording.states.position
         on = (state.t >= x["start"] - 1e-9) & (state.t <= x["end"] + 1e-3)
         for joint, error in said["position_rmse_rad"].items():
             if error is not None and joint not in said["follow_their_recording"]:
                 seen = np.asarray(state.value[:, recording.joints.index(joint)], float)
                 count = (on & own_readings(state.t, seen)).sum()  # one sent again tells nothing
-                total[joint] = total.get(joint, np.zeros(2)) + np.array([error**2 * count, count])
-    return {joint: float(np.sqrt(a / b)) for joint, (a, b) in total.items()}
+                missed[joint] = missed.get(joint, np.zeros(2)) + np.array([error**2 * count, count])
+    return {j: x.tolist() for j, x in missed.items()}
+
+
+def played(given: dict[str, tuple[Converted, Path, Sequence[dict[str, Any]]]], out: Path, engine: Any) -> dict:
+    """Return by name and joint the rms [rad or m] that `play.py replay=` prints over all parts with the files in a
+    folder. given: by name of the set's part: it, the folder, what was held out."""
+    jobs = {f"{n}.{k}": (p, f, dict(list(enumerate(parts))[k::SPLIT]))
+            for n, (p, f, parts) in given.items() for k in range(min(SPLIT, len(parts)))}  # fmt: skip
+    total: dict[str, dict[str, np.ndarray]] = {n: {} for n in given}
+    for name, missed in zip(jobs, answers.at_once(play, jobs, out, engine), strict=True):
+        for joint, x in missed.items():
+            mine = total[name.rpartition(".")[0]]
+            mine[joint] = mine.get(joint, np.zeros(2)) + x
+    return {n: {j: float(np.sqrt(a / b)) for j, (a, b) in x.items()} for n, x in total.items()}
 
 
 def by_hand(job: tuple[Converted, Path, str, Sequence[dict[str, Any]], float]) -> dict[str, Any]:
@@ -125,19 +139,15 @@ def by_hand(job: tuple[Converted, Path, str, Sequence[dict[str, Any]], float]) -
     return found
 
 
-def hand_replayed(job: tuple[Converted, Path, dict[str, dict[str, Any]], Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """Write our own least squares of all joints of a part as `diagnose` writes its answer, and replay it as `play`
-    does."""
+def write_hand(part: Converted, folder: Path, hand: dict[str, dict[str, Any]]) -> None:
+    """Write our own least squares of all joints of a part as `diagnose` writes its answer."""
     from dexsim.actuator.columns import INDEX
     from dexsim.gap.effects.body import add_armature
     from dexsim.gap.judge.handed_on import save_model
     from dexsim.recording import mechanism
-    from dexsim.sim.quiet import quiet_warp
 
-    part, out, hand, parts = job
-    quiet_warp("cpu")
     m = mechanism.mechanism(str(part.model), str(part.servo))
-    table, folder = m.table, out / part.name / "by_hand"
+    table = m.table
     table.fitted = {}
     for joint, found in hand.items():
         x, row = found["figures"], m.table.nominal([joint])[0]
@@ -155,8 +165,6 @@ def hand_replayed(job: tuple[Converted, Path, dict[str, dict[str, Any]], Sequenc
     folder.mkdir(parents=True, exist_ok=True)
     table.save(folder / "servo.yaml")
     save_model(m.spec, folder / "model.xml")
-    return {"part": part.name, "by_hand": play(part, folder, {p.name: p for p in (*part.recordings, *part.held_out)},
-                                               parts)}  # fmt: skip
 
 
 def judged(row: dict[str, Any]) -> dict[str, bool | None]:
@@ -221,16 +229,20 @@ def main(argv: list[str]) -> int:
     hand: dict[str, dict[str, dict[str, Any]]] = {p.name: {} for p in parts}
     for found in answers.at_once(by_hand, each, out / "by_hand", engine):
         hand[found["part"]][found["joint"]] = found
+    by = {p.name: p for p in parts}
+    files = {n: (p, out / n, results[n]["parts"]) for n, p in by.items()}
     whole = {}
     for p in parts:
         r, mine = results[p.name], hand[p.name]
         if r["parts"] and set(r["joints"]) == set(mine):
             for joint, found in mine.items():
                 r["joints"][joint]["by_hand_alone"] = found["error"]
-            whole[p.name] = (p, out, mine, r["parts"])
-    for played in answers.at_once(hand_replayed, whole, out / "replayed", engine):
-        for joint, error in played["by_hand"].items():
-            results[played["part"]]["joints"][joint]["by_hand"] = error
+            write_hand(p, out / p.name / "by_hand", mine)
+            whole[p.name] = (p, out / p.name / "by_hand", r["parts"])
+    for key, given, to in (("replayed", files, "play"), ("by_hand", whole, "play_by_hand")):
+        for n, errors in played(given, out / to, engine).items():
+            for joint, row in results[n]["joints"].items():
+                row[key] = errors.get(joint)
     ordered = list(results.values())
     for r in ordered:
         for row in r["joints"].values():
