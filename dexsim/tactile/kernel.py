@@ -1,34 +1,42 @@
 """The touch kernel: transform, distance, force and reduction of all taxels in one launch.
 
 Pads that share one force form a group, and each taxel's distance is measured once. Two variants share every line of
-the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per (world, group), for the CPU; `lanes`,
-one warp per (world, group), for CUDA: each lane keeps the distances of every 32nd taxel, in registers up to 512 taxels,
-sums are shuffles, and there is no barrier and no shared memory. Both compose the two poses once a group and reduce in
-the frame of its body.
+the law (`taxel_force`, `spread_weight`, grids' distances): `serial`, one thread per (world, group), for the CPU; for
+CUDA a warp looks at a few pairs of world and group, then measures those that are pressed: each lane keeps the distances
+of every 32nd taxel, in registers up to 512 taxels, sums are shuffles, and there is no barrier and no shared memory. The
+hand's touch of itself, which few groups feel at a time, has its own launch. Both compose the two poses once a group and
+reduce in the frame of its body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from dexsim.tactile.lanes import LANES, lane_ballot, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.sdf import (
+    BOX,
+    CYLINDER,
     GRID,
+    SPHERE,
     Shapes,
     bound_radius,
     boxes_apart,
     distance,
     in_box,
     load4,
-    primitive,
     sd_cells,
     sd_grid,
 )
 
+ITEMS = 4
+"""Pairs of a world and a group that a warp looks at for the object's touch; those that nothing presses cost little."""
+HAND_ITEMS = 8
+"""The same for touch of the hand on itself."""
 MAX_UNROLL = 16
 """Rounds of 32 taxels, a taxel a lane, whose distances are kept in registers; more go through a thread's memory."""
 CHUNK = 4
@@ -231,7 +239,7 @@ def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j
 
 
 @cache
-def touch_kernel(
+def touch_kernels(
     lanes: bool,
     solver: bool,
     raw: bool,
@@ -247,8 +255,9 @@ def touch_kernel(
     links: int = 5,
     selves: bool = False,
     registers: int = 0,
-) -> wp.Kernel:
-    """Return the kernel for one choice of options; dimensions: [N, G] threads (serial) or N * G * 32 (lanes).
+) -> tuple[tuple[wp.Kernel, int], ...]:
+    """Return the kernels for one choice of options, to be launched in turn, each with the pairs of a world and a group
+    that go to a warp of 32 threads (lanes); serial: one, dimensions [N, G], and 0.
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
     the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the
@@ -256,20 +265,28 @@ def touch_kernel(
     `CHUNK`, or less than it), the objects in each world, and links L. registers: CUDA, at most so many a thread (0: as
     the compiler likes).
     """
-    if lanes:
-        kernel = _lanes(
-            solver, raw, others, LAWS[law], pads, groups, taxels, rounds, objects, feel_others, links, selves
-        )
+    kind, sizes = LAWS[law], (pads, groups, taxels, rounds)
+    if not lanes:
+        made = [(_serial(solver, raw, others, kind, feel_others, selves), 0)]
     else:
-        kernel = _serial(solver, raw, others, LAWS[law], feel_others, selves)
+        made = [(_lanes(solver, raw, kind, *sizes, objects), ITEMS)]
+        if others:
+            made.append((_lanes_of_hand(raw, kind, *sizes, feel_others, links, selves), HAND_ITEMS))
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
-    return wp.kernel(
-        kernel,
-        enable_backward=False,
-        module="unique",
-        grid_stride=False,
-        cuda_max_registers=registers or None,
-        module_options={"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK},
+    options = {"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK}
+    return tuple(
+        (
+            wp.kernel(
+                kernel,
+                enable_backward=False,
+                module="unique",
+                grid_stride=False,
+                cuda_max_registers=registers or None,
+                module_options=options,
+            ),
+            items,
+        )
+        for kernel, items in made
     )
 
 
@@ -408,51 +425,64 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
     return serial
 
 
-def _lanes(
-    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int,
-    objects: int, feel_others: bool, links: int, selves: bool,
-) -> Callable:  # fmt: skip
+def _measures(rounds: int) -> SimpleNamespace:
+    """Return functions of a warp that measures a group of up to so many rounds, a lane's taxels in its registers."""
     Reals = wp.types.vector(length=rounds, dtype=float)
-    blocks = -(-links // LANES)
-    Gaps = wp.types.vector(length=max(blocks, 1), dtype=float)
     chunk = min(CHUNK, rounds)
 
     @wp.func
-    def in_grid(
-        s: Shapes, i: int, scale: float, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float
-    ):
-        """Return distances to a grid of this lane's taxels, in n rounds from flat index `at` on; FAR behind them, and
-        where a taxel is `level` [m] or more from the grid's box, as it then is from the shape."""
+    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
+        """Return distances of this lane's taxels to a shape, in n rounds from flat index `at` on; FAR behind them. All
+        primitives are one formula: a box, or a body of revolution, minus a radius; no branch, a third of the code."""
+        d = Reals(FAR)
+        if s.kind[i] == wp.static(GRID):
+            offset = s.offset[i]
+            dims = s.dims[i]
+            origin = s.origin[i]
+            h = s.spacing[i]
+            for c in range(wp.static(rounds // chunk)):
+                if wp.static(chunk) * c < n:
+                    for k in range(wp.static(chunk)):
+                        r = wp.static(chunk) * c + k
+                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        d[r] = sd_cells(s.data, offset, dims, origin, h, size[0], q)
+        else:
+            kind = s.kind[i]
+            box = kind == wp.static(BOX)
+            wide = wp.where(kind == wp.static(CYLINDER), size[0], 0.0)
+            round = wp.where(box or kind == wp.static(CYLINDER), 0.0, size[0])
+            tall = wp.where(box, size[2], wp.where(kind == wp.static(SPHERE), 0.0, size[1]))
+            for c in range(wp.static(rounds // chunk)):
+                if wp.static(chunk) * c < n:
+                    for k in range(wp.static(chunk)):
+                        r = wp.static(chunk) * c + k
+                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        x = wp.where(box, wp.abs(q[0]) - size[0], wp.sqrt(q[0] * q[0] + q[1] * q[1]) - wide)
+                        y = wp.where(box, wp.abs(q[1]) - size[1], -FAR)
+                        z = wp.abs(q[2]) - tall
+                        most = wp.max(x, wp.max(y, z))
+                        out = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0))
+                        d[r] = wp.length(out) + wp.min(most, 0.0) - round
+        return d
+
+    @wp.func
+    def nearer(d: Any, s: Shapes, i: int, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float):
+        """Return the lesser of the distances d and those to a grid, of taxels less than `level` [m] from its box."""
         offset = s.offset[i]
         dims = s.dims[i]
         low = s.origin[i]
         h = s.spacing[i]
         high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
-        d = Reals(FAR)
         for c in range(wp.static(rounds // chunk)):
             if wp.static(chunk) * c < n:
                 for k in range(wp.static(chunk)):
                     r = wp.static(chunk) * c + k
                     q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
                     # those that are far read one cell, all the same, without a branch that others would wait at
-                    off = q - wp.max(scale * low, wp.min(q, scale * high))
+                    off = q - wp.max(low, wp.min(q, high))
                     near = wp.dot(off, off) <= level * level
-                    e = sd_cells(s.data, offset, dims, low, h, scale, wp.where(near, q, scale * low))
-                    d[r] = wp.where(near, e, FAR)
-        return d
-
-    @wp.func
-    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
-        """Return the same for a shape of any kind, which is asked once for all."""
-        d = Reals(FAR)
-        if s.kind[i] == wp.static(GRID):
-            d = in_grid(s, i, size[0], a, b, groups, n, at, FAR)
-        else:
-            for c in range(wp.static(rounds // chunk)):
-                if wp.static(chunk) * c < n:
-                    for k in range(wp.static(chunk)):
-                        r = wp.static(chunk) * c + k
-                        d[r] = primitive(s.kind[i], size, a * xyz(load4(groups.taxel, at + 32 * r)) + b)
+                    e = sd_cells(s.data, offset, dims, low, h, 1.0, wp.where(near, q, low))
+                    d[r] = wp.min(d[r], wp.where(near, e, FAR))
         return d
 
     @wp.func
@@ -463,8 +493,8 @@ def _lanes(
         return lanes_min(least)
 
     @wp.func
-    def shares(d: Any, groups: Groups, at: int, reach: float):
-        """Return each taxel's share of a force that is spread over its group, by its distance."""
+    def shares(d: Any, groups: Groups, at: int, reach: float, force: float):
+        """Return what each taxel has of a force that is spread over its group, by its distance."""
         level = spread_level(least_of(d), reach)
         whole = float(0.0)
         for r in range(wp.static(rounds)):
@@ -473,7 +503,143 @@ def _lanes(
                 c = spread_weight(d[r], load4(groups.taxel, at + 32 * r)[3], level)
             whole += c
             d[r] = c
-        return d * (1.0 / lanes_sum(whole))
+        return d * (force / lanes_sum(whole))
+
+    return SimpleNamespace(Reals=Reals, distances=distances, nearer=nearer, least_of=least_of, shares=shares)
+
+
+def _lanes(
+    solver: bool, raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, objects: int
+) -> Callable:
+    """A warp looks at `ITEMS` pairs of a world and a group, and measures, one after another, those that are pressed."""
+    do = _measures(rounds)
+    Reals, distances, shares = do.Reals, do.distances, do.shares
+    width = LANES // ITEMS
+
+    @wp.func
+    def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
+        """Whether object o may press group g."""
+        shape = here.shape_id[w, o]
+        near = shape >= 0
+        if near:
+            if wp.static(solver):
+                near = here.pair_normal[w, here.pair_column[g, o]] > 0.0
+            else:
+                body = groups.body[g]
+                bound = groups.bound[g]
+                a = turn_in(here.xmat, w, body, here.object_body[o])
+                b = pose_in(here.xpos, here.xmat, w, body, here.object_body[o])
+                near = may_touch(shapes, shape, here.shape_size[w, o], a * xyz(bound) + b, bound[3])
+        return near
+
+    def lanes(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
+        # Every branch around an exchange of lanes is the same for the whole warp.
+        i = wp.tid()
+        lane = i & 31
+        first = wp.static(ITEMS) * (i >> 5)
+        item = first + lane // wp.static(width)
+        w = item // wp.static(group_count)
+        g = item - w * wp.static(group_count)
+        inside = w < here.shape_id.shape[0]
+        busy = bool(False)
+        if inside:
+            for o in range(wp.static(objects)):
+                if presses(here, groups, shapes, w, g, o):
+                    busy = True
+            if not busy:
+                for j in range(groups.first[g] + lane % wp.static(width), groups.first[g + 1], wp.static(width)):
+                    f = groups.pads[j]
+                    pad = w * wp.static(pad_count) + f
+                    body = groups.body[g]
+                    out.force[pad] = 0.0
+                    out.centre[pad] = here.xmat[w, body] * pads.centre[f] + here.xpos[w, body]
+        if wp.static(raw):
+            left = lane_ballot(inside and not busy and lane % wp.static(width) == 0)
+            while left != 0:
+                one = first + lowest_bit(left) // wp.static(width)
+                left = left & (left - 1)
+                w = one // wp.static(group_count)
+                g = one - w * wp.static(group_count)
+                for j in range(groups.first[g], groups.first[g + 1]):
+                    for t in range(lane, wp.static(taxels), 32):
+                        out.felt[(w * wp.static(pad_count) + groups.pads[j]) * wp.static(taxels) + t] = 0.0
+        left = lane_ballot(busy and lane % wp.static(width) == 0)
+        while left != 0:
+            one = first + lowest_bit(left) // wp.static(width)
+            left = left & (left - 1)
+            w = one // wp.static(group_count)
+            g = one - w * wp.static(group_count)
+            body = groups.body[g]
+            rot = here.xmat[w, body]
+            pos = here.xpos[w, body]
+            n = groups.rounds[g]
+            at = g * wp.static(rounds * LANES) + lane
+            mine = Reals()  # N, on this lane's taxels
+            for o in range(wp.static(objects)):
+                near = bool(True)
+                if wp.static(objects > 1):
+                    near = presses(here, groups, shapes, w, g, o)
+                if near:
+                    shape = here.shape_id[w, o]
+                    turn = wp.transpose(here.xmat[w, here.object_body[o]])
+                    a = turn * rot
+                    b = turn * (pos - here.xpos[w, here.object_body[o]])
+                    d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
+                    if wp.static(solver):
+                        pressed = here.pair_normal[w, here.pair_column[g, o]]
+                        mine += shares(d, groups, at, law.reach, pressed)
+                    else:
+                        for r in range(wp.static(rounds)):
+                            if d[r] < 0.0:
+                                stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
+                                area = load4(groups.taxel, at + 32 * r)[3]
+                                mine[r] += taxel_force(wp.static(kind), law, stiff, -d[r], area, law.threshold[w])
+            s = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force: of a pad
+            for r in range(wp.static(rounds)):
+                if r < n:
+                    this = groups.round[g, r]
+                    pad = w * wp.static(pad_count) + this[0]
+                    c = mine[r]
+                    if c > 0.0:
+                        p = load4(groups.taxel, at + 32 * r)
+                        s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
+                    t = this[1] + lane
+                    if wp.static(raw):
+                        if t < wp.static(taxels):
+                            out.felt[pad * wp.static(taxels) + t] = c
+                    if this[2] != 0:
+                        if lane_ballot(s[3] > 0.0) != 0:
+                            s = lanes_sum4(s, lane)
+                        if lane == 0:
+                            out.force[pad] = s[3]
+                            out.centre[pad] = rot * centre_of(pads, this[0], s) + pos
+                        s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                        if wp.static(raw):
+                            for u in range(t + 32, wp.static(taxels), 32):
+                                out.felt[pad * wp.static(taxels) + u] = 0.0
+
+    return lanes
+
+
+def _lanes_of_hand(
+    raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, feel_others: bool, links: int,
+    selves: bool,
+) -> Callable:  # fmt: skip
+    """The same for what pads feel of the hand itself, which few do at a time."""
+    do = _measures(rounds)
+    Reals, nearer, least_of, shares = do.Reals, do.nearer, do.least_of, do.shares
+    blocks = max(-(-links // LANES), 1)
+    Gaps = wp.types.vector(length=blocks, dtype=float)
+    width = LANES // HAND_ITEMS
+
+    @wp.func
+    def near_link(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j: int):
+        near = may_meet(g, j, here, groups, w)
+        if near:
+            a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
+            b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
+            near = not tips_apart(groups, tips, g, j, a, b)
+        return near
 
     @wp.func
     def to_links(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, at: int, lane: int, reach: float):
@@ -481,142 +647,97 @@ def _lanes(
         how near its link may be; then the warp measures them, nearest first, until the rest cannot matter."""
         body = groups.body[g]
         gap = Gaps()
-        for k in range(wp.static(max(blocks, 1))):
+        for k in range(wp.static(blocks)):
             gap[k] = link_gap(here, groups, tips, w, g, 32 * k + lane)
         d = Reals(FAR)
         level = float(FAR)
-        nearer = bool(True)
-        while nearer:
+        more = bool(True)
+        while more:
             least = gap[0]
-            for k in range(1, wp.static(max(blocks, 1))):
+            for k in range(1, wp.static(blocks)):
                 least = wp.min(least, gap[k])
             least = lanes_min(least)
-            nearer = least < level
-            if nearer:
+            more = least < level
+            if more:
                 j = int(0)
-                for k in range(wp.static(max(blocks, 1))):
+                for k in range(wp.static(blocks)):
                     bits = lane_ballot(gap[k] == least)
                     if bits != 0:
                         j = 32 * k + lowest_bit(bits)
-                for k in range(wp.static(max(blocks, 1))):
+                for k in range(wp.static(blocks)):
                     if j == 32 * k + lane:
                         gap[k] = FAR
                 a = turn_in(here.xmat, w, body, here.link_body[j])
                 b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
-                e = in_grid(tips, j, 1.0, a, b, groups, groups.rounds[g], at, level)
-                for r in range(wp.static(rounds)):
-                    d[r] = wp.min(d[r], e[r])
+                d = nearer(d, tips, j, a, b, groups, groups.rounds[g], at, level)
                 level = spread_level(least_of(d), reach)
         return d
 
-    def lanes(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
-        # Every branch around an exchange of lanes is the same for the whole warp.
+    def lanes_of_hand(
+        here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt
+    ):
         i = wp.tid()
         lane = i & 31
-        w = (i >> 5) // wp.static(group_count)
-        g = (i >> 5) - w * wp.static(group_count)
-        body = groups.body[g]
-        rot = here.xmat[w, body]
-        pos = here.xpos[w, body]
-        n = groups.rounds[g]
-        at = g * wp.static(rounds * LANES) + lane
-        k = law.scale[w]
-        quiet = law.threshold[w]
+        first = wp.static(HAND_ITEMS) * (i >> 5)
+        item = first + lane // wp.static(width)
+        w = item // wp.static(group_count)
+        g = item - w * wp.static(group_count)
         busy = bool(False)
-        mine = Reals()  # N, of the object on this lane's taxels
-        theirs = Reals()  # N, of the hand itself
-        for o in range(wp.static(objects)):
-            shape = here.shape_id[w, o]
-            size = here.shape_size[w, o]
-            turn = wp.transpose(here.xmat[w, here.object_body[o]])
-            a = turn * rot
-            b = turn * (pos - here.xpos[w, here.object_body[o]])
-            if wp.static(solver):
-                pressed = here.pair_normal[w, here.pair_column[g, o]]
-                if shape >= 0 and pressed > 0.0:
-                    busy = True
-                    d = distances(shapes, shape, size, a, b, groups, n, at)
-                    mine += pressed * shares(d, groups, at, law.reach)
+        if w < here.shape_id.shape[0]:
+            if wp.static(selves):
+                busy = here.pair_normal[w, here.self_column[g]] > 0.0
             else:
-                if shape >= 0:
-                    bound = groups.bound[g]
-                    if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
-                        busy = True
-                        d = distances(shapes, shape, size, a, b, groups, n, at)
-                        for r in range(wp.static(rounds)):
-                            if d[r] < 0.0:
-                                stiff = k * law.stiffness[groups.round[g, r][0]]
-                                area = load4(groups.taxel, at + 32 * r)[3]
-                                mine[r] += taxel_force(wp.static(kind), law, stiff, -d[r], area, quiet)
-        if wp.static(others and selves):
-            other = here.pair_normal[w, here.self_column[g]]
-            if other > 0.0:
-                busy = True
+                for j in range(lane % wp.static(width), wp.static(links), wp.static(width)):
+                    if not busy:
+                        busy = near_link(here, groups, tips, w, g, j)
+            for j in range(groups.first[g] + lane % wp.static(width), groups.first[g + 1], wp.static(width)):
+                out.force_other[w * wp.static(pad_count) + groups.pads[j]] = 0.0
+        left = lane_ballot(busy)
+        while left != 0:
+            part = lowest_bit(left) // wp.static(width)
+            left = left & ~(wp.static((1 << width) - 1 if width < 32 else -1) << (part * wp.static(width)))
+            w = (first + part) // wp.static(group_count)
+            g = first + part - w * wp.static(group_count)
+            n = groups.rounds[g]
+            at = g * wp.static(rounds * LANES) + lane
+            theirs = Reals()  # N, on this lane's taxels
+            if wp.static(selves):
                 d = to_links(here, groups, tips, w, g, at, lane, law.reach)
-                theirs = other * shares(d, groups, at, law.reach)
-        elif wp.static(others):
-            # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
-            for block in range(wp.static(blocks)):
-                j = wp.static(32) * block + lane
-                near = j < wp.static(links)
-                if near:
-                    near = may_meet(g, j, here, groups, w)
-                if near:
-                    turn = wp.transpose(here.xmat[w, here.link_body[j]])
-                    near = not tips_apart(
-                        groups, tips, g, j, turn * rot, turn * (pos - here.xpos[w, here.link_body[j]])
-                    )
-                left = lane_ballot(near)
-                while left != 0:
-                    busy = True
-                    one = 32 * block + lowest_bit(left)
-                    left = left & (left - 1)
-                    turn = wp.transpose(here.xmat[w, here.link_body[one]])
-                    a = turn * rot
-                    b = turn * (pos - here.xpos[w, here.link_body[one]])
-                    middle = tips.middle[one]
-                    half = tips.half[one]
-                    offset = tips.offset[one]
-                    dims = tips.dims[one]
-                    origin = tips.origin[one]
-                    h = tips.spacing[one]
-                    for r in range(wp.static(rounds)):
-                        p = load4(groups.taxel, at + 32 * r)
-                        q = a * xyz(p) + b
-                        if in_box(q, middle, half):
-                            gap = sd_cells(tips.data, offset, dims, origin, h, 1.0, q)
-                            if gap < 0.0:
-                                stiff = k * law.stiffness[groups.round[g, r][0]]
-                                theirs[r] += taxel_force(wp.static(kind), law, stiff, -gap, p[3], quiet)
-        s = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force: of a pad
-        other = float(0.0)
-        for r in range(wp.static(rounds)):
-            if r < n:
-                this = groups.round[g, r]
-                pad = w * wp.static(pad_count) + this[0]
-                if busy:
-                    p = load4(groups.taxel, at + 32 * r)
-                    s += wp.vec4(mine[r] * p[0], mine[r] * p[1], mine[r] * p[2], mine[r])
+                theirs = shares(d, groups, at, law.reach, here.pair_normal[w, here.self_column[g]])
+            else:
+                # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
+                for block in range(wp.static(blocks)):
+                    near = 32 * block + lane < wp.static(links)
+                    if near:
+                        near = near_link(here, groups, tips, w, g, 32 * block + lane)
+                    these = lane_ballot(near)
+                    while these != 0:
+                        j = 32 * block + lowest_bit(these)
+                        these = these & (these - 1)
+                        a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
+                        b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
+                        for r in range(wp.static(rounds)):
+                            p = load4(groups.taxel, at + 32 * r)
+                            q = a * xyz(p) + b
+                            if in_box(q, tips.middle[j], tips.half[j]):
+                                gap = sd_grid(tips, j, 1.0, q)
+                                if gap < 0.0:
+                                    stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
+                                    theirs[r] += taxel_force(wp.static(kind), law, stiff, -gap, p[3], law.threshold[w])
+            other = float(0.0)
+            for r in range(wp.static(rounds)):
+                if r < n:
+                    this = groups.round[g, r]
+                    pad = w * wp.static(pad_count) + this[0]
                     other += theirs[r]
-                t = this[1] + lane
-                if wp.static(raw):
-                    if t < wp.static(taxels):
-                        out.felt[pad * wp.static(taxels) + t] = mine[r] + wp.static(float(feel_others)) * theirs[r]
-                if this[2] != 0:
-                    if busy:
-                        s = lanes_sum4(s, lane)
+                    if wp.static(raw and feel_others):
+                        if theirs[r] > 0.0:
+                            t = pad * wp.static(taxels) + this[1] + lane
+                            out.felt[t] = out.felt[t] + theirs[r]
+                    if this[2] != 0:
                         other = lanes_sum(other)
-                    if lane == 0:
-                        out.force[pad] = s[3]
-                        out.centre[pad] = rot * centre_of(pads, this[0], s) + pos
-                        if wp.static(others):
+                        if lane == 0:
                             out.force_other[pad] = other
-                    s = wp.vec4(0.0, 0.0, 0.0, 0.0)
-                    other = 0.0
-                    if wp.static(raw):
-                        t += 32
-                        while t < wp.static(taxels):
-                            out.felt[pad * wp.static(taxels) + t] = 0.0
-                            t += 32
+                        other = 0.0
 
-    return lanes
+    return lanes_of_hand

@@ -40,8 +40,7 @@ _BALLOT = _EXCHANGE.format(
     cuda="(int)__ballot_sync(0xffffffffu, yes)",
     kind="bool",
     value="yes",
-    cpu="int out = 0;"
-    " for (int k = 0; k < 32; ++k) out |= (int)(wp_lane_values[(WP_TILE_THREAD_IDX & ~31) + k]) << k;",
+    cpu="int out = 0; for (int k = 0; k < 32; ++k) out |= (int)(wp_lane_values[(WP_TILE_THREAD_IDX & ~31) + k]) << k;",
 )
 
 

@@ -204,9 +204,7 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"taxel file {path}: not found")
-    point, normal, tx, area = (
-        None if x is None else x.copy() for x in _columns(path, files.text(path, "taxel file"))
-    )
+    point, normal, tx, area = (None if x is None else x.copy() for x in _columns(path, files.text(path, "taxel file")))
     return {
         "name": name or path.stem,
         "body": body,

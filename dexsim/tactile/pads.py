@@ -116,9 +116,7 @@ def _plain(node: object) -> object:
 def _pad(where: str, entry: Mapping) -> PadConfig:
     """Check an entry against `Pad`."""
     entry = {k: v for k, v in entry.items() if v is not None}
-    params = {
-        k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in PAD_COLUMNS if k in entry
-    }
+    params = {k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in PAD_COLUMNS if k in entry}
     thickness = THICKNESS
     if "rubber" in entry:
         rubber = entry["rubber"]
@@ -130,9 +128,7 @@ def _pad(where: str, entry: Mapping) -> PadConfig:
         thickness = value_range(f"{where}.rubber.thickness", rubber.get("thickness", THICKNESS), "m", 1e-5, 0.1)[0]
     taxels = {_index(f"{where}.taxels", k): value_range(f"{where}.taxels.{k}", v, *GAIN[:3])
               for k, v in entry.get("taxels", {}).items()}  # fmt: skip
-    taxels |= {
-        _index(f"{where}.dead", k): (0.0, 0.0) for k in entry.get("dead", [])
-    }
+    taxels |= {_index(f"{where}.dead", k): (0.0, 0.0) for k in entry.get("dead", [])}
     stuck = {_index(f"{where}.stuck", k): value_range(f"{where}.stuck.{k}", v, *STUCK[:3])[0]
              for k, v in entry.get("stuck", {}).items()}  # fmt: skip
     return PadConfig(params, taxels, stuck, _swaps(f"{where}.swapped", entry.get("swapped", [])), thickness)

@@ -61,9 +61,7 @@ def skin_of(
     return Skin(point, n, area)
 
 
-def surface_points(
-    rng: np.random.Generator, shape: Shape, size: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def surface_points(rng: np.random.Generator, shape: Shape, size: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield random points of an object's surface, by area, and the outward normals there (object frame), without
     end."""
     kind = shape.kind

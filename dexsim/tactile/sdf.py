@@ -167,9 +167,7 @@ def bound_radius(s: Shapes, i: int, size: wp.vec3):
 
 
 @wp.func
-def boxes_apart(
-    a: wp.mat33, b: wp.vec3, middle: wp.vec3, half: wp.vec3, other_middle: wp.vec3, other_half: wp.vec3
-):
+def boxes_apart(a: wp.mat33, b: wp.vec3, middle: wp.vec3, half: wp.vec3, other_middle: wp.vec3, other_half: wp.vec3):
     """Whether a face of one of two boxes separates them; the first box's frame has rotation a and origin b in the
     second's. Boxes that only edges separate count as not apart."""
     d = a * middle + b - other_middle

@@ -15,7 +15,7 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import CHUNK, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernel
+from dexsim.tactile.kernel import CHUNK, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernels
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, Measured, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
@@ -162,7 +162,7 @@ class Tactile:
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
         options |= {"links": len(near), "selves": selves is not None, "groups": len(members), "rounds": rounds}
-        self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
+        self._kernels = touch_kernels(self.lanes, solver, store, others, **options, registers=registers)
         kind: Any = FlatFelt if self.lanes else Felt
         self._out = kind()
         for name in kind.vars:
@@ -301,10 +301,12 @@ class Tactile:
         a, n = self._a, self.engine.n
         args = [self._around, self._pads, self._groups, self._law, self.shapes.wp, self.tips.wp, self._out]
         g = self._groups.body.shape[0]
-        if self.lanes:
-            wp.launch(self._kernel, dim=n * g * LANES, inputs=args, block_dim=self.block_dim, device=self.device)
-        else:
-            wp.launch(self._kernel, dim=(n, g), inputs=args, device=self.device)
+        for kernel, items in self._kernels:
+            if items:
+                dim, block = LANES * -(-n * g // items), self.block_dim
+                wp.launch(kernel, dim=dim, inputs=args, block_dim=block, device=self.device)
+            else:
+                wp.launch(kernel, dim=(n, g), inputs=args, device=self.device)
         m = self._m
         if m is None:
             return
