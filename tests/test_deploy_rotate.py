@@ -153,12 +153,12 @@ def test_goals_move_on_as_the_object_turns(made):
     """The cube turned by hand: a goal a quarter turn on each time, whatever the IMU's heading."""
     m = turner(made)
     if m.needs is None:
-        assert m.observe(state(0.0), None, 0.0, np.zeros(12), np.zeros(12))[0].shape == (1, m.frame * 3)
+        assert m.observe(state(0.0), None, [], np.zeros(12), np.zeros(12))[0].shape == (1, m.frame * 3)
         return
     heading = 2.1
     for k in range(200):
         q = np.array([np.cos((heading + 0.02 * k) / 2), 0, 0, np.sin((heading + 0.02 * k) / 2)])
-        m.observe(state(k * 0.021), q, 0.0, np.zeros(12), np.zeros(12))
+        m.observe(state(k * 0.021), q, [], np.zeros(12), np.zeros(12))
     remaining = np.radians(90) - m.task["reward"]["delta_rot"]
     assert m.goals == int(0.02 * 199 / remaining) and m.goals >= 2
     assert float(rotation.error(m.goal, torch.tensor(q, dtype=torch.float32)[None])) < np.radians(90) + 1e-4
@@ -283,7 +283,7 @@ def test_the_loop_says_what_it_lacks(made):
 
 def test_command_line(made):
     wrong = [
-        (["command=0.5"], "takes no commanded force"),
+        (["command=0.5"], "takes no command"),
         (["vision=camera"], "vision=camera"),
         (["shape=box"], "shape=box"),
     ]

@@ -54,10 +54,10 @@ def test_reorient_sees_a_cube_alike_whichever_face_is_up():
     before = env.cube_turn(), env.to_goal(), *env.measure(env.object_pose)
     relabelled = env.alike.repeat(2, 1)  # each of the 24 turns of a cube onto itself
     env.object_pose[:, 3:] = rotation.multiply(env.object_pose[:, 3:].clone(), relabelled)
-    env.goal = rotation.multiply(env.goal.clone(), relabelled)
+    env.commands["goal"].copy_(rotation.multiply(env.commands["goal"].clone(), relabelled))
     after = env.cube_turn(), env.to_goal(), *env.measure(env.object_pose)
     for seen, again in zip(before, after, strict=True):
         torch.testing.assert_close(again, seen, atol=2e-5, rtol=0)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(96, 3)
-    tipped = rotation.rotate(env.goal, rotation.rotate(rotation.conjugate(env.object_pose[:, 3:]), up))
+    tipped = rotation.rotate(env.commands["goal"], rotation.rotate(rotation.conjugate(env.object_pose[:, 3:]), up))
     torch.testing.assert_close(before[3].cos(), tipped[:, 2], atol=1e-5, rtol=0)

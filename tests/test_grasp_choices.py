@@ -83,7 +83,7 @@ def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
     tactile = np.zeros((5, 120, 3), np.int16)
     tactile[1, 7, 2] = 10
     state = HandState(0.0, 0, np.zeros(12), np.zeros(12), tactile=tactile)
-    built, force = measure.observe(state, np.array([0.05, 0.0, 0.1]), 0.7, np.zeros(12), np.zeros(12))
+    built, force = measure.observe(state, np.array([0.05, 0.0, 0.1]), [0.7], np.zeros(12), np.zeros(12))
     assert built.shape == (1, at) and built[0, -commands:] == pytest.approx(0.7)
     assert force.shape == (5,) and force[1] > 0 and force[[0, 2, 3, 4]].max() == 0  # known to the loop all the same
     row = next((r for r in table if r["name"] == "contact_force"), None)

@@ -35,7 +35,8 @@ settings (key=default):
   ros2_message=       joint_state, or xhand: the messages of the vendor's ROS driver (needs rclpy)
   ros2_effort=1       mA a unit of the states' effort
   seconds=10          of the policy, after homing
-  command=0.5         grasp: commanded force, 0..1 of F_max
+  command=            what the policy is told: grasp, a force, 0..1 of F_max (default 0.5); a task of your own, the
+                      numbers of its commands, as in "1 0 0 0" (default: the bundle's)
   calibration=        calibration.yaml instead of the bundle's
   record=             FILE.mcap, a new one, of everything seen and sent (default: out/deploy_<date>.mcap;
                       record=none: nothing)
@@ -122,7 +123,6 @@ def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list
     from dexsim.calibration.file import Calibration
     from dexsim.deploy import bundle as bundles
     from dexsim.deploy.loop import Loop, LoopSettings
-    from dexsim.deploy.measure import of
     from dexsim.deploy.process import HANG
 
     found = []
@@ -143,11 +143,6 @@ def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list
             print(f"note     no motor gets more than {max(mine['tor_max']):.0f} mA; tor_max= says otherwise")
         settings = LoopSettings(**mine)
         settings.check()
-        if "command" in mine and "command" not in of(b.manifest["task"]).OPTIONS:
-            raise UserError(
-                f"command={mine['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
-                " commanded force"
-            )
         found.append((given, b, calibration, settings))
     hands = _two_hands(found, changes.get("hang", HANG)) if len(found) > 1 else [None]
     loops = []
@@ -417,7 +412,9 @@ def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
     changes: dict[str, Any] = {}
     for key in [k for k in given if k in fields]:
         value, kind = given.pop(key), fields[key]
-        if "bool" in kind:
+        if key == "command":
+            changes[key] = tuple(typed.real(x) for x in value.replace(",", " ").split())
+        elif "bool" in kind:
             changes[key] = typed.truth(key, value)
         else:
             changes[key] = typed.whole(key, value) if kind == "int" else typed.number(key, value, 0.0)

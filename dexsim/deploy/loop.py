@@ -54,7 +54,7 @@ RELAX_TRIES, RELAX_EVERY = 200, 0.005
 CONFIRM = 1.0
 """s that a driver may take to say whether the hand is limp."""
 LIMITS: dict[str, tuple[float, float, str]] = {
-    "seconds": (0, 1e7, "s"), "command": (0, 1, ""), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
+    "seconds": (0, 1e7, "s"), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
     "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"),
     "read_hz": (20, 1000, "Hz"),
     "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "ahead": (0, 0.5, "s"),
@@ -68,7 +68,8 @@ LIMITS: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """seconds of policy; command: force 0..1; home: whether to home first (False only for replays).
+    """seconds of policy; command: what the policy is told (`measure.commanded`); home: whether to home first (False
+    only for replays).
 
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
     home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task
@@ -86,7 +87,7 @@ class LoopSettings:
     """
 
     seconds: float = 10.0
-    command: float = 0.5
+    command: float | tuple[float, ...] | None = None
     home: bool = True
     home_speed: float = 0.5
     home_current: float = 0.5
@@ -176,6 +177,7 @@ class Loop:
         self.grip = np.array(m["grip"]["target"], float) if m.get("grip") else None
         self.calibration = calibration
         self.measure = for_bundle(bundle, calibration)
+        self._command = self.measure.commanded(settings.command)
         wanted = self.measure.needs
         if wanted is not None and not hasattr(eye, wanted):
             raise UserError(
@@ -526,8 +528,8 @@ class Loop:
             return self._send(now, self.target, 1.0)
         if now - self._seen_at > self._seen_limit:
             return None  # the next turn lets go
-        state, command = self.state, self.settings.command
-        observation, touch = self.measure.observe(state, self._seen, command, self.target, self._action)
+        state = self.state
+        observation, touch = self.measure.observe(state, self._seen, self._command, self.target, self._action)
         action = self.bundle.act(observation)[0]
         if self._noise is not None:
             action = (action + self._noise * self._rng.standard_normal(len(action))).astype(np.float32)
@@ -547,7 +549,7 @@ class Loop:
                 r.put(TURNED, now, np.asarray(self._seen, np.float32))
                 r.put(GOAL, now, self.measure.goal[0].numpy())
             elif self.measure.needs == WHERE:
-                r.put(FORCE_COMMAND, now, command)
+                r.put(FORCE_COMMAND, now, self._command[0])
                 r.put(HEIGHT, now, np.asarray(self._seen, np.float32))
         if self.keep:
             self.report.observations.append(observation[0])

@@ -9,6 +9,7 @@ loop calls) and `parts` (of a manifest, by an environment).
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,6 +18,7 @@ import torch
 
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
+from dexsim.errors import UserError
 
 PLACE, ORIENTATION, POSE = "place", "orientation", "pose"
 """What a policy needs to know of the object, beside what the hand reads; also the method of an eye that tells it."""
@@ -30,11 +32,14 @@ class Measure(Protocol):
     def reset(self) -> None:
         """Begin a new episode."""
 
+    def commanded(self, given: Any) -> list[float]:
+        """Return the numbers that the policy is told: those given, or the usual ones for None. Raises UserError."""
+
     def observe(
-        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen: what `needs` names; command:
-        0..1; target [J] rad: the last ones sent; action [J]: the last."""
+        of `commanded`; target [J] rad: the last ones sent; action [J]: the last."""
 
 
 def of(task: str) -> Any:
@@ -47,6 +52,19 @@ def of(task: str) -> Any:
 def for_bundle(bundle: Any, calibration: Calibration) -> Any:
     """Return the measure of a bundle's task."""
     return of(bundle.manifest["task"]).measure(bundle, calibration)
+
+
+def commanded(given: Any, usual: Sequence[float], task: str, low: float = -1e6, high: float = 1e6) -> list[float]:
+    """Return the numbers given, one or several, or the usual ones for None. Raises UserError."""
+    if given is None:
+        return list(usual)
+    numbers = [float(x) for x in np.ravel(given)]
+    text = f"command={','.join(f'{x:g}' for x in numbers)}: the policy is of task={task}, which takes"
+    if not usual:
+        raise UserError(f"{text} no command")
+    if len(numbers) != len(usual) or not all(low <= x <= high for x in numbers):
+        raise UserError(f"{text} {len(usual)} number{'s' * (len(usual) > 1)} in [{low:g}, {high:g}]")
+    return numbers
 
 
 def tensor(x: object) -> torch.Tensor:

@@ -11,12 +11,12 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.manifests import floats
-from dexsim.deploy.measure import PLACE, tensor
+from dexsim.deploy.measure import PLACE, commanded, tensor
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.tasks import observations
 
-OPTIONS = ("vision", "place", "shape", "command")
+OPTIONS = ("vision", "place", "shape")
 SIGNALS = observations
 
 
@@ -105,12 +105,16 @@ class Measure:
         self._xy: np.ndarray | None = None
         self._z: torch.Tensor | None = None
 
+    def commanded(self, given: Any) -> list[float]:
+        """Return the commanded force, a share of F_max (0.5 for None). Raises UserError."""
+        return commanded(given, [0.5], "grasp", 0.0, 1.0)
+
     @torch.inference_mode()
     def observe(
-        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm
-        frame, which is needed; command 0..1."""
+        frame, which is needed; command: one number, 0..1."""
         assert seen is not None
         s = self.signals(state, seen, command)
         force = s.touch_force[0].numpy()
@@ -118,7 +122,7 @@ class Measure:
             s = s._replace(touch_force=s.touch_force[:, :0], touch_centre=s.touch_centre[:, :0])
         return self.observation(s), force
 
-    def signals(self, state: HandState, place: np.ndarray, command: float) -> observations.Signals:
+    def signals(self, state: HandState, place: np.ndarray, command: list[float]) -> observations.Signals:
         """See `observe`; of touch, all that the hand feels."""
         c = self.calibration
         tips, position, rotation_ = self.hand(state.position, state.follower)
@@ -132,7 +136,7 @@ class Measure:
             tensor(state.position), tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
             tensor(self._xy), z, vz,
             tensor(force), tensor(centre), tensor(tips),
-            tensor([command] * self.commands), self.hand.followers(state))  # fmt: skip
+            tensor([*command] * self.commands), self.hand.followers(state))  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
         """Return [1, D] float32, by the builder that training used."""

@@ -14,7 +14,7 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.manifests import Observe, floats
-from dexsim.deploy.measure import ORIENTATION, tensor
+from dexsim.deploy.measure import ORIENTATION, commanded, tensor
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.tasks import observations_rotate
@@ -126,9 +126,13 @@ class TurnMeasure:
         self._past: torch.Tensor | None = None
         self.hand.forget()
 
+    def commanded(self, given: Any) -> list[float]:
+        """Return nothing: this task has no command. Raises UserError where one is given."""
+        return commanded(given, [], "rotate")
+
     @torch.inference_mode()
     def observe(
-        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation
         w x y z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""

@@ -17,13 +17,13 @@ import torch
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
-from dexsim.deploy.measure import POSE
+from dexsim.deploy.measure import POSE, commanded
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.tasks.task import STATE, Task
 from dexsim.tasks.terms import Memory
 
-OPTIONS = ("vision", "shape", "command")
+OPTIONS = ("vision", "shape")
 FRAME: dict[str, str] = {}
 ORDER: dict[str, str] = {}
 
@@ -192,6 +192,7 @@ class TermsMeasure:
 
     def __init__(self, manifest: dict[str, Any], calibration: Calibration, session: Any):
         self.calibration, self.session, self.terms = calibration, session, manifest["terms"]
+        self.task = str(manifest["task"])
         self.period = float(manifest["rates"]["policy_period_s"])
         self.tau_max = np.array(manifest["normalization"]["tau_max"])
         self.hand = HandKinematics(calibration.hand)
@@ -210,23 +211,25 @@ class TermsMeasure:
         self.hand.forget()
         self._steps = 0
 
+    def commanded(self, given: Any) -> list[float]:
+        """Return the numbers of the declared commands in a row, by default the bundle's. Raises UserError."""
+        return commanded(given, [float(x) for v in self.commands.values() for x in v], self.task)
+
     def observe(
-        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where
-        the policy needs it. command: of a task with one command of one number, that."""
+        the policy needs it."""
         c = self.calibration
         tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
-        commanded = self.commands
-        if len(commanded) == 1 and next(iter(commanded.values())).size == 1:
-            commanded = dict.fromkeys(commanded, np.array([command], np.float32))
+        numbers = iter(command)
         now = {
             "q": state.position, "qd": self.hand.velocity(state), "target": target,
             "torque": c.torque_norm(np.asarray(state.current, float) * 1e-3) * self.tau_max,
             "action": np.clip(np.nan_to_num(action), -1.0, 1.0), "touch_force": force, "touch_centre": centre,
             "tips": tips, "age": self._steps * self.period, "object_pose": seen,
-        } | {f"command {k}": v for k, v in commanded.items()}  # fmt: skip
+        } | {f"command {k}": [next(numbers) for _ in v] for k, v in self.commands.items()}  # fmt: skip
         self._steps += 1
         return self.built({name: np.asarray(now[name], np.float32) for name in self.names}), force
 

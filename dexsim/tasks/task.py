@@ -686,8 +686,9 @@ def _observation(term: Term) -> dict[str, Any]:
 
 def _only(term: Term) -> dict[str, bool]:
     only = term.options.get("only")
-    if only not in (None, *SWITCHES):
-        raise UserError(f"term {term.name}: only={only!r}: must be actor, critic or None")
+    known = (None, *SWITCHES, *("rows" for _ in range(term.kind == "command")))
+    if only not in known:
+        raise UserError(f"term {term.name}: only={only!r}: must be {', '.join(map(str, known[1:]))} or None")
     return {} if only is None else {s: s == only for s in SWITCHES}
 
 

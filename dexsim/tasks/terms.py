@@ -124,10 +124,13 @@ def done(method: Any = None, *, name: str | None = None) -> Any:
     return lambda method: _declare("done", method, "", {}, name)
 
 
-def command(unit: str = "", *, hold_s: Span = float("inf"), only: Literal["actor", "critic"] | None = None) -> Any:
+def command(
+    unit: str = "", *, hold_s: Span = float("inf"), only: Literal["actor", "critic", "rows"] | None = None
+) -> Any:
     """Declare what the policy is told: the method returns new values for all worlds, [N] or [N, D], which hold for
     `hold_s` s (a pair: drawn anew), from the start of an episode. `self.commands[name]` is the present value, which is
-    observed too; `self.renew(name, mask)` asks for a new one."""
+    observed too, unless `only` says that other rows alone use it ("rows"); `self.renew(name, mask)` asks for a new
+    one."""
     return lambda method: _declare("command", method, unit, {"hold_s": hold_s, "only": only})
 
 

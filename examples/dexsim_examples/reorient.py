@@ -3,7 +3,7 @@
 import torch
 
 from dexsim import rotation
-from dexsim.tasks import Task, done, memory, metric, observe, reward
+from dexsim.tasks import Task, command, done, event, memory, metric, observe, reward
 from dexsim_examples import rows
 
 REACHED = 0.4  # rad
@@ -27,7 +27,6 @@ class Reorient(Task):
     weights = {"change": -0.0005}
     randomize = {"object": {"size": [0.045, 0.052], "mass": {"log": [0.03, 0.1]}}}
 
-    goal = memory(4)  # orientation to reach, w x y z
     angle = memory()  # rad, left to the goal
     tilt = memory()  # rad, between the cube's axes that point up now and at the goal
     progress = memory()  # rad, what the last step took off both
@@ -43,7 +42,7 @@ class Reorient(Task):
 
     def turn(self, pose):
         """Turn from a pose [N, 7] to the goal [N, 4], palm frame."""
-        return rotation.multiply(self.goal, rotation.conjugate(pose[:, 3:]))
+        return rotation.multiply(self.commands["goal"], rotation.conjugate(pose[:, 3:]))
 
     def measure(self, pose):
         """Find what is left to the goal. A cube turns about the palm's normal at any time, but has to be tipped over
@@ -51,11 +50,17 @@ class Reorient(Task):
         q = self.turn(pose)
         return rotation.angle(q), 2 * torch.atan2(q[:, 1:3].norm(dim=1), q[:, ::3].norm(dim=1))
 
+    @command("1", only="rows")
+    def goal(self):
+        """orientation to reach, palm frame, w x y z"""
+        return self.sampler.quaternion()
+
     def begin(self, mask):
-        pose, m = self.hold(mask), mask[:, None]
-        self.home = torch.where(m, pose[:, :3], self.home)
-        self.goal = torch.where(m, self.sampler.quaternion(), self.goal)
-        angle, tilt = self.measure(pose)
+        self.home = torch.where(mask[:, None], self.hold(mask)[:, :3], self.home)
+
+    @event
+    def aim(self, mask):
+        angle, tilt = self.measure(self.object_pose)
         self.angle, self.tilt = torch.where(mask, angle, self.angle), torch.where(mask, tilt, self.tilt)
 
     def update(self):
@@ -66,7 +71,7 @@ class Reorient(Task):
         self.since = torch.where(self.reached, 0.0, self.since + self.dt)
         renew = self.reached | ((self.since > PATIENCE) & self.learning)
         self.since = torch.where(renew, 0.0, self.since)
-        self.goal = torch.where(renew[:, None], self.sampler.quaternion(), self.goal)
+        self.renew("goal", renew)
         self.angle, self.tilt = self.measure(self.object_pose)
 
     def drift(self):
