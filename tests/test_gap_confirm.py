@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from test_gap import SERVO, demo, mechanism_of, motion, plant_run
 
+from dexsim import guard, system
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.cli import recorded
+from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.judge import full_model
@@ -56,6 +58,32 @@ def test_worlds_of_a_batch_move_as_a_replay_of_each_does():
         q = free_runs(m.spec, ["joint"], [world(table, t, c, 2.0, c[0]), own], timestep=1e-3)[1]
         alone = drive(other, Series(t, c[:, None], COMMANDS, t), ["joint"], 2.0, np.array([c[0]]), timestep=1e-3)
         assert np.abs(q[:2000, 0] - alone.position[:, 0]).max() < 1e-9 < np.abs(q - together[0]).max(), k
+
+
+def test_on_several_cores_worlds_move_as_on_one(monkeypatch):
+    """In processes of their own, to the last bit; a process that breaks is made up for."""
+    table = ServoTable.from_dict({"joints": {"*": SERVO | {"delay": 0.013}}})
+    m = mechanism_of(table)
+    worlds = [world(table, *motion(k % 2, 1.0, k), 1.0 - 0.2 * k, 0.0) for k in range(4)]
+    for w, armature in zip(worlds, (1.0, 2.0, 2.0, 1.0), strict=True):
+        w.spec = m.spec.copy()
+        w.spec.joint("joint").armature *= armature
+    forked, real = [], guard.call
+
+    def call(work, **rest):
+        forked.append(work)
+        if len(forked) % 3 == 0:
+            raise UserError("broken")
+        return real(work, **rest)
+
+    monkeypatch.setattr(guard, "call", call)
+    moved = []
+    for cores in ("1", "2", "16"):
+        monkeypatch.setenv("OMP_NUM_THREADS", cores)
+        moved.append(free_runs(m.spec, ["joint"], worlds, timestep=1e-3))
+    assert all(np.array_equal(a, b) for x in moved[1:] for a, b in zip(moved[0], x, strict=True))
+    assert len(forked) >= 6 or system.start_method() != "fork"
+    assert np.abs(moved[0][0][:300] - moved[0][2][:300]).max() > 1e-4  # another motion, another model
 
 
 def test_a_run_begun_in_its_middle_goes_on_as_it_did():

@@ -14,7 +14,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from dexsim import system
+from dexsim import guard, system
+from dexsim.errors import UserError
 
 # -- cores ------------------------------------------------------------------------------------------------------------
 # The cores of a machine: joints searched side by side, each a problem of its own in a thread of its own, and on a CPU
@@ -26,6 +27,8 @@ MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
 # few guesses)
 SWITCH = 2e-4
 WORTH = 20_000  # steps of guesses that a part has at least: about 2 ms, beside the tenth of one that a launch takes
+
+ENDLESS = 1 << 36  # bytes of the file that a reader with a fork's limits would read: days, a TiB
 
 _busy = 0  # parts under way
 _lock = threading.Lock()
@@ -94,6 +97,22 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
         return [work(k) for k in range(count)]
     with ThreadPoolExecutor(at_once) as pool:
         return list(pool.map(work, range(count)))
+
+
+def forked(count: int, prepared: Callable[[int], Callable[[], T]], at_once: int) -> list[T]:
+    """Return prepared(k)() for k below `count`, in order: side by side in forks of this process, for what is Python
+    itself; without such a fork here, one after the other. Nothing of it may touch a GPU."""
+    if min(at_once, count) <= 1 or system.start_method() != "fork":
+        return [prepared(k)() for k in range(count)]
+
+    def one(work: Callable[[], T]) -> T:
+        try:
+            return guard.call(work, what="a fork", size=ENDLESS)
+        except UserError:  # its own, or the system has no process or memory for it
+            return work()
+
+    with ThreadPoolExecutor(at_once) as pool:
+        return list(pool.map(one, [prepared(k) for k in range(count)]))
 
 
 class Pace:

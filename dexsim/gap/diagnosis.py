@@ -591,7 +591,6 @@ class Drives(Steps):
             if cases and self.written.share < 1:
                 which = "chosen and replayed" if self.written.by_replay else "replayed"
                 w.limit.leave_out(f"what is written is {which} over {_first_part(self.written.share)} held out")
-        self.engine = engine
         w.clock.lap("choice in the engine that trains")
 
     def report(self, d: Diagnosis) -> None:
@@ -651,15 +650,10 @@ class Drives(Steps):
     def replay(self, d: Diagnosis) -> None:
         """The files as they are, over all that was held out, by the function of `play replay=`: the number of the
         report."""
-        w, p = self.w, self.parts
-        if self.engine == "none" or d.servo is None:
+        if self.written.kept is None or d.servo is None:
             return
-        spec = w.m.spec if d.model_spec is None else d.model_spec
-        cases = [x.case for x in self.searched]
-        what = w.m, d.servo, spec, w.runs, w.by_name, cases, p.test, p.span_test
-        found = full_model.replay_files(*what, self.written.share)
-        if found is None:
-            return
+        spec = self.w.m.spec if d.model_spec is None else d.model_spec
+        found = full_model.replay_files(self.written.kept, d.servo, spec, self.written.share)
         self.written.replayed = found
         d.data["held_out"]["replayed"] = found.entry()
         if d.data["held_out"]["error"].startswith("position"):

@@ -26,6 +26,7 @@ from dexsim.actuator.columns import COLUMNS, DELAYS
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
+from dexsim.gap import compute
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.read import Run
 from dexsim.gap.read.channels import own_readings
@@ -90,7 +91,7 @@ class World:
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
     from where a joint that drags another is counted (None: q); setpoint: None or of `setpoints_at`; led: joints that
     follow their recording, in every world of a batch the same; figures [3, J]: `FIELDS` of the joints in the world's
-    own model (None: as in the batch's)."""
+    own model (None: as in the batch's); spec: of its batch (None: everybody's)."""
 
     rows: np.ndarray
     table: ServoTable
@@ -107,6 +108,7 @@ class World:
     setpoint: np.ndarray | None = None
     led: Led | None = None
     figures: np.ndarray | None = None
+    spec: mujoco.MjSpec | None = None
 
 
 @dataclass
@@ -144,6 +146,7 @@ class Written:
     by_replay: bool = False
     replayed: Replayed | None = None
     share: float = 1.0  # of each part held out, from its begin, that is replayed
+    kept: Kept | None = None  # None where nothing was held out or is replayed
 
     def candidate(self, joint: str) -> Candidate:
         """Return what is written of a joint."""
@@ -337,12 +340,24 @@ def free_runs(
     for i, w in enumerate(worlds):
         # as long as the longest of a batch all of it runs
         length = math.ceil(math.log2(max(w.duration / SHORTEST, 1.0)))
-        groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate, length), []).append(i)
-    out: list = [np.zeros((0, len(joints)))] * len(worlds)
+        groups.setdefault((id(w.spec), w.gravity.tobytes(), w.table.drive, w.table.control_rate, length), []).append(i)
+    # on several cores in as many parts, those that take longest first
+    cores, parts = compute.cores() if device == "cpu" else 1, list[tuple[list[World], list[int]]]()
+    whole = sum(w.duration for w in worlds)
     for members in groups.values():
-        for i, q in zip(
-            members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True
-        ):
+        together = [worlds[i] for i in members]
+        count = math.ceil(cores * sum(w.duration for w in together) / whole)
+        longest = sorted(members, key=lambda i: -worlds[i].duration)
+        parts += [(together, longest[k::count]) for k in range(min(count, len(members)))]
+    parts.sort(key=lambda x: -max(worlds[i].duration for i in x[1]))
+
+    def part(k: int) -> Callable[[], list]:
+        together, mine = parts[k]
+        return _batch(spec, joints, [worlds[i] for i in mine], together, device, timestep, engine, torque)
+
+    out: list = [np.zeros((0, len(joints)))] * len(worlds)
+    for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores), strict=True):
+        for i, q in zip(mine, moved, strict=True):
             out[i] = q
     return out
 
@@ -351,12 +366,14 @@ def _batch(
     spec: mujoco.MjSpec,
     joints: Sequence[str],
     worlds: Sequence[World],
+    group: Sequence[World],
     device: str,
     timestep: float,
     kind: str,
     torque: bool,
-) -> list:
-    spec = spec.copy()
+) -> Callable[[], list]:
+    """Return what moves these of a group's worlds: as they do in a batch of all of it."""
+    spec = (worlds[0].spec or spec).copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     led = worlds[0].led.joints if worlds[0].led is not None else []
@@ -365,13 +382,14 @@ def _batch(
     N = len(worlds)
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
-    rows = np.stack([w.rows for w in worlds])
+    rows = np.stack([w.rows for w in group])
     table = copy.deepcopy(worlds[0].table)
     for name in DELAYS:  # the queue must hold the longest
         table.set(joints[0], name, float(rows[:, :, SERVO_INDEX[name]].max()))
-    spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
+    spacing = np.concatenate([np.diff(w.stamps) for w in group])
     spacing = spacing[spacing > 1e-6]
     varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]
+    rows = np.stack([w.rows for w in worlds])
     servo = Servo(
         engine,
         joints,
@@ -408,9 +426,13 @@ def _batch(
     heated = "warmth" in varied or "rare" in servo.features
     changes = Changes(servo, worlds, now, steps, timestep, up, heated)
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
-    seen = _stepped(engine, servo, changes, seen, given, path)
-    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
-    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+    def moved() -> list:
+        shown = _stepped(engine, servo, changes, seen, given, path)
+        q, *tau = (x.cpu().numpy().astype(float) for x in (shown, given) if x is not None)
+        return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+    return moved
 
 
 def _own_figures(engine: Any, servo: Servo, worlds: Sequence[World], led: Sequence[str]) -> None:
@@ -615,9 +637,9 @@ def write_best(
             return []
         begun = time.monotonic()
         given = [files(m, cases, {j: by[j][name] for j, name in x.items()})[:2] for x in choices]
-        found = kept.replayed(given, share, device, engine)
-        pace = (time.monotonic() - begun) / len(choices)
-        return [{j: rms(x) for j, x in kept.missed(q).items()} for q in found]
+        found = kept.missed(given, share, device, engine)
+        pace = max(pace, (time.monotonic() - begun) / len(choices))
+        return [{j: rms(x) for j, x in missed.items()} for missed in found]
 
     while True:
         done = list(zip(kinds, replayed(kinds), strict=True))
@@ -627,9 +649,9 @@ def write_best(
         share = min(1.0, share * more)
     if share < LEAST:
         out = write_best(m, runs, recordings, cases, candidates, noise, test, span_test, engine="none")
-        return replace(out, share=float(np.clip(share * room() / pace, share, 1.0)))
+        return replace(out, share=float(np.clip(share * room() / pace, share, 1.0)), kept=kept)
     chosen = composed(by, errors, noise, done, replayed, lambda count: count * pace > room())
-    return Written(candidates, errors, chosen, True, share=share)
+    return Written(candidates, errors, chosen, True, share=share, kept=kept)
 
 
 def rms(missed: Sequence[np.ndarray]) -> float:
@@ -656,6 +678,7 @@ class Kept:
         count = range(len(self.starts))
         self.ends = [float(t[windows.sample_row[windows.sample_window == k][-1]]) for k in count]
         self._begins: dict[int, tuple] = {}
+        self._known, self._specs = dict[tuple, np.ndarray](), dict[str, mujoco.MjSpec]()
 
     @property
     def seconds(self) -> list[float]:
@@ -666,48 +689,45 @@ class Kept:
         """Return begin and end [s] of the first share of each part."""
         return [(a, a + share * (b - a)) for a, b in zip(self.starts, self.ends, strict=True)]
 
-    def replayed(
+    def missed(
         self,
         given: Sequence[tuple[ServoTable, mujoco.MjSpec]],
         share: float = 1.0,
         device: str = "cpu",
         engine: str = "mujoco",
-    ) -> list[list[np.ndarray]]:
-        """Return positions [T, J] along each part as files (servo table, model) have it. Those whose models differ in
-        armature, damping and friction alone run as one batch."""
-        groups: dict[str, list[int]] = {}
-        for i, (_, spec) in enumerate(given):
-            groups.setdefault(frame_of(self.m, spec), []).append(i)
-        found: dict[int, list[np.ndarray]] = {}
-        count = len(self.starts)
-        for group in groups.values():
-            worlds = []
-            for i in group:
-                m = replace(self.m, spec=given[i][1])
-                worlds += worlds_of(m, self.runs, self.by_name, self.cases, given[i][0], self.windows, self._begins)
-            for w in worlds:
-                w.duration *= share
-            device = "cpu" if engine == "mujoco" else device
-            q = free_runs(given[group[0]][1], self.m.joints, worlds, device, STEP, engine)
-            for k, i in enumerate(group):
-                found[i] = q[k * count : (k + 1) * count]
-        return [[x[: len(t)] for x, t in zip(found[i], self._times(share), strict=True)] for i in range(len(given))]
+    ) -> list[dict[str, list[np.ndarray]]]:
+        """Return by joint, of each part: sum of squares and number of what files (servo table, model), replayed, miss
+        of its readings; none of recordings that do not tell of a joint. What makes the same worlds is replayed once;
+        models that differ in armature, damping and friction alone run as one batch."""
+        asked, new = list[list[tuple]](), dict[tuple, World]()
+        for table, spec in given:
+            frame = frame_of(self.m, spec)
+            spec = self._specs.setdefault(frame, spec)
+            mine = replace(self.m, spec=given[len(asked)][1])
+            worlds = worlds_of(mine, self.runs, self.by_name, self.cases, table, self.windows, self._begins)
+            asked.append([])
+            for k, w in enumerate(worlds):
+                w.duration, w.spec = share * w.duration, spec
+                led, figures = [] if w.led is None else w.led.joints, b"" if w.figures is None else w.figures.tobytes()
+                what = k, share, engine, frame, figures, w.rows.tobytes(), tuple(led)
+                asked[-1].append(what)
+                if what not in self._known:
+                    new[what] = w
+        device = "cpu" if engine == "mujoco" else device
+        found = free_runs(self.m.spec, self.m.joints, [*new.values()], device, STEP, engine)
+        for what, q in zip(new, found, strict=True):
+            self._known[what] = self._missed(what[0], share, q)
+        return [{c.joint: [self._known[x][i] for x in parts] for i, c in enumerate(self.cases)} for parts in asked]
 
-    def _times(self, share: float) -> list[np.ndarray]:
-        return [a + STEP * np.arange(round((b - a) / STEP) + 1) for a, b in self.spans(share)]
-
-    def missed(self, q: Sequence[np.ndarray]) -> dict[str, list[np.ndarray]]:
-        """Return by joint, of each part: sum of squares and number of what free runs miss of its readings; none of
-        recordings that do not tell of a joint."""
-        out = {}
-        for case in self.cases:
-            j, mine = self.m.joints.index(case.joint), []
-            for r, start, x, run in zip(self.recordings, self.starts, q, self.windows.run, strict=True):
-                tells = int(run) not in case.plant.left_out and case.joint in r.joints
-                t = start + STEP * np.arange(len(x))
-                mine.append(_missed(r, case.joint, t, x[:, j]) if tells else np.zeros(2))
-            out[case.joint] = mine
-        return out
+    def _missed(self, k: int, share: float, q: np.ndarray) -> np.ndarray:
+        """Return [cases, 2] of part k."""
+        r, run, (a, b) = self.recordings[k], int(self.windows.run[k]), self.spans(share)[k]
+        t = a + STEP * np.arange(round((b - a) / STEP) + 1)
+        return np.array([
+            _missed(r, c.joint, t, q[: len(t), self.m.joints.index(c.joint)])
+            if run not in c.plant.left_out and c.joint in r.joints else np.zeros(2)
+            for c in self.cases
+        ])  # fmt: skip
 
 
 def kinds_of(by: Mapping[str, Collection[str]]) -> list[dict[str, str]]:
@@ -777,25 +797,10 @@ def _missed(r: Recording, joint: str, t: np.ndarray, q: np.ndarray) -> np.ndarra
     return np.array([np.nansum(d**2), np.isfinite(d).sum()]) if np.isfinite(q).all() else np.array([np.inf, 1.0])
 
 
-def replay_files(
-    m: Mechanism,
-    table: ServoTable,
-    spec: mujoco.MjSpec,
-    runs: Sequence[Run],
-    recordings: Mapping[str, Recording],
-    cases: Sequence[Case],
-    test: list[int],
-    span_test: dict[int, tuple[float, float]] | None,
-    share: float = 1.0,
-) -> Replayed | None:
-    """Replay the files over all that was held out, as `play replay=` does with each recording or part of one; None
-    where there is nothing to replay. share: of each part, from its begin."""
-    ws = cases[0].plant.windows(None, test, span=span_test, every_run=True) if cases else None
-    if ws is None or not len(ws.window):
-        return None
-    kept = Kept(m, runs, recordings, cases, ws)
-    (q,) = kept.replayed([(table, spec)], share)
-    missed = kept.missed(q)
+def replay_files(kept: Kept, table: ServoTable, spec: mujoco.MjSpec, share: float = 1.0) -> Replayed:
+    """Replay the files over all that was held out, as `play replay=` does with each recording or part of one. share: of
+    each part, from its begin."""
+    (missed,) = kept.missed([(table, spec)], share)
     each: dict[str, dict[str, list[np.ndarray]]] = {}
     for joint, parts in missed.items():
         for r, x in zip(kept.recordings, parts, strict=True):
