@@ -348,8 +348,9 @@ import json, sys
 from pathlib import Path
 import numpy as np
 import torch
-from dexsim.actuator import Servo, reference
-from dexsim.actuator.columns import MEMORY
+import servo_reference
+from dexsim.actuator import Servo
+from dexsim.actuator.columns import INDEX, MEMORY
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Drives as Steps, Settings, diagnose, save
@@ -384,13 +385,13 @@ d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=F
              say=lambda _: None)
 save(d, out)
 row = ServoTable.from_dict(demo.BELIEVED).nominal(["joint"])[0]
-without, there = (reference.servo(r, 1.1, 1.0, 0.0, dt=1e-9, features={column}, fresh=0.0, last=1.0,
+without, there = (servo_reference.servo(r, 1.1, 1.0, 0.0, dt=1e-9, features={column}, fresh=0.0, last=1.0,
                                   memory={name: np.ones(()) for name in MEMORY})
-                  for r in (row, np.where(np.arange(len(row)) == reference.INDEX[column], hidden[column], row)))
+                  for r in (row, np.where(np.arange(len(row)) == INDEX[column], hidden[column], row)))
 Drives.features = frozenset({column})
 ServoRandomizer(Drives(), Sampler({"servo": {column: [0.02, 0.06]}}, torch.Generator().manual_seed(0), 400,
                 "cpu")).draw(torch.ones(400).bool())
-drawn = Drives.params[:, 0, reference.INDEX[column]]
+drawn = Drives.params[:, 0, INDEX[column]]
 print(json.dumps({"hidden": hidden, "left": left, "drawn": [float(drawn.min()), float(drawn.max())],
     "torque": float(there["qfrc_applied"] - without["qfrc_applied"]),
     "friction": float(there["dof_frictionloss"] - without["dof_frictionloss"]),
@@ -410,7 +411,8 @@ def grown(tmp_path_factory) -> Path:
         assert old.count(before) == 1 or not before, f"{name}: {before}"
         path.write_text(old.replace(before, text + before) if before else old + text, encoding="utf-8")
     (folder / "tried.py").write_text(TRIED, encoding="utf-8")
-    shutil.copy(Path(__file__).with_name("test_servo.py"), folder)
+    for name in ("test_servo.py", "servo_reference.py"):
+        shutil.copy(Path(__file__).with_name(name), folder)
     return folder
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from bundles import QUIET, make_checkpoint
+from replay_hand import ReplayHand
 
 from dexsim import export
 from dexsim.assets import xhand
@@ -19,7 +20,6 @@ from dexsim.deploy import bundle
 from dexsim.deploy.driver import Clock, HandCommand, HandState, VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.recorder import Recorder
-from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.simulated_hand import SimulatedXHand, choose_gl
 from dexsim.deploy.timing import Timing

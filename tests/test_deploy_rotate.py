@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from bundles import QUIET_TURN, make_checkpoint
+from replay_hand import ReplayHand
 from test_deploy import FakeHand
 
 from dexsim import export, rotation
@@ -23,7 +24,6 @@ from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.measure import for_bundle
 from dexsim.deploy.of_rotate import TurnMeasure
 from dexsim.deploy.recorder import GOAL, TURNED
-from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.simulated_hand import SimulatedXHand
 from dexsim.errors import UserError
 from dexsim.recording.reader import read

@@ -11,8 +11,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+import servo_reference
 
-from dexsim.actuator import reference
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -125,7 +125,7 @@ def test_a_stuck_drive_rests_where_the_servo_law_balances_gravity():
     q, tau = plant.simulate(params, plant.windows(None))
     rest, torque = q[0, -1], tau[0, -1]
     row = run.servo.nominal(["joint"])[0]
-    law = reference.servo(row, 0.6, rest, 0.0, dt=1e-9)["torque"]
+    law = servo_reference.servo(row, 0.6, rest, 0.0, dt=1e-9)["torque"]
     assert torque == pytest.approx(law, rel=1e-3)
     assert law == pytest.approx(0.15 * 9.81 * 0.1 * np.sin(rest), rel=2e-3)
 

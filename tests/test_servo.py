@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from servo_reference import servo as servo_reference
+from servo_reference import target_in_force, target_rates
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
 from dexsim.actuator.columns import FEATURES, INDEX, MEMORY, column
 from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS
-from dexsim.actuator.reference import Step, command_delay, target_in_force, target_rates
-from dexsim.actuator.reference import servo as servo_reference
+from dexsim.actuator.reference import Step, command_delay
 from dexsim.errors import UserError
 from dexsim.sim import make_engine
 

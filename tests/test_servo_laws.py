@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from servo_reference import servo as servo_reference
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, kernel, laws
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.laws import LEAST_ROTOR
 from dexsim.actuator.reference import gear_load_friction, measured_position, torque_along, viscous
-from dexsim.actuator.reference import servo as servo_reference
 from dexsim.gap import demo
 from dexsim.gap.judge.full_model import World, free_runs
 from dexsim.gap.plant.batch import JointPlant, nominal_row
