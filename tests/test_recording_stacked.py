@@ -14,8 +14,9 @@ from mcap.writer import Writer as McapWriter
 
 from dexsim.recording import cdr, decode, read, samples, write
 from dexsim.recording.audit_values import quantum, repeats
-from dexsim.recording.schema import DEFINITIONS, IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH
+from dexsim.recording.schema import IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH
 
+DEFINITIONS = {kind: cdr.definition(kind) for kind in (IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH)}
 NAMES = ("one", "two", "three")
 STAMPS = [1_700_000_000_123_456_789 + 10_000_000 * i for i in range(40)]
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.recording import schema
 from dexsim.recording.writer import Writer
 
 OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = (
@@ -111,23 +110,13 @@ class Recorder:
                 elif kind in add:
                     add[kind](t, *values)
                 else:
-                    self._array(kind, t, values[0])
+                    w.add_array(kind, t, np.atleast_1d(np.asarray(values[0], np.float32)), LABELS[kind])
                 self.written += 1
             except Exception as error:  # a full disk must not stop the hand, and neither must what cannot be written
                 self.error = f"{self.path}: {_reason(error)}; nothing is recorded from {t - first:.1f} s on"
                 return
             if self._queue.empty():
                 time.sleep(0.002)  # a few samples at a time: fewer turns taken from the loop
-
-    def _array(self, topic: str, t: float, value: Any) -> None:
-        """Declare a topic that recordings do not have, on its first message."""
-        w = self.writer
-        if topic not in w._channels:
-            kind = schema.MULTI_ARRAY
-            if kind not in w._schemas:
-                w._schemas[kind] = w._mcap.register_schema(kind, "ros2msg", schema.DEFINITIONS[kind].encode())
-            w._channels[topic] = w._mcap.register_channel(topic, "cdr", w._schemas[kind])
-        w._array(topic, t, np.atleast_1d(np.asarray(value, np.float32)), LABELS[topic])
 
 
 def _reason(error: Exception) -> str:

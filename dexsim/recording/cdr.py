@@ -1,80 +1,30 @@
-"""The few ROS 2 messages of a recording as little-endian CDR, written from NumPy arrays.
-
-The message definitions are in `schema.py`. `mcap-ros2-support` can write them too, one Python call a number: a touch
-message of 1800 numbers then takes milliseconds, too long for a real-time loop. The bytes are the same (tested).
-"""
+"""The few ROS 2 messages of a recording as little-endian CDR, and definitions of standard messages, by `rosbags`."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
+from math import prod
+from typing import Any
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
-_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little endian; alignment counts from behind it
-
-
-class Cdr:
-    """A message being written: fields in order, each aligned to its size."""
-
-    def __init__(self, begun: bytes = _ENCAPSULATION) -> None:
-        self._b = bytearray(begun)
-
-    def _align(self, size: int) -> None:
-        self._b += b"\0" * (-(len(self._b) - 4) % size)
-
-    def pack(self, code: str, value: float) -> None:
-        """Append one number; `code` as in `struct`."""
-        self._align(struct.calcsize(code))
-        self._b += struct.pack("<" + code, value)
-
-    def string(self, text: str) -> None:
-        """Append a string with its length and a closing zero."""
-        data = text.encode()
-        self.pack("I", len(data) + 1)
-        self._b += data + b"\0"
-
-    def strings(self, texts: Sequence[str]) -> None:
-        """Append a sequence of strings."""
-        self.pack("I", len(texts))
-        for text in texts:
-            self.string(text)
-
-    def sequence(self, values: np.ndarray | Sequence[float] | None, dtype: str) -> None:
-        """Append a sequence of numbers ("<f8" or "<f4"); None is empty."""
-        array = np.asarray([] if values is None else values, dtype=dtype).ravel()
-        self.pack("I", array.size)
-        self.array(array)
-
-    def array(self, array: np.ndarray) -> None:
-        """Numbers without a length."""
-        if array.size:
-            self._align(array.itemsize)
-            self._b += array.tobytes()
-
-    def header(self, stamp_ns: int, frame: str = "") -> None:
-        """Append a std_msgs/Header."""
-        self.pack("i", stamp_ns // 1_000_000_000)
-        self.pack("I", stamp_ns % 1_000_000_000)
-        self.string(frame)
-
-    def stamp(self, stamp_ns: int) -> None:
-        """Set another time in the header of a message that begins with one."""
-        struct.pack_into("<iI", self._b, len(_ENCAPSULATION), *divmod(stamp_ns, 1_000_000_000))
-
-    def bytes(self) -> bytes:
-        """Return the message."""
-        return bytes(self._b)
+from dexsim.recording.schema import IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH
 
 
-@lru_cache(maxsize=16)
-def _named(names: tuple[str, ...]) -> bytes:
-    """Return header and names of a joint state: of the thousands in a recording they differ in the stamp alone."""
-    c = Cdr()
-    c.header(0)
-    c.strings(names)
-    return c.bytes()
+@cache
+def standard() -> Typestore:
+    """Return the message types that come with ROS 2."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+@cache
+def definition(kind: str) -> str:
+    """Return the definition of a standard message type, as rosbag2 stores it. Raises KeyError for another type."""
+    return standard().generate_msgdef(kind, ros_version=2)[0]
 
 
 def joint_state(
@@ -85,57 +35,75 @@ def joint_state(
     effort: np.ndarray | None = None,
 ) -> bytes:
     """Return sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
-    c = Cdr(_named(tuple(names)))
-    c.stamp(stamp_ns)
-    for values in (position, velocity, effort):
-        c.sequence(values, "<f8")
-    return c.bytes()
+    data = bytearray(_named(tuple(names)))
+    struct.pack_into("<iI", data, 4, *divmod(stamp_ns, 1_000_000_000))
+    for x in (position, velocity, effort):
+        array = np.asarray([] if x is None else x, "<f8")
+        data += struct.pack("<I", array.size)
+        data += b"\0" * (-(len(data) - 4) % 8 * bool(array.size)) + array.tobytes()
+    return bytes(data)
+
+
+@cache
+def _named(names: tuple[str, ...]) -> bytes:
+    """Return a joint state up to its numbers: of the thousands in a recording it differs in the stamp alone."""
+    none = np.zeros(0)
+    return _bytes(JOINT_STATE, _header(0), list(names), none, none, none)[:-12]
 
 
 def multi_array(values: np.ndarray, labels: Sequence[str] = ()) -> bytes:
     """Return std_msgs/Float32MultiArray of any shape; one dimension label an axis (none: layout left empty)."""
-    array = np.asarray(values, dtype="<f4")
-    c = Cdr()
-    c.pack("I", len(labels))
-    stride = array.size
-    for label, size in zip(labels, array.shape, strict=False):
-        c.string(label)
-        c.pack("I", size)
-        c.pack("I", stride)
-        stride //= max(size, 1)
-    c.pack("I", 0)  # data_offset
-    c.sequence(array, "<f4")
-    return c.bytes()
+    array = np.asarray(values, "<f4")
+    return _bytes(MULTI_ARRAY, _layout(array.shape, tuple(labels)), array.ravel())
+
+
+@cache
+def _layout(shape: tuple[int, ...], labels: tuple[str, ...]) -> Any:
+    strides = [prod(shape[k:]) for k in range(len(labels))]
+    dims = [_of("std_msgs/msg/MultiArrayDimension", *x) for x in zip(labels, shape, strides, strict=False)]
+    return _of("std_msgs/msg/MultiArrayLayout", dims, 0)
 
 
 def wrench(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
     """Return geometry_msgs/WrenchStamped: force and torque [6]."""
-    c = Cdr()
-    c.header(stamp_ns, frame)
-    c.array(np.asarray(values, dtype="<f8"))
-    return c.bytes()
+    force, torque = (_vector(x) for x in np.asarray(values, float).reshape(2, 3))
+    return _bytes(WRENCH, _header(stamp_ns, frame), _of("geometry_msgs/msg/Wrench", force, torque))
 
 
 def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
     """Return geometry_msgs/PoseStamped from [7] x y z, w x y z."""
-    x, y, z, qw, qx, qy, qz = np.asarray(values, dtype="<f8")
-    c = Cdr()
-    c.header(stamp_ns, frame)
-    c.array(np.array([x, y, z, qx, qy, qz, qw], dtype="<f8"))
-    return c.bytes()
+    x = np.asarray(values, float).tolist()
+    at = _of("geometry_msgs/msg/Pose", _of("geometry_msgs/msg/Point", *x[:3]), _quaternion(x[3:]))
+    return _bytes(POSE, _header(stamp_ns, frame), at)
 
 
 def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
     """Return sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown
     (0). A part that is not a number is not measured, which the message says by -1 as the first entry of its
     covariance."""
-    v = np.asarray(values, dtype="<f8")
-    c = Cdr()
-    c.header(stamp_ns, frame)
-    for part in (v[[1, 2, 3, 0]], v[4:7], v[7:10]):
+    v, parts = np.asarray(values, float), []
+    for part, make in ((v[:4], _quaternion), (v[4:7], _vector), (v[7:], _vector)):
         missing = not np.isfinite(part).all()
-        c.array(np.zeros_like(part) if missing else part)
-        covariance = np.zeros(9, dtype="<f8")
-        covariance[0] = -1.0 if missing else 0.0
-        c.array(covariance)
-    return c.bytes()
+        parts += [make(np.zeros_like(part) if missing else part), np.r_[-1.0 if missing else 0.0, np.zeros(8)]]
+    return _bytes(IMU_TYPE, _header(stamp_ns, frame), *parts)
+
+
+def _bytes(kind: str, *fields: Any) -> bytes:
+    return bytes(standard().serialize_cdr(_of(kind, *fields), kind))
+
+
+def _of(kind: str, *fields: Any) -> Any:
+    return standard().types[kind](*fields)
+
+
+def _header(stamp_ns: int, frame: str = "") -> Any:
+    return _of("std_msgs/msg/Header", _of("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
+
+
+def _vector(x: np.ndarray) -> Any:
+    return _of("geometry_msgs/msg/Vector3", *map(float, x))
+
+
+def _quaternion(x: Sequence[float] | np.ndarray) -> Any:
+    w, *rest = map(float, x)
+    return _of("geometry_msgs/msg/Quaternion", *rest, w)

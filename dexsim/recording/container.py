@@ -22,8 +22,10 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from rosbags.typesys import TypesysError
 
 from dexsim.errors import UserError
+from dexsim.recording import cdr
 
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
@@ -120,10 +122,8 @@ def _sqlite(data: Any, out: Container) -> None:
 
 def _standard(kind: str) -> str:
     """Return the definition of a standard message type; empty for another."""
-    from rosbags.typesys import Stores, TypesysError, get_typestore
-
     try:
-        return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(kind, ros_version=2)[0]
+        return cdr.definition(kind)
     except (TypesysError, KeyError, ValueError):
         return ""
 

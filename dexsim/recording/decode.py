@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from dexsim.recording import ros2, stacked
+from dexsim.recording import cdr, ros2, stacked
 from dexsim.recording.samples import Array, JointSample, Reader, Trajectory, Vector
-from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
+from dexsim.recording.schema import JOINT_STATE, MULTI_ARRAY, TOPICS
 
 
 class Unreadable(Exception):
@@ -41,13 +41,8 @@ def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
     """Return whether the messages are of the standard definition, whose fields need not be looked for."""
     if channel.message_encoding != "cdr" or schema is None or schema.name != kind:
         return False
-
-    def lines(text: str) -> list[str]:
-        stated = [x.split("#")[0] for x in text.splitlines()]
-        return [" ".join(x.split()[:2]).replace("/msg/", "/") for x in stated if x.strip("= \t")]
-
     text = schema.data.decode("utf-8", "replace")
-    return schema.encoding != "ros2msg" or not text.strip() or lines(text) == lines(DEFINITIONS[kind])
+    return schema.encoding != "ros2msg" or not text.strip() or ros2.is_standard(kind, text)
 
 
 def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[Any]:
@@ -225,8 +220,8 @@ def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
     if schema is None:
         raise Unreadable("its message definition is lost")
     text, encoding = schema.data.decode("utf-8", "replace"), schema.encoding
-    if schema.name in DEFINITIONS and (encoding != "ros2msg" or not text.strip()):
-        text, encoding = DEFINITIONS[schema.name], "ros2msg"  # the standard messages are known anyway
+    if schema.name in TOPICS.values() and (encoding != "ros2msg" or not text.strip()):
+        text, encoding = cdr.definition(schema.name), "ros2msg"  # the standard messages are known anyway
     if encoding not in ("ros2msg", "ros2idl") or not text.strip():
         raise Unreadable(
             f"its type {schema.name} is described in '{encoding or 'nothing'}', which is not read;"

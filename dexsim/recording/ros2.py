@@ -14,6 +14,8 @@ from typing import Any
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
+from dexsim.recording.cdr import standard
+
 MAX_DEFINITION = 1 << 16  # characters: rosbags compiles it, which takes seconds a megabyte
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*_?\Z")
 
@@ -65,6 +67,13 @@ def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
         return message
 
     return decode
+
+
+@lru_cache(maxsize=64)
+def is_standard(name: str, text: str) -> bool:
+    """Return whether a definition (ros2msg) that `decoder` takes is the one that comes with ROS 2, comments aside."""
+    known = standard().fielddefs
+    return all(fields == known.get(key, ((), None))[1] for key, (_, fields) in get_types_from_msg(text, name).items())
 
 
 def _flat(x: Any) -> list[Any]:

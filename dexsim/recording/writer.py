@@ -102,23 +102,23 @@ class Writer:
 
     def add_temperature(self, t: float, value: np.ndarray) -> None:
         """Add temperatures [J] in degC."""
-        self._array(schema.TEMPERATURES, t, value, ("joint",))
+        self.add_array(schema.TEMPERATURES, t, value, ("joint",))
 
     def add_duty(self, t: float, value: np.ndarray) -> None:
         """Add duty cycles [J], -1..1."""
-        self._array(schema.DUTY, t, value, ("joint",))
+        self.add_array(schema.DUTY, t, value, ("joint",))
 
     def add_enabled(self, t: float, value: np.ndarray) -> None:
         """Add [J]: 1 where the servo drives, 0 where it is free."""
-        self._array(schema.ENABLED, t, value, ("joint",))
+        self.add_array(schema.ENABLED, t, value, ("joint",))
 
     def add_supply_voltage(self, t: float, value: float) -> None:
         """Add the supply's voltage [V]."""
-        self._array(schema.SUPPLY, t, np.atleast_1d(value), ("supply",))
+        self.add_array(schema.SUPPLY, t, np.atleast_1d(value), ("supply",))
 
     def add_tactile(self, t: float, value: np.ndarray) -> None:
         """Add readings [fingers, taxels, 3] in `tactile_unit`."""
-        self._array(schema.TACTILE, t, value, ("finger", "taxel", "axis"))
+        self.add_array(schema.TACTILE, t, value, ("finger", "taxel", "axis"))
 
     def add_external_force(self, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None) -> None:
         """Add [6]: force [N] and torque [N.m] in `frame`."""
@@ -166,14 +166,15 @@ class Writer:
             topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), names, position, velocity, effort)
         )
 
-    def _array(self, topic: str, t: float, value: np.ndarray, labels: Sequence[str]) -> None:
+    def add_array(self, topic: str, t: float, value: np.ndarray, labels: Sequence[str]) -> None:
+        """Add an array of any topic; labels: a word for each axis."""
         self._message(topic, t, cdr.multi_array(value, labels))
 
     def _message(self, topic: str, t: float, data: bytes) -> None:
         if topic not in self._channels:
-            kind = schema.TOPICS[topic]
+            kind = schema.TOPICS.get(topic, schema.MULTI_ARRAY)
             if kind not in self._schemas:
-                self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", schema.DEFINITIONS[kind].encode())
+                self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", cdr.definition(kind).encode())
             self._channels[topic] = self._mcap.register_channel(topic, "cdr", self._schemas[kind])
         ns = self._ns(t)
         number = self._count[topic] = self._count.get(topic, 0) + 1

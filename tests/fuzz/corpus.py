@@ -257,7 +257,7 @@ def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
         w = McapWriter(file, compression=compression, chunk_size=4096)
         w.start("ros2" if encoding == "cdr" else "", "other")
         if encoding == "cdr":
-            kind = w.register_schema(schema.JOINT_STATE, "ros2msg", schema.DEFINITIONS[schema.JOINT_STATE].encode())
+            kind = w.register_schema(schema.JOINT_STATE, "ros2msg", cdr.definition(schema.JOINT_STATE).encode())
         else:
             kind = w.register_schema("JointState", "jsonschema", b"{}")
         channels = [w.register_channel(topic, encoding, kind) for topic in ("/arm/joint_states", "/arm/joint_commands")]
