@@ -12,6 +12,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.read import Run, channels, inputs
 from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording import read, write
@@ -193,6 +194,38 @@ def test_one_recording_of_another_sign_is_named_beside_what_contradicts_it():
     runs = [swept("a", 0.03, 1, 0, 8), swept("b", 0.03, -1, 0, 8)]
     found, out, _ = channels.inspect(runs, FREE, {})
     assert [n for n, _ in out] == ["b"] and "not so in a" in found[0].regime
+
+
+def test_a_joint_of_another_sign_moves_the_others_as_it_was_read():
+    """Its commands are negated in every recording: it is not judged, and what hangs from it feels it all the same."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='a' axis='0 1 0'/><geom size='.02' mass='.2' pos='.1 0 0'/><body "
+        "pos='.2 0 0'><joint name='b' axis='0 1 0'/><geom size='.02' mass='.2' pos='.1 0 0'/></body></body>"
+        "</worldbody></mujoco>"
+    )
+
+    def runs(way):
+        out = []
+        for name, where in (("r0", 0.0), ("r1", 4.0)):
+            run, other = swept(name, 0.03, 1, where, where + 4.0), swept(name, 0.05, 1, where, where + 4.0)
+            q, cmd = np.hstack([run.q, 0.5 * other.q]), np.hstack([way * run.cmd, 0.5 * other.cmd])
+            out.append(Run(name, ("a", "b"), run.cmd_t, cmd, run.t, q, run.servo, run.gravity))
+        return out
+
+    def felt(given):
+        for r in given:
+            r.smooth()
+        (b,) = build(model, given, only={"b"})
+        return np.delete(b.plant.series, SERIES_INDEX["others_torque"], 1)  # of which the commands tell
+
+    wrong, notes = runs(-1), []
+    _, out, _ = channels.inspect(wrong, model, {})
+    assert set(out) == {("r0", "a"), ("r1", "a")}
+    wrong = channels.drop(wrong, out, notes, model)
+    assert all(r.joints == ("a", "b") and r.left_out == {"a"} for r in wrong) and "a is left out (sign" in notes[0]
+    alone = [Run(r.name, ("b",), r.cmd_t, r.cmd[:, 1:], r.t, r.q[:, 1:], r.servo, r.gravity) for r in wrong]
+    np.testing.assert_allclose(felt(wrong), felt(runs(1)), atol=1e-9)
+    assert np.abs(felt(wrong) - felt(alone)).max() > 0.1
 
 
 def stepped(late, others=0):

@@ -230,7 +230,7 @@ class Drives(Steps):
         """The runs without the stretches in which something outside pushes."""
         w = self.w
         fitted = [i for i in range(len(w.runs)) if i not in w.held]
-        self.pushes = logged_torque.find_pushes(self.mj_model, w.runs, fitted, w.settings.seed, w.settings.joints)
+        self.pushes = logged_torque.find_pushes(self.mj_model, w.runs, fitted, w.settings.seed, self._judged())
         w.runs, w.held = logged_torque.without_pushes(self.pushes, w.runs, w.held, w.notes)
         w.clock.lap("forces from outside")
 
@@ -243,16 +243,16 @@ class Drives(Steps):
         w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
         self._within_the_limit()
         begun = time.monotonic()
-        self.cases = refined_cases(self.mj_model, w.runs, s.device, _step(w.runs), s.joints)
+        judged = self._judged()
+        self.cases = refined_cases(self.mj_model, w.runs, s.device, _step(w.runs), judged)
         self.left_out = conclude.not_considered(self.cases, self.felt, s.allowed)
         w.notes += cannot_be_seen(s.allowed, self.left_out) + conclude.not_fitted(self.cases)
-        if s.joints is not None:
-            self.cases = [c for c in self.cases if c.joint in s.joints]
-            if not self.cases:
-                raise UserError(
-                    f"joints: none of {', '.join(sorted(s.joints))} is in the recordings "
-                    f"({', '.join(w.runs[0].joints)})"
-                )
+        self.cases = [c for c in self.cases if c.joint in judged]
+        if not self.cases:
+            raise UserError(
+                f"joints: none of {', '.join(sorted(s.joints or judged))} is in the recordings "
+                f"({', '.join(w.runs[0].joints)})"
+            )
         self.modelling = time.monotonic() - begun
         w.clock.lap("model along the motion")
         group = conditions(w.runs)
@@ -262,6 +262,12 @@ class Drives(Steps):
         w.say(f"held out of the fit: {self.parts.how}")
         self.noise = Noise(*held_out.floor(w.runs, self.cases), held_out.by_motion(w.runs, self.cases))
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
+
+    def _judged(self) -> set[str]:
+        """Return the joints that are judged: those that were asked for, of which some recording tells."""
+        w = self.w
+        some = {j for run in w.runs for j in run.joints if j not in run.left_out}
+        return some if w.settings.joints is None else some & w.settings.joints
 
     def _within_the_limit(self) -> None:
         """Leaves out recordings, evenly, whose model along the motion would take more than its share of the limit of

@@ -417,7 +417,8 @@ def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> li
 def _elsewhere(channel: Finding, kept: held_out.Split) -> bool:
     """Return whether a signal is wrong only where its joint is not judged, as one of those left out of a recording or
     with all of it: that casts no doubt on what the other recordings tell of it."""
-    left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
+    never = frozenset.intersection(*(run.left_out for run in kept.runs))  # told of by none
+    left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out - never}
     judged = {run.name for run in kept.runs}
     return bool(channel.when) and all(
         w["recording"] not in judged or (w["recording"], j) in left_out for w in channel.when for j in channel.joints

@@ -657,28 +657,33 @@ def coupled(cases: Sequence[Case]) -> bool:
 def refine_motion_by_fits(
     model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted: Sequence[Any], device: str, dt: float
 ) -> list[Case]:
-    """Return the cases of all joints built anew along motions refined with what was fitted to each (trials, in the
-    order of the cases). Where a joint's encoder was found not to show its position, the others are moved by where it
-    is."""
-    at = []
+    """Return the cases built anew along motions refined with what was fitted to each (trials, in the order of the
+    cases); joints without a case move as they did. Where a joint's encoder was found not to show its position, the
+    others are moved by where it is."""
+    at, was = [], [run.fine for run in runs]
+    place = [runs[0].joints.index(case.joint) for case in cases]
     for case, trial in zip(cases, fitted, strict=True):
         with_fixed = expand(case.plant, trial.fit.params, trial.fit.x[None])
         for name, value in (f for m in trial.members for f in m.variant.fixed):
             with_fixed[:, :, INDEX[name]] = value
         at.append(with_fixed)
-    motion = compute.each(len(cases), lambda j: _motions(runs, j, cases[j].plant, at[j]))
-    misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
+    motion = compute.each(len(cases), lambda k: _motions(runs, place[k], cases[k].plant, at[k]))
+    misread = [k for k, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
         def shown(j: int, i: int) -> tuple[np.ndarray, ...]:
-            return true_motion(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]
+            if j not in place:
+                assert (fine := was[i]) is not None  # as `refined_cases` leaves it
+                return fine[0], *(x[:, j] for x in fine[1:])
+            k = place.index(j)
+            return true_motion(motion[k][i], at[k][0, i]) if k in misread and k != own else motion[k][i]
 
-        _refine(runs, [[shown(j, i) for i in range(len(runs))] for j in range(len(cases))])
-        return build(model, runs, device=device, dt=dt)
+        _refine(runs, [[shown(j, i) for i in range(len(runs))] for j in range(len(runs[0].joints))])
+        return build(model, runs, device, dt, {case.joint for case in cases})
 
     out = built(None)
-    for j in misread:  # what a case holds of its own joint is what was measured
-        out[j] = built(j)[j]
+    for k in misread:  # what a case holds of its own joint is what was measured
+        out[k] = built(k)[k]
     for new, old in zip(out, cases, strict=True):
         new.ranges, new.unknown, new.factors, new.told = old.ranges, old.unknown, old.factors, old.told
         new.plant.nominal = old.plant.nominal  # with what the recorded torque told

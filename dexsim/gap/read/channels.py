@@ -302,7 +302,8 @@ def drop(
     A joint that others of the recordings tell of stays in a run in which it is spoiled, as one of `Run.left_out`: it is
     not judged there, and what the joints beside it feel of it is that of its targets (where those are spoiled too, of a
     joint at rest). A joint that is spoiled in every run, in all that are held out (`held`) or in all others, goes
-    altogether; a run without joints is gone."""
+    altogether, but for one whose direction alone is in doubt: it is judged in none, and moves the others as its
+    readings say, which is how it is replayed. A run without joints is gone."""
     every = {j for run in runs for j in run.joints}
     sides = [[r for i, r in enumerate(runs) if (i in held) == side] for side in ((True, False) if held else (False,))]
     told = {j for j in every if all(any(j in r.joints and (r.name, j) not in out for r in part) for part in sides)}
@@ -318,9 +319,12 @@ def drop(
         ]
         if all((run.name, j) in out for j in run.joints):
             continue
+        moving = [j for j in bad if all(x.startswith("sign") for (_, k), x in out.items() if k == j)]
+        bad = [j for j in bad if j not in moving]
         run.left_out = frozenset(j for j in wrong if j in told)
         for j in run.left_out:
             _assume(run, run.joints.index(j), out[run.name, j].startswith("stuck"), model)
+        run.left_out |= frozenset(moving)
         if bad:
             k = [i for i, j in enumerate(run.joints) if j not in bad]
             if not k:
