@@ -492,7 +492,9 @@ def test_summary_reproduces_the_papers_first_row():
 def test_summary_without_success():
     m = summary(np.zeros(5, int), np.full(5, 2.0), np.zeros(5, bool), 10.0, 100, 0)
     assert m["seconds_per_success"] is None and m["seconds_per_success_interval"] == [None, None]
-    assert m["consecutive_successes"]["average"] == 0.0
+    assert m["consecutive_successes"]["average"] == 0.0 and m["share_without_success"] == 1.0
+    m = summary(np.array([0, 3, 0, 5, 1]), np.full(5, 2.0), np.zeros(5, bool), 10.0, 100, 0)
+    assert m["share_without_success"] == pytest.approx(0.4)
 
 
 def test_evaluation_counts(monkeypatch):

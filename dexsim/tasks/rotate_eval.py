@@ -187,7 +187,7 @@ def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: fl
         "seconds_per_success": float(time.sum() / total) if total else None,
         "seconds_per_success_interval": _interval(per),
         "seconds_to_fall": float(time.mean()), "seconds_to_fall_interval": _interval(fall),
-        "capped": int(np.asarray(capped).sum()), "cap_s": cap,
+        "capped": int(np.asarray(capped).sum()), "cap_s": cap, "share_without_success": float((successes == 0).mean()),
     }  # fmt: skip
 
 
