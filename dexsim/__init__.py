@@ -58,33 +58,15 @@ if TYPE_CHECKING:
     from dexsim.recording.schema import Recording
 
 __all__ = [
-    "Diagnosis",
-    "Distillation",
-    "PPO",
-    "Recording",
-    "ServoTable",
-    "UserError",
-    "__version__",
-    "demo_recordings",
-    "diagnose",
-    "load_policy",
-    "make_env",
-    "play",
-    "read_recording",
-    "replay_recording",
-    "settings",
-    "train",
+    "Diagnosis", "Distillation", "PPO", "Recording", "ServoTable", "UserError", "__version__", "demo_recordings",
+    "diagnose", "load_policy", "make_env", "play", "read_recording", "replay_recording", "settings", "train",
     "write_recording",
-]
+]  # fmt: skip
 
 _ELSEWHERE = {
-    "Diagnosis": "dexsim.gap.inquiry",
-    "Distillation": "dexsim.agents",
-    "PPO": "dexsim.agents",
-    "Recording": "dexsim.recording.schema",
-    "ServoTable": "dexsim.actuator.table",
-    "UserError": "dexsim.errors",
-}
+    "Diagnosis": "dexsim.gap.inquiry", "Distillation": "dexsim.agents", "PPO": "dexsim.agents",
+    "Recording": "dexsim.recording.schema", "ServoTable": "dexsim.actuator.table", "UserError": "dexsim.errors",
+}  # fmt: skip
 """Modules of the names that are not in `dexsim.api`."""
 
 

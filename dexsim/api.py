@@ -36,12 +36,9 @@ Policy = Callable[[Any], "torch.Tensor"]
 
 
 def read_recording(
-    path: File,
-    remap: Mapping[str, str] | None = None,
-    meta: Mapping[str, Any] | None = None,
-    joints: Sequence[str] | None = None,
-    audit: bool = True,
-) -> Recording:
+    path: File, remap: Mapping[str, str] | None = None, meta: Mapping[str, Any] | None = None,
+    joints: Sequence[str] | None = None, audit: bool = True,
+) -> Recording:  # fmt: skip
     """Return a recording out of an MCAP file or a ROS 2 bag folder.
 
     Args:
@@ -124,20 +121,12 @@ def demo_recordings(
 
 
 def diagnose(
-    recordings: File | Sequence[File],
-    model: File | None = None,
-    servo: File | None = None,
-    out: File = "out/diagnosis",
-    held_out: File | Sequence[File] | None = None,
-    effects: Iterable[str] | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    replay: str = "mujoco",
-    next_recording: bool = True,
-    meta: Mapping[str, str] | None = None,
-    remap: Mapping[str, str] | None = None,
+    recordings: File | Sequence[File], model: File | None = None, servo: File | None = None,
+    out: File = "out/diagnosis", held_out: File | Sequence[File] | None = None, effects: Iterable[str] | None = None,
+    seed: int = 0, device: str = "cpu", replay: str = "mujoco", next_recording: bool = True,
+    meta: Mapping[str, str] | None = None, remap: Mapping[str, str] | None = None,
     say: Callable[[str], None] | None = None,
-) -> Diagnosis:
+) -> Diagnosis:  # fmt: skip
     """Find the physics that the simulator leaves out of recordings; writes what `dexsim diagnose` writes into `out`.
 
     Args:
@@ -166,17 +155,11 @@ def diagnose(
     if effects is not None and isinstance(effects, str):
         raise UserError(f"effects={effects!r}: must be a list of names, e.g. [{effects!r}]")
     given: dict[str, Any] = {
-        "recordings": _texts(recordings),
-        "held_out": None if held_out is None else _texts(held_out),
-        "model": None if model is None else str(model),
-        "servo": None if servo is None else str(servo),
-        "effects": None if effects is None else list(effects),
-        "seed": seed,
-        "next": next_recording,
-        "replay": replay,
-        "meta": dict(meta or {}),
-        "remap": dict(remap or {}),
-    }
+        "recordings": _texts(recordings), "held_out": None if held_out is None else _texts(held_out),
+        "model": None if model is None else str(model), "servo": None if servo is None else str(servo),
+        "effects": None if effects is None else list(effects), "seed": seed, "next": next_recording, "replay": replay,
+        "meta": dict(meta or {}), "remap": dict(remap or {}),
+    }  # fmt: skip
     where = Path(out).expanduser()
     parsed = command.settings_of(given, where, command.started(device))
     command.claim(parsed)
@@ -199,19 +182,11 @@ def settings(task: Task = "grasp", overrides: Sequence[str] = ()) -> dict[str, A
 
 
 def make_env(
-    task: Task = "grasp",
-    worlds: int | None = None,
-    device: str | None = None,
-    seed: int = 1,
-    settings: Sequence[str] = (),
-    checkpoint: File | None = None,
-    *,
-    hand: File | None = None,
-    servo: File | None = None,
-    objects: Sequence[File] | None = None,
-    kept_out: Sequence[File] | None = None,
+    task: Task = "grasp", worlds: int | None = None, device: str | None = None, seed: int = 1,
+    settings: Sequence[str] = (), checkpoint: File | None = None, *, hand: File | None = None,
+    servo: File | None = None, objects: Sequence[File] | None = None, kept_out: Sequence[File] | None = None,
     rewards: Mapping[str, float] | None = None,
-) -> HandEnv:
+) -> HandEnv:  # fmt: skip
     """Simulate many hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it
     gymnasium's).
 
@@ -261,23 +236,12 @@ def load_policy(checkpoint: File, env: HandEnv) -> Policy:
 
 
 def train(
-    task: Task = "grasp",
-    worlds: int | None = None,
-    iterations: int | None = None,
-    device: str | None = None,
-    seed: int = 1,
-    settings: Sequence[str] = (),
-    out: File | None = None,
-    *,
-    agent: PPO | Distillation | None = None,
-    hand: File | None = None,
-    servo: File | None = None,
-    objects: Sequence[File] | None = None,
-    kept_out: Sequence[File] | None = None,
-    rewards: Mapping[str, float] | None = None,
-    resume: File | None = None,
+    task: Task = "grasp", worlds: int | None = None, iterations: int | None = None, device: str | None = None,
+    seed: int = 1, settings: Sequence[str] = (), out: File | None = None, *, agent: PPO | Distillation | None = None,
+    hand: File | None = None, servo: File | None = None, objects: Sequence[File] | None = None,
+    kept_out: Sequence[File] | None = None, rewards: Mapping[str, float] | None = None, resume: File | None = None,
     final_episodes: int | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Train a policy as `dexsim train` does, with its printout; returns the run's folder.
 
     Args:
@@ -311,16 +275,10 @@ def train(
 
 
 def play(
-    checkpoint: File | None = None,
-    policy: str | None = None,
-    task: Task = "grasp",
-    episodes: int = 256,
-    device: str | None = None,
-    seed: int = 0,
-    video: bool = False,
-    settings: Sequence[str] = (),
+    checkpoint: File | None = None, policy: str | None = None, task: Task = "grasp", episodes: int = 256,
+    device: str | None = None, seed: int = 0, video: bool = False, settings: Sequence[str] = (),
     out: File | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Play episodes as `dexsim play` does, with its printout; returns the metrics (metrics.json as a dict).
 
     Args:
@@ -350,13 +308,9 @@ def play(
 
 
 def _start(
-    task: Task,
-    worlds: int | None,
-    device: str | None,
-    seed: int | None,
-    settings: Sequence[str],
+    task: Task, worlds: int | None, device: str | None, seed: int | None, settings: Sequence[str],
     checkpoint: File | None = None,
-) -> Any:
+) -> Any:  # fmt: skip
     """Return the start of a run (`dexsim.cli.start.Start`) from named arguments and settings."""
     from dexsim.cli import start
 
@@ -376,12 +330,9 @@ def _start(
 
 
 def _things(
-    hand: File | None,
-    servo: File | None,
-    objects: Sequence[File] | None,
-    kept_out: Sequence[File] | None,
+    hand: File | None, servo: File | None, objects: Sequence[File] | None, kept_out: Sequence[File] | None,
     rewards: Mapping[str, float] | None,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Return keywords as settings."""
     out = [_setting(k, v) for k, v in (("hand", hand), ("servo_file", servo)) if v is not None]
     for key, names in (("objects", objects), ("kept_out", kept_out)):

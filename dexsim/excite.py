@@ -69,15 +69,9 @@ def main(argv: Sequence[str]) -> int:
     outputs.claim(out, "out=", FILES)
     start = time.perf_counter()
     p = plan(
-        m,
-        _list(given, "joints"),
-        _list(given, "kinds"),
-        int(seed),
-        rate,
-        limits,
-        int(repeats),
+        m, _list(given, "joints"), _list(given, "kinds"), int(seed), rate, limits, int(repeats),
         say=lambda text: print(f"  {text}", flush=True),
-    )
+    )  # fmt: skip
     print(f"\n{'start s':>9}{'end s':>9}  {'kind':<11}{'scale':>6}  joints")
     for s in p.segments:
         again = "" if s.repeats is None else f"  (repeats the one at {p.segments[s.repeats].start:.1f} s)"
@@ -108,23 +102,9 @@ def _current(m: Any, peaks: Any) -> str:
 
 
 KEYS = (
-    "out",
-    "joints",
-    "kinds",
-    "model",
-    "hand",
-    "hand_mirror",
-    "servo",
-    "seed",
-    "rate",
-    "repeats",
-    "speed",
-    "torque",
-    "current",
-    "margin",
-    "clearance",
-    "gravity",
-)
+    "out", "joints", "kinds", "model", "hand", "hand_mirror", "servo", "seed", "rate", "repeats", "speed", "torque",
+    "current", "margin", "clearance", "gravity",
+)  # fmt: skip
 
 
 RANGES: dict[str, tuple[float, float, float, bool]] = {

@@ -57,26 +57,18 @@ def main(argv: Sequence[str]) -> int:
         if not given.get(key):
             raise UserError(f"say {key}=... (dexsim export --help)")
     out = export(
-        given["checkpoint"],
-        given["out"],
-        given.get("calibration"),
-        whole("steps", given.get("steps", "64"), 2, 100_000),
-        whole("seed", given.get("seed", "0")),
+        given["checkpoint"], given["out"], given.get("calibration"),
+        whole("steps", given.get("steps", "64"), 2, 100_000), whole("seed", given.get("seed", "0")),
         frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
         truth("mirror", given.get("mirror", "false")),
-    )
+    )  # fmt: skip
     return 0 if check(out) else 1
 
 
 def export(
-    checkpoint: str,
-    out: str | Path,
-    calibration: str | None = None,
-    steps: int = 64,
-    seed: int = 0,
-    typed: frozenset[tuple[str, Any]] = frozenset(),
-    mirror: bool = False,
-) -> Path:
+    checkpoint: str, out: str | Path, calibration: str | None = None, steps: int = 64, seed: int = 0,
+    typed: frozenset[tuple[str, Any]] = frozenset(), mirror: bool = False,
+) -> Path:  # fmt: skip
     """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. mirror: for the mirror
     image of its hand. Raises UserError."""
     from dexsim import outputs

@@ -74,13 +74,9 @@ def register() -> None:
     for entry in registry.entries():
         name = "".join(part.capitalize() for part in entry.name.replace("-", "_").split("_"))
         gymnasium.register(
-            f"dexsim/{name}-v0",
-            entry_point="dexsim.gym:GymEnv",
-            vector_entry_point="dexsim.gym:make_vector",
-            kwargs={"task": entry.name},
-            order_enforce=False,
-            disable_env_checker=True,
-        )
+            f"dexsim/{name}-v0", entry_point="dexsim.gym:GymEnv", vector_entry_point="dexsim.gym:make_vector",
+            kwargs={"task": entry.name}, order_enforce=False, disable_env_checker=True,
+        )  # fmt: skip
 
 
 register()

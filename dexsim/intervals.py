@@ -42,15 +42,9 @@ def draws(samples: Sequence[np.ndarray], statistic: Callable, seed: Seed, count:
         # the interval and standard error that SciPy adds are not used: only they mind a value that is not finite
         warnings.simplefilter("ignore", stats.DegenerateDataWarning)
         found = stats.bootstrap(
-            tuple(samples),
-            statistic,
-            paired=len(samples) > 1,
-            vectorized=True,
-            n_resamples=count,
-            batch=max(1, AT_ONCE // units),
-            method="percentile",
-            rng=np.random.default_rng(seed),
-        )
+            tuple(samples), statistic, paired=len(samples) > 1, vectorized=True, n_resamples=count,
+            batch=max(1, AT_ONCE // units), method="percentile", rng=np.random.default_rng(seed),
+        )  # fmt: skip
     return np.asarray(found.bootstrap_distribution)
 
 

@@ -39,14 +39,10 @@ from dexsim.errors import UserError
 
 Zero = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 SAME = {
-    "friction_base": "coulomb_friction",
-    "friction_viscous": "viscous_friction",
-    "friction_stribeck": "stribeck_peak",
-    "dtheta_stribeck": "stribeck_speed",
-    "alpha": "stribeck_exponent",
-    "q_offset": "position_offset",
+    "friction_base": "coulomb_friction", "friction_viscous": "viscous_friction", "friction_stribeck": "stribeck_peak",
+    "dtheta_stribeck": "stribeck_speed", "alpha": "stribeck_exponent", "q_offset": "position_offset",
     "command_delay": "delay",
-}
+}  # fmt: skip
 """Parameters that are a column as they stand."""
 FIX = "BAM writes such a file with its fit"
 STRIBECK = ("m2", "m4", "m5", "m6")

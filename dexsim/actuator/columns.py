@@ -148,16 +148,9 @@ COLUMNS: tuple[Column, ...] = (
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)
 
 DRY_FRICTION = (
-    "coulomb_friction",
-    "stribeck_peak",
-    "load_friction",
-    "load_friction_backdriven",
-    "load_friction_external",
-    "load_stribeck",
-    "load_stribeck_external",
-    "load_quadratic",
-    "load_quadratic_external",
-)
+    "coulomb_friction", "stribeck_peak", "load_friction", "load_friction_backdriven", "load_friction_external",
+    "load_stribeck", "load_stribeck_external", "load_quadratic", "load_quadratic_external",
+)  # fmt: skip
 """Columns of which each is the size of a dry friction, or of a part of it."""
 
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}

@@ -28,12 +28,9 @@ class Step:
 
 
 def over_time(
-    law: Callable[..., Any],
-    p: Mapping[str, float],
-    t: np.ndarray,
-    *signals: np.ndarray,
+    law: Callable[..., Any], p: Mapping[str, float], t: np.ndarray, *signals: np.ndarray,
     features: Collection[str] = FEATURES,
-) -> Any:
+) -> Any:  # fmt: skip
     """Return what a law of this file (`lost_error`, `parasitic_torque`, `shown_position`, ...) answers to signals
     [S] at the times t [S] s, from rest at the first: one after the other where a column p of it remembers, else at
     once."""
@@ -99,12 +96,9 @@ def dragged_target(
 
 
 def supply_left(
-    p: Mapping[str, Numbers],
-    supply: Numbers,
-    others: Numbers,
-    features: Collection[str] = FEATURES,
+    p: Mapping[str, Numbers], supply: Numbers, others: Numbers, features: Collection[str] = FEATURES,
     step: Step | None = None,
-) -> Numbers:
+) -> Numbers:  # fmt: skip
     """Supply [...] over nominal where it would be `supply` [...] without load and the other motors give |torque| of
     `others` [...] N.m together: of all steps of `laws.supply_left`.
 
@@ -144,12 +138,9 @@ def setpoint(p: Mapping[str, Numbers], target: Numbers, q: Numbers, step: Step) 
 
 
 def lost_error(
-    p: Mapping[str, Numbers],
-    target: Numbers,
-    e: Numbers,
-    features: Collection[str] = FEATURES,
+    p: Mapping[str, Numbers], target: Numbers, e: Numbers, features: Collection[str] = FEATURES,
     step: Step | None = None,
-) -> tuple[Numbers, Numbers, Numbers]:
+) -> tuple[Numbers, Numbers, Numbers]:  # fmt: skip
     """Return (what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what
     acts: 0 no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
 
@@ -190,12 +181,9 @@ def loop_torque(p: Mapping[str, Numbers], e: Numbers, v: Numbers, acts: Numbers)
 
 
 def warm_motor(
-    p: Mapping[str, Numbers],
-    torque: Numbers,
-    voltage: bool,
-    features: Collection[str] = FEATURES,
+    p: Mapping[str, Numbers], torque: Numbers, voltage: bool, features: Collection[str] = FEATURES,
     step: Step | None = None,
-) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+) -> tuple[Numbers, Numbers, Numbers, Numbers]:  # fmt: skip
     """Return (stall torque [...] N.m, no-load speed [...] rad/s, efficiency [...], factor [...] on the friction) of
     a motor as
     it is now: of all of `laws.warm_motor`.
@@ -218,15 +206,9 @@ def warm_motor(
 
 
 def torque_along(
-    wanted: np.ndarray,
-    v: np.ndarray,
-    stall: Numbers,
-    no_load: Numbers,
-    voltage: bool,
-    supply: Numbers = 1.0,
-    limited: bool = True,
-    braking_slope: Numbers = 1.0,
-) -> np.ndarray:
+    wanted: np.ndarray, v: np.ndarray, stall: Numbers, no_load: Numbers, voltage: bool, supply: Numbers = 1.0,
+    limited: bool = True, braking_slope: Numbers = 1.0,
+) -> np.ndarray:  # fmt: skip
     """Return the motor torque [S] N.m along a measured motion: `laws.torque_limits`, or `laws.voltage_torque`.
 
     wanted [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
@@ -293,14 +275,9 @@ def gear_load_friction(
 
 
 def dry_friction(
-    p: Mapping[str, Numbers],
-    q: Numbers,
-    v: Numbers,
-    motor: Numbers,
-    outside: Numbers = 0.0,
-    features: Collection[str] = FEATURES,
-    step: Step | None = None,
-) -> Numbers:
+    p: Mapping[str, Numbers], q: Numbers, v: Numbers, motor: Numbers, outside: Numbers = 0.0,
+    features: Collection[str] = FEATURES, step: Step | None = None,
+) -> Numbers:  # fmt: skip
     """Return the level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of
     `laws.dry_friction`.
 

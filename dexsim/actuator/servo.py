@@ -74,17 +74,10 @@ class Servo:
     """
 
     def __init__(
-        self,
-        engine: Any,
-        joints: Sequence[str],
-        table: ServoTable,
-        *,
-        control_period: float | None = None,
-        driven: Sequence[str] | None = None,
-        loop: Sequence[str] | None = None,
-        reported: Sequence[str] | None = None,
+        self, engine: Any, joints: Sequence[str], table: ServoTable, *, control_period: float | None = None,
+        driven: Sequence[str] | None = None, loop: Sequence[str] | None = None, reported: Sequence[str] | None = None,
         varied: Sequence[str] = (),
-    ):
+    ):  # fmt: skip
         self.engine = engine
         self.joints = tuple(joints)
         self.table = table
@@ -176,21 +169,9 @@ class Servo:
         self._fields = {name: engine.wp_field(name) for name in FIELDS}
         self._drives = drives(real)()
         own = (
-            "params",
-            "state",
-            "torque",
-            "inertia",
-            "base_damping",
-            "base_frictionloss",
-            "base_armature",
-            "home",
-            "given",
-            "dof",
-            "dof_q",
-            "loop_q",
-            "loop_dof",
-            "loop_motor",
-        )
+            "params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home",
+            "given", "dof", "dof_q", "loop_q", "loop_dof", "loop_motor",
+        )  # fmt: skip
         for name in own:
             setattr(self._drives, name, getattr(self, f"_{name}"))
         for name in ("time", "qpos", "qvel", "qfrc_applied", *(("outside",) if "load" in self.features else ())):

@@ -40,17 +40,9 @@ Side = Literal["joint", "motor"]
 Loop = Literal["position", "velocity"]
 SIDES = get_args(Side)
 KEYS = (
-    "drive",
-    "joints",
-    "current_per_torque",
-    "control_rate",
-    "loop_rate",
-    "loop_encoder",
-    "position_encoder",
-    "supply_voltage",
-    "fitted",
-    "loop",
-)
+    "drive", "joints", "current_per_torque", "control_rate", "loop_rate", "loop_encoder", "position_encoder",
+    "supply_voltage", "fitted", "loop",
+)  # fmt: skip
 ALL = "*"
 
 
@@ -183,18 +175,9 @@ class ServoTable:
             if top.loop == "velocity" and "kd" in columns:
                 entries[str(joint)].setdefault("speed_feedforward", entries[str(joint)]["kd"])
         return cls(
-            top.drive,
-            entries,
-            top.current_per_torque,
-            top.control_rate,
-            top.loop_rate,
-            top.loop_encoder or "joint",
-            top.position_encoder or "joint",
-            top.supply_voltage,
-            top.fitted,
-            top.loop,
-            source,
-        )
+            top.drive, entries, top.current_per_torque, top.control_rate, top.loop_rate, top.loop_encoder or "joint",
+            top.position_encoder or "joint", top.supply_voltage, top.fitted, top.loop, source,
+        )  # fmt: skip
 
     def to_dict(self) -> dict:
         """Return the file's content again: `from_dict(table.to_dict())` is the same table."""

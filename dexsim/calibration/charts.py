@@ -28,15 +28,9 @@ def lines(half: Half, path: Path, title: str) -> Path:
         levels, f = half.levels.get(joint), half.fits.get(joint)
         if levels is None or f is None:  # what is fitted has levels
             ax.text(
-                0.5,
-                0.5,
-                half.left_out.get(joint, ""),
-                ha="center",
-                va="center",
-                fontsize=7,
-                wrap=True,
+                0.5, 0.5, half.left_out.get(joint, ""), ha="center", va="center", fontsize=7, wrap=True,
                 transform=ax.transAxes,
-            )
+            )  # fmt: skip
             continue
         for way, name, mark in ((True, "loading", "o"), (False, "unloading", "s")):
             m = levels.up == way

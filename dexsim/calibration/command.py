@@ -135,26 +135,15 @@ def _print_half(half: Any, key: str, symbol: str) -> None:
             continue
         rows.append(
             (
-                joint,
-                f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]",
-                f"{f.slope:.4g} {f.offset:+.2f}",
-                f"{f.r2:.4f}",
-                f"{f.held_out:.2f}",
-                f"{100 * f.hysteresis:.0f}",
-                f"{f.effort_max:.3g} / {f.force_max:.3g}",
-                "; ".join(f.why) or "linear",
+                joint, f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]", f"{f.slope:.4g} {f.offset:+.2f}",
+                f"{f.r2:.4f}", f"{f.held_out:.2f}", f"{100 * f.hysteresis:.0f}",
+                f"{f.effort_max:.3g} / {f.force_max:.3g}", "; ".join(f.why) or "linear",
             )
         )
     head = (
-        "joint",
-        f"{symbol} N/{half.unit}, 95 %",
-        "slope, offset",
-        "R2",
-        "held out N",
-        "hysteresis %",
-        f"max {half.unit} / N",
-        "verdict",
-    )
+        "joint", f"{symbol} N/{half.unit}, 95 %", "slope, offset", "R2", "held out N", "hysteresis %",
+        f"max {half.unit} / N", "verdict",
+    )  # fmt: skip
     print(table(f"{key}: fingertip force over effort", head, rows))
     for note in half.notes:
         print(f"note     {note}")
@@ -281,13 +270,9 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
         )
         print(f"plot     {_moved(charts.press(a, b, k, out / 'press.png'))}")
         result["stiffness"] = {
-            "value": k.value,
-            "low": k.low,
-            "high": k.high,
-            "r2": k.r2,
-            "held_out_N": k.held_out,
+            "value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out,
             "linear": k.r2 >= LINEAR_R2,
-        }
+        }  # fmt: skip
         if k.r2 < LINEAR_R2:
             print(
                 f"note     R2 under {LINEAR_R2}: the force does not grow in proportion to depth; the Mooney-Rivlin fit"

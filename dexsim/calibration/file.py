@@ -189,16 +189,10 @@ class Calibration:
         sign = content.current_sign
         signs = [sign.get(j, -1) for j in hand.joints] if isinstance(sign, dict) else [sign] * J
         return cls(
-            current_per_torque=out["current_per_torque"],
-            current_max=out["current_max"],
-            torque_max=out["torque_max"],
-            current_sign=np.array(signs, float),
-            normalization=how,
-            **_touch(content.touch or Touch(), assumed, where, hand),
-            hand=hand,
-            assumed=assumed,
-            raw=raw,
-        )
+            current_per_torque=out["current_per_torque"], current_max=out["current_max"], torque_max=out["torque_max"],
+            current_sign=np.array(signs, float), normalization=how,
+            **_touch(content.touch or Touch(), assumed, where, hand), hand=hand, assumed=assumed, raw=raw,
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """Return the file's content with every value that deployment uses stated."""

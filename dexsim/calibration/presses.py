@@ -120,14 +120,9 @@ def _steady(force: Series, width: float = 0.25) -> list[tuple[int, int]]:
 
 
 def _collect(
-    recording: Recording,
-    effort: Series,
-    force: Series,
-    full: np.ndarray,
-    f: int,
-    column: int,
+    recording: Recording, effort: Series, force: Series, full: np.ndarray, f: int, column: int,
     windows: list[tuple[float, float, float]],
-) -> Levels | None:
+) -> Levels | None:  # fmt: skip
     """Means of a joint (column) and its finger f over the settled part of each window; rows without contact are counted
     and left out."""
     position = recording.states.position

@@ -139,13 +139,9 @@ def fit_linear(depth: np.ndarray, force: np.ndarray) -> Stiffness:
         loop = float(np.mean(np.abs(width)) / f.max())
     total = ((f - f.mean()) ** 2).sum()
     return Stiffness(
-        float(k),
-        float(k - wide),
-        float(k + wide),
-        float(1 - rest @ rest / total),
-        float(np.sqrt(np.mean(np.square(held)))),
-        loop,
-    )
+        float(k), float(k - wide), float(k + wide), float(1 - rest @ rest / total),
+        float(np.sqrt(np.mean(np.square(held)))), loop,
+    )  # fmt: skip
 
 
 def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:

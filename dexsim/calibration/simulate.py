@@ -34,14 +34,9 @@ def pads_of(hand: Hand) -> TaxelLayout:
 
 
 def press_recording(
-    hand: Hand,
-    joint: str,
-    servo: dict | str | Path | None = None,
-    levels: int = 8,
-    most: float = 0.8,
-    stiffness: float = STIFFNESS,
-    timestep: float = 0.002,
-) -> Recording:
+    hand: Hand, joint: str, servo: dict | str | Path | None = None, levels: int = 8, most: float = 0.8,
+    stiffness: float = STIFFNESS, timestep: float = 0.002,
+) -> Recording:  # fmt: skip
     """Return one joint presses, from the hand's open pose: up a ladder of `levels` torques to the share `most` of
     its torque limit (less where another joint of the finger could not hold against it), and down again; torque in
     N.m, touch in N. The finger's other joints lean in by what they carry (arm times force over kp), so that the
@@ -80,15 +75,9 @@ def press_recording(
         )
     commands = _ladder(pose, goals, (j, pose[j] + reach))
     run = mechanism.drive(
-        m,
-        commands,
-        hand.joints,
-        float(commands.t[-1]),
-        pose,
-        timestep,
-        frame_s=0.01,
+        m, commands, hand.joints, float(commands.t[-1]), pose, timestep, frame_s=0.01,
         pairs=[ContactPair("press", ("body", finger.body), ("geom", "anvil"))],
-    )
+    )  # fmt: skip
     out = mechanism.recorded(run, m, commands, hand.joints)
     times = np.minimum((np.arange(len(run.qpos)) + 1) * run.frame_s, run.t[-1])
     out.tactile = Series(times, _taxels(hand, run, f, place), TACTILE)
@@ -102,15 +91,9 @@ def press_recording(
 
 
 def make(
-    out: str | Path,
-    hand: Hand,
-    joints: Sequence[str],
-    servo: dict | str | Path | None = None,
-    levels: int = 8,
-    realistic: bool = False,
-    seed: int = 0,
-    say: Callable[[str], None] = print,
-) -> list[Path]:
+    out: str | Path, hand: Hand, joints: Sequence[str], servo: dict | str | Path | None = None, levels: int = 8,
+    realistic: bool = False, seed: int = 0, say: Callable[[str], None] = print,
+) -> list[Path]:  # fmt: skip
     """Write press_<joint>.mcap of each joint into a folder; realistic: as the hardware would have delivered it (mA,
     counts)."""
     from dexsim.console import folders
@@ -157,14 +140,9 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
             row += frames + rest
     posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
     touch = Tactile(
-        posed,
-        layout,
-        ShapeSet([library()["sphere"]], "cpu"),
-        "anvil",
-        {"raw": True, "others": False},
-        pairs=pairs,
+        posed, layout, ShapeSet([library()["sphere"]], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
         tips=tip_skins(hand),
-    )
+    )  # fmt: skip
     posed.t.xpos[:, :F] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(F)])  # the pads, far apart
     posed.t.xmat[:] = torch.eye(3)
     active = force.argmax(1)
@@ -288,14 +266,9 @@ def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
     d = 0.95
     k = stiffness * (1 - d) * model.body_invweight0[model.geom(tip).bodyid[0], 0]
     spec.add_pair(
-        name=f"press_{tip}",
-        geomname1=tip,
-        geomname2="anvil",
-        condim=3,
-        friction=[0.8, 0.8, 0.005, 1e-4, 1e-4],
-        solref=[-k, -2 * np.sqrt(k)],
-        solimp=[d, d, 1e-3, 0.5, 2],
-    )
+        name=f"press_{tip}", geomname1=tip, geomname2="anvil", condim=3, friction=[0.8, 0.8, 0.005, 1e-4, 1e-4],
+        solref=[-k, -2 * np.sqrt(k)], solimp=[d, d, 1e-3, 0.5, 2],
+    )  # fmt: skip
 
 
 def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> np.ndarray:
@@ -311,14 +284,9 @@ def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> n
     posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
     shape = library()["sphere"]
     touch = Tactile(
-        posed,
-        layout,
-        ShapeSet([shape], "cpu"),
-        "anvil",
-        {"raw": True, "others": False},
-        pairs=pairs,
+        posed, layout, ShapeSet([shape], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
         tips=tip_skins(hand),
-    )
+    )  # fmt: skip
     data = mujoco.MjData(run.model)
     ids = [run.model.body(b).id for b in hand.tip_bodies]
     for w in range(n):

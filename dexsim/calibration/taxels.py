@@ -144,13 +144,9 @@ def _beside(
 
 
 def _swapped(
-    clean: np.ndarray,
-    near: list[list[int]],
-    skip: set[int],
-    least: float = 0.15,
-    sure: float = 2.5,
+    clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15, sure: float = 2.5,
     beside: float = 5.0,
-) -> list[tuple[int, int]]:
+) -> list[tuple[int, int]]:  # fmt: skip
     """Return the pairs that each fit the other's neighbours better than their own by `least` (correlation), and by
     `sure` standard
     deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies

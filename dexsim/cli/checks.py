@@ -15,35 +15,19 @@ from dexsim.learning import names
 INF = math.inf
 # setting: (lowest, highest, whole number?); a missing or null setting is not checked
 LIMITS: dict[str, tuple[float, float, bool]] = {
-    "worlds": (1, 1 << 20, True),
-    "iterations": (1, 10**9, True),
-    "episodes": (1, 10**7, True),
-    "view_port": (1, 65535, True),
-    "view_seconds": (1, 1e9, False),
-    "seed": (0, 2**31 - 1, True),
-    "noise": (0, 2, False),
-    "save_interval": (1, 10**9, True),
-    "average": (0, 10**6, True),
-    "final_episodes": (0, 10**7, True),
-    "sim.timestep": (1e-5, 0.02, False),
-    "sim.control_period": (1e-4, 1.0, False),
-    "sim.iterations": (1, 10**4, True),
-    "sim.iterations_mujoco": (1, 10**4, True),
-    "sim.nconmax": (1, 10**6, True),
-    "sim.njmax": (1, 10**6, True),
-    "agent.num_steps_per_env": (1, 10**5, True),
-    "agent.algorithm.learning_rate": (1e-12, 1.0, False),
-    "agent.algorithm.desired_kl": (1e-9, 10.0, False),
-    "agent.algorithm.num_learning_epochs": (1, 1000, True),
-    "agent.algorithm.num_mini_batches": (1, 10**6, True),
-    "agent.algorithm.clip_param": (1e-6, 10.0, False),
-    "agent.algorithm.gamma": (0.0, 1.0, False),
-    "agent.algorithm.lam": (0.0, 1.0, False),
-    "agent.algorithm.entropy_coef": (0.0, INF, False),
-    "agent.algorithm.value_loss_coef": (0.0, INF, False),
-    "agent.algorithm.max_grad_norm": (1e-9, INF, False),
+    "worlds": (1, 1 << 20, True), "iterations": (1, 10**9, True), "episodes": (1, 10**7, True),
+    "view_port": (1, 65535, True), "view_seconds": (1, 1e9, False), "seed": (0, 2**31 - 1, True),
+    "noise": (0, 2, False), "save_interval": (1, 10**9, True), "average": (0, 10**6, True),
+    "final_episodes": (0, 10**7, True), "sim.timestep": (1e-5, 0.02, False), "sim.control_period": (1e-4, 1.0, False),
+    "sim.iterations": (1, 10**4, True), "sim.iterations_mujoco": (1, 10**4, True), "sim.nconmax": (1, 10**6, True),
+    "sim.njmax": (1, 10**6, True), "agent.num_steps_per_env": (1, 10**5, True),
+    "agent.algorithm.learning_rate": (1e-12, 1.0, False), "agent.algorithm.desired_kl": (1e-9, 10.0, False),
+    "agent.algorithm.num_learning_epochs": (1, 1000, True), "agent.algorithm.num_mini_batches": (1, 10**6, True),
+    "agent.algorithm.clip_param": (1e-6, 10.0, False), "agent.algorithm.gamma": (0.0, 1.0, False),
+    "agent.algorithm.lam": (0.0, 1.0, False), "agent.algorithm.entropy_coef": (0.0, INF, False),
+    "agent.algorithm.value_loss_coef": (0.0, INF, False), "agent.algorithm.max_grad_norm": (1e-9, INF, False),
     "agent.actor.distribution_cfg.init_std": (1e-6, 100.0, False),
-}
+}  # fmt: skip
 
 
 def check(cfg: dict[str, Any]) -> None:

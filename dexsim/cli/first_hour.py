@@ -165,13 +165,9 @@ class Session:
         return self._turns(seconds, goal, current, speed)
 
     def _turns(
-        self,
-        seconds: float,
-        goal: Callable[[float], np.ndarray] | None,
-        current: Any,
-        speed: float = SPEED,
+        self, seconds: float, goal: Callable[[float], np.ndarray] | None, current: Any, speed: float = SPEED,
         period: float = PERIOD,
-    ) -> Trace:
+    ) -> Trace:  # fmt: skip
         begun = due = self.clock.now()
         while self.state is None:
             self.read()

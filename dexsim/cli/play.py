@@ -30,12 +30,9 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         print(f"policy   {checkpoint.provenance(start.data)}", flush=True)
         policy = load_policy(start.data, env, str(start.source), start.typed, float(play["noise"]))
         about = {
-            "checkpoint": str(start.source),
-            "iteration": start.data["iteration"],
-            "git": start.data["git"],
-            "trained_with": start.data["versions"],
-            "versions": machine.versions(),
-        }
+            "checkpoint": str(start.source), "iteration": start.data["iteration"], "git": start.data["git"],
+            "trained_with": start.data["versions"], "versions": machine.versions(),
+        }  # fmt: skip
     else:
         policy = plain_policy(str(play["policy"]), env, cfg["seed"])
         about = {"policy": play["policy"], "versions": machine.versions()}

@@ -14,23 +14,9 @@ from dexsim.console.tables import table
 from dexsim.errors import UserError
 
 KEYS = (
-    "replay",
-    "model",
-    "servo",
-    "servo_file",
-    "out",
-    "video",
-    "timestep",
-    "hold",
-    "start",
-    "end",
-    "hand",
-    "hand_mirror",
-    "object",
-    "object_size",
-    "object_mass",
-    "object_friction",
-)
+    "replay", "model", "servo", "servo_file", "out", "video", "timestep", "hold", "start", "end", "hand", "hand_mirror",
+    "object", "object_size", "object_mass", "object_friction",
+)  # fmt: skip
 RESULTS = ("metrics.json", "simulated.mcap", "position.png", "effort.png", "force.png", "video.mp4")
 
 
@@ -62,20 +48,12 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
             raise UserError(f"servo={servo}: must be a servo.yaml file, or one of {', '.join(options)}")
         servo = str(path)
     return {
-        "replay": own["replay"],
-        "model": own.get("model") or None,
-        "hand": stated_hand(own.get("hand"), own.get("hand_mirror") == "true"),
-        "servo": servo,
-        "out": own.get("out") or None,
-        "video": own.get("video", "true") == "true",
-        "timestep": timestep,
-        "hold": own.get("hold", "recorded"),
-        "start": start or 0.0,
-        "end": end,
-        "object": _object(own),
-        "remap": remap,
+        "replay": own["replay"], "model": own.get("model") or None,
+        "hand": stated_hand(own.get("hand"), own.get("hand_mirror") == "true"), "servo": servo,
+        "out": own.get("out") or None, "video": own.get("video", "true") == "true", "timestep": timestep,
+        "hold": own.get("hold", "recorded"), "start": start or 0.0, "end": end, "object": _object(own), "remap": remap,
         "meta": meta,
-    }
+    }  # fmt: skip
 
 
 def _object(own: dict[str, str]) -> Any:
@@ -163,19 +141,13 @@ def run(play: dict[str, Any]) -> int:
         rows.append((f"all {len(free)} that run free", f"{1e3 * together:.2f}", ""))
     print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")
     about = {
-        "replay": str(path),
-        "model": model or m.robot,
-        "timestep_s": timestep,
-        "object": placed,
-        "start_s": float(result.t[0]),
-        "follow_their_recording": held,
-        "position_rmse_rad": _plain(c.joints, position),
-        "position_rmse_all_rad": together if together == together else None,
-        "torque_rmse_Nm": _plain(c.joints, effort),
+        "replay": str(path), "model": model or m.robot, "timestep_s": timestep, "object": placed,
+        "start_s": float(result.t[0]), "follow_their_recording": held, "position_rmse_rad": _plain(c.joints, position),
+        "position_rmse_all_rad": together if together == together else None, "torque_rmse_Nm": _plain(c.joints, effort),
         "current_per_torque": _plain(c.joints, c.effort_scale),
         "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
         "findings": [f"{f.severity}: {f.kind} {f.topic} {f.text}".strip() for f in recording.findings],
-    }
+    }  # fmt: skip
     with outputs.staged(out) as stage:
         (stage / "metrics.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         sent = recording.commands.between(start, np.inf if play["end"] is None else play["end"])

@@ -58,14 +58,9 @@ def _video(env: Any, frames: dict[str, Any], path: Path) -> bool:
 
     try:
         render(
-            clips_of(frames),
-            path,
-            float(frames.get("dt", env.dt)),
-            frames.get("names", ()),
-            float(frames.get("full", 10.0)),
-            camera=frames.get("camera"),
-            progress=Ticker("frames"),
-        )
+            clips_of(frames), path, float(frames.get("dt", env.dt)), frames.get("names", ()),
+            float(frames.get("full", 10.0)), camera=frames.get("camera"), progress=Ticker("frames"),
+        )  # fmt: skip
     except NoRenderer as error:  # the metrics stand without it
         print(error)
         return False

@@ -48,13 +48,8 @@ def main(argv: list[str]) -> int:
         print(USAGE, end="")
         return 0
     own: dict[str, Any] = {
-        "out": "out/stable_grasps.npz",
-        "count": 2000,
-        "worlds": 256,
-        "seed": 0,
-        "sizes": None,
-        "hold": "palm",
-    }
+        "out": "out/stable_grasps.npz", "count": 2000, "worlds": 256, "seed": 0, "sizes": None, "hold": "palm",
+    }  # fmt: skip
     rest = []
     for text in argv:
         key, eq, value = text.partition("=")

@@ -124,12 +124,8 @@ def _collect(folder: Path) -> tuple[list[tuple], bool]:
         tail = [float(r["step_reward"]) for r in progress[-10:]]
         rows.append(
             (
-                note.stem,
-                " ".join(x for x in own if x not in common),
-                job["status"],
-                int(last.get("iteration", 0)),
-                sum(tail) / len(tail) if tail else float("nan"),
-                job["seconds"],
+                note.stem, " ".join(x for x in own if x not in common), job["status"], int(last.get("iteration", 0)),
+                sum(tail) / len(tail) if tail else float("nan"), job["seconds"],
             )
         )
         failed |= job["status"] != 0

@@ -25,13 +25,9 @@ from dexsim.tasks.registry import typing
 
 SAVE_EVERY_S = 60.0  # last.pt and policy.pt, besides what save_interval keeps
 TAGS = {
-    "reward": "Train/mean_reward",
-    "length": "Train/mean_episode_length",
-    "step_reward": "Train/step_reward",
-    "rate": "Perf/steps_per_second",
-    "collect_s": "Perf/collection_time",
-    "learn_s": "Perf/learning_time",
-}
+    "reward": "Train/mean_reward", "length": "Train/mean_episode_length", "step_reward": "Train/step_reward",
+    "rate": "Perf/steps_per_second", "collect_s": "Perf/collection_time", "learn_s": "Perf/learning_time",
+}  # fmt: skip
 
 
 def run(start: Start, make_env: build.MakeEnv | None = None, where: Path | None = None) -> int:
@@ -55,13 +51,9 @@ def run(start: Start, make_env: build.MakeEnv | None = None, where: Path | None 
 
 
 def _run(
-    start: Start,
-    make_env: build.MakeEnv | None,
-    ranks: Ranks,
-    stop: Stop,
-    where: Path | None,
+    start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop, where: Path | None,
     open_: contextlib.ExitStack,
-) -> int:
+) -> int:  # fmt: skip
     cfg = start.cfg
     where = Path(ranks.tell(str(where or folder.for_run(cfg)) if ranks.leader else None))
     if ranks.leader:

@@ -154,17 +154,10 @@ class Loop:
     _action: np.ndarray
 
     def __init__(
-        self,
-        bundle: Bundle,
-        driver: HandDriver,
-        eye: HeightSource | OrientationSource | None,
-        calibration: Calibration,
-        settings: LoopSettings = LoopSettings(),
-        clock: Clock | None = None,
-        recorder: Recorder | None = None,
-        keep: bool = False,
-        say: Callable[[str], None] | None = None,
-    ):
+        self, bundle: Bundle, driver: HandDriver, eye: HeightSource | OrientationSource | None,
+        calibration: Calibration, settings: LoopSettings = LoopSettings(), clock: Clock | None = None,
+        recorder: Recorder | None = None, keep: bool = False, say: Callable[[str], None] | None = None,
+    ):  # fmt: skip
         """Check the bundle against the driver. eye: what sees the object, as `measure.needs` of the bundle's task has
         it (None: nothing has to). say: told what a person beside the hand has to do."""
         m, self.settings = bundle.manifest, settings
@@ -193,13 +186,10 @@ class Loop:
         self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (J,)), 1, 32767)
         self._taxels = touch_shape(bundle.hand)
         self.guard = Guard(
-            self.rule.low + settings.margin,
-            self.rule.high - settings.margin,
-            settings.speed * np.array(m["action"]["speed_limit_rad_s"]),
-            self.tor_max,
-            calibration.current_sign,
+            self.rule.low + settings.margin, self.rule.high - settings.margin,
+            settings.speed * np.array(m["action"]["speed_limit_rad_s"]), self.tor_max, calibration.current_sign,
             tuple(m["joints"]),
-        )
+        )  # fmt: skip
         spread = m["action"].get("std")
         if settings.noise and spread is None:
             raise UserError(f"noise={settings.noise:g}: bundle {bundle.path} does not say how much; export it again")
@@ -561,12 +551,9 @@ class Loop:
         """Limit, remember, send, record."""
         assert self.target is not None  # since the first reading
         safe = self.guard.apply(
-            target,
-            self.target,
-            np.asarray(self.state.position, float),
-            np.asarray(self.state.current, float),
+            target, self.target, np.asarray(self.state.position, float), np.asarray(self.state.current, float),
             self.period,
-        )
+        )  # fmt: skip
         self.target = safe.astype(np.float32)
         with self._lock:  # the watchdog relaxes from its own thread
             if self._tripped is None:

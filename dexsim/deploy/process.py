@@ -80,15 +80,9 @@ class BusDriver:
     name = "hand"
 
     def __init__(
-        self,
-        make: Callable[[Clock], Body],
-        joints: int,
-        taxels: tuple[int, int],
-        clock: Clock | None = None,
-        hang: float = HANG,
-        start: float = 60.0,
-        inside: bool = False,
-    ):
+        self, make: Callable[[Clock], Body], joints: int, taxels: tuple[int, int], clock: Clock | None = None,
+        hang: float = HANG, start: float = 60.0, inside: bool = False,
+    ):  # fmt: skip
         self.clock, self.joints, self.taxels, self.hang = clock or Clock(), joints, taxels, hang
         self._make, self.start, self._inside = make, start, inside
         self.body: Body | None = None

@@ -15,12 +15,8 @@ import numpy as np
 from dexsim.recording.writer import Writer
 
 OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = (
-    "/policy/observation",
-    "/policy/action",
-    "/policy/force_command",
-    "/object_seen",
-    "/joint_errors",
-)
+    "/policy/observation", "/policy/action", "/policy/force_command", "/object_seen", "/joint_errors",
+)  # fmt: skip
 TURNED, GOAL = "/object_turned", "/policy/goal"
 HAND = "hand"
 """A record of metadata: serial number, side and versions, as the driver gave them."""
@@ -37,17 +33,9 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        joints: Sequence[str],
-        meta: Mapping[str, Any],
-        config: str | None,
-        zero: float,
-        start_ns: int | None = None,
-        most: int = 4000,
-        chunk_s: float = 0.5,
-        sensed: Sequence[str] = (),
-    ):
+        self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any], config: str | None, zero: float,
+        start_ns: int | None = None, most: int = 4000, chunk_s: float = 0.5, sensed: Sequence[str] = (),
+    ):  # fmt: skip
         self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s, sensed=sensed)
         self.path, self.zero, self.dropped, self.written = self.writer.path, zero, 0, 0
         self.error: str | None = None

@@ -196,15 +196,9 @@ class Ros2Hand:
     name = "ROS 2 hand"
 
     def __init__(
-        self,
-        hand: Hand,
-        state: str = STATE,
-        command: str = COMMAND,
-        clock: Clock | None = None,
-        message: str = "joint_state",
-        effort: float = 1.0,
-        by: Transport | None = None,
-    ):
+        self, hand: Hand, state: str = STATE, command: str = COMMAND, clock: Clock | None = None,
+        message: str = "joint_state", effort: float = 1.0, by: Transport | None = None,
+    ):  # fmt: skip
         self.hand, self.topics, self.clock, self.message = hand, (state, command), clock or Clock(), message
         self.effort, self._by = effort, by
         self._lock = threading.Lock()

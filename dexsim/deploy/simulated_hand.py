@@ -48,14 +48,9 @@ class SimulatedHand:
     """
 
     def __init__(
-        self,
-        config: dict[str, Any],
-        calibration: Calibration,
-        seed: int = 0,
-        camera: bool = False,
-        shape: str | None = None,
-        grip: dict[str, Any] | None = None,
-    ):
+        self, config: dict[str, Any], calibration: Calibration, seed: int = 0, camera: bool = False,
+        shape: str | None = None, grip: dict[str, Any] | None = None,
+    ):  # fmt: skip
         import copy
 
         import torch
@@ -365,11 +360,8 @@ class SimulatedBody:
         self._zero = self.clock.now() - self.hand.time
         self._cycle = round(self.hand.time / BUS_PERIOD)
         return {
-            "driver": "simulated",
-            "serial": "sim",
-            "bus": f"{1 / BUS_PERIOD:g} Hz",
-            "latency_s": f"{self.latency:g}",
-        }
+            "driver": "simulated", "serial": "sim", "bus": f"{1 / BUS_PERIOD:g} Hz", "latency_s": f"{self.latency:g}",
+        }  # fmt: skip
 
     @property
     def due(self) -> float:
@@ -421,17 +413,10 @@ class SimulatedXHand(BusDriver):
     name = "simulated hand"
 
     def __init__(
-        self,
-        config: dict[str, Any],
-        calibration: Calibration,
-        clock: Clock | None = None,
-        seed: int = 0,
-        camera: bool = False,
-        shape: str | None = None,
-        latency: float = 0.002,
-        grip: dict[str, Any] | None = None,
+        self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, seed: int = 0,
+        camera: bool = False, shape: str | None = None, latency: float = 0.002, grip: dict[str, Any] | None = None,
         hang: float = HANG,
-    ):
+    ):  # fmt: skip
         registry.task_class(config)  # refused here where nobody that may has named it
         self._camera, hand = camera, hand_of(config)
         make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip), latency=latency)
@@ -450,17 +435,10 @@ class SimulatedXHand(BusDriver):
 
 
 def faked(
-    config: dict[str, Any],
-    calibration: Calibration,
-    faults: str = "",
-    seed: int = 0,
-    camera: bool = False,
-    shape: str | None = None,
-    grip: dict[str, Any] | None = None,
-    hang: float = HANG,
-    serial: str | None = None,
+    config: dict[str, Any], calibration: Calibration, faults: str = "", seed: int = 0, camera: bool = False,
+    shape: str | None = None, grip: dict[str, Any] | None = None, hang: float = HANG, serial: str | None = None,
     clock: Clock | None = None,
-) -> VendorXHand:
+) -> VendorXHand:  # fmt: skip
     """Return the xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
     `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
     side = hand_of(config).handedness

@@ -493,14 +493,10 @@ class VendorXHands(BusDriver):
     name = "xHands"
 
     def __init__(
-        self,
-        serials: Sequence[str | None] = (None, None),
-        sides: Sequence[str | None] = ("right", "left"),
-        port: str = "auto",
-        clock: Clock | None = None,
-        package: Callable[[Clock], Any] | None = None,
+        self, serials: Sequence[str | None] = (None, None), sides: Sequence[str | None] = ("right", "left"),
+        port: str = "auto", clock: Clock | None = None, package: Callable[[Clock], Any] | None = None,
         hang: float = HANG,
-    ):
+    ):  # fmt: skip
         n = len(sides)
         make = partial(XHandsBus, port=port, serials=serials, sides=sides, package=package)
         super().__init__(make, n * JOINTS, (n * TAXELS[0], TAXELS[1]), clock, hang)
@@ -598,14 +594,9 @@ class VendorXHand(BusDriver):
     name = "xHand"
 
     def __init__(
-        self,
-        port: str = "auto",
-        clock: Clock | None = None,
-        package: Any = None,
-        serial: str | None = None,
-        side: str | None = None,
-        hang: float = HANG,
-    ):
+        self, port: str = "auto", clock: Clock | None = None, package: Any = None, serial: str | None = None,
+        side: str | None = None, hang: float = HANG,
+    ):  # fmt: skip
         inside = hasattr(package, "XHandControl")  # the module itself, of this process
         give = (lambda clock: package) if inside else package
         make = partial(XHandBus, port=port, serial=serial, side=side, package=give)

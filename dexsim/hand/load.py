@@ -119,36 +119,22 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
         normal = np.array(entry.tip.normal) / np.linalg.norm(entry.tip.normal)
         fingers.append(
             Finger(
-                name=entry.name,
-                joints=tuple(order[j] for j in entry.joints),
-                flexion=tuple(order[j] for j in bends.flexion),
-                closes=tuple(bends.closes or [1] * len(bends.flexion)),
-                root=model.root_body(spec, entry.joints, entry.tip.body, file.palm.body),
-                body=entry.tip.body,
-                position=_triple(np.array(entry.tip.position) * flip * scale),
-                normal=_triple(normal * flip),
-                geoms=geoms,
-                pad=entry.pad,
+                name=entry.name, joints=tuple(order[j] for j in entry.joints),
+                flexion=tuple(order[j] for j in bends.flexion), closes=tuple(bends.closes or [1] * len(bends.flexion)),
+                root=model.root_body(spec, entry.joints, entry.tip.body, file.palm.body), body=entry.tip.body,
+                position=_triple(np.array(entry.tip.position) * flip * scale), normal=_triple(normal * flip),
+                geoms=geoms, pad=entry.pad,
             )
         )
     names = [f.name for f in file.fingers]
     opposing = tuple(names.index(f) for f in file.opposing)
     hand = Hand(
-        folder=path.parent,
-        file=file,
-        mirror=mirror,
-        scale=scale,
-        joints=tuple(order),
-        fingers=tuple(fingers),
-        limits=limits,
-        efforts=np.array([j.effort for j in file.joints]),
-        speeds=np.array([j.speed for j in file.joints]),
-        opposing=opposing,
-        others=tuple(k for k in range(len(names)) if k not in opposing),
-        span=file.span * scale,
-        force=float(file.force) if isinstance(file.force, (int, float)) else file.force,
-        _spec=spec,
-    )
+        folder=path.parent, file=file, mirror=mirror, scale=scale, joints=tuple(order), fingers=tuple(fingers),
+        limits=limits, efforts=np.array([j.effort for j in file.joints]),
+        speeds=np.array([j.speed for j in file.joints]), opposing=opposing,
+        others=tuple(k for k in range(len(names)) if k not in opposing), span=file.span * scale,
+        force=float(file.force) if isinstance(file.force, (int, float)) else file.force, _spec=spec,
+    )  # fmt: skip
     presses = {*hand.links, *hand.tip_bodies}
     for pad in file.skin:
         if pad.body not in presses:
@@ -171,13 +157,10 @@ def _names(file: HandFile, where: str) -> None:
     """Return what can be told without the model."""
     joints, fingers = [j.name for j in file.joints], [f.name for f in file.fingers]
     for key, names in (
-        ("joints", joints),
-        ("fingers", fingers),
-        ("fingers.*.tip.body", [f.tip.body for f in file.fingers]),
-        ("fingers.*.joints", [j for f in file.fingers for j in f.joints]),
-        ("opposing", file.opposing),
+        ("joints", joints), ("fingers", fingers), ("fingers.*.tip.body", [f.tip.body for f in file.fingers]),
+        ("fingers.*.joints", [j for f in file.fingers for j in f.joints]), ("opposing", file.opposing),
         ("skin and fingers", [*fingers, *(p.name for p in file.skin)]),
-    ):
+    ):  # fmt: skip
         if (twice := _twice(names)) is not None:
             raise UserError(f"{where}: {key}: '{twice}' twice; each must be there once")
     for f in file.fingers:

@@ -46,13 +46,9 @@ class Runner(OnPolicyRunner):
     """
 
     def __init__(
-        self,
-        env: Any,
-        cfg: dict[str, Any],
-        versions: dict[str, str],
-        ranks: Ranks | None = None,
+        self, env: Any, cfg: dict[str, Any], versions: dict[str, str], ranks: Ranks | None = None,
         typed: names.Typed = frozenset(),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.ranks = ranks or Ranks({})
         self.full_cfg, self._versions, self._git = cfg, versions, checkpoint.git_state()
         device = str(env.device)
@@ -275,19 +271,10 @@ class Runner(OnPolicyRunner):
         """Return the everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         actor, critic = (part.state_dict() for part in self._parts)
         data = {
-            "kind": "train",
-            "config": self._config(),
-            "versions": self._versions,
-            "git": self._git,
-            "layout": self._layout,
-            "iteration": self.iteration,
-            "steps": self.steps,
-            "actor": actor,
-            "critic": critic,
-            "optimizer": self.alg.optimizer.state_dict(),
-            "env": self.env.state_dict(),
-            "rng": checkpoint.rng_state(),
-        }
+            "kind": "train", "config": self._config(), "versions": self._versions, "git": self._git,
+            "layout": self._layout, "iteration": self.iteration, "steps": self.steps, "actor": actor, "critic": critic,
+            "optimizer": self.alg.optimizer.state_dict(), "env": self.env.state_dict(), "rng": checkpoint.rng_state(),
+        }  # fmt: skip
         if self._averaged:  # what is played is the average, what learns on is "learner"
             data |= {"actor": dict(self._average), "learner": actor}
         return data | ({"worlds": self._worlds()} if self.saves_worlds else {})

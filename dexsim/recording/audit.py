@@ -16,32 +16,24 @@ from dexsim.recording.schema import SEVERITIES, Finding, Recording, Series
 KINDS: dict[str, str] = {
     "damage": "bytes, chunks or channels of the file that are lost",
     "unreadable": "messages or channels that cannot be decoded",
-    "malformed": "messages with an unexpected number of values",
-    "missing_topic": "a topic that most uses need",
+    "malformed": "messages with an unexpected number of values", "missing_topic": "a topic that most uses need",
     "missing_metadata": "a key that nothing states, and what is assumed",
     "metadata_override": "a key whose recorded value is not the one used",
-    "metadata_unknown": "a key that this format does not have",
-    "topic": "a topic found under another name",
+    "metadata_unknown": "a key that this format does not have", "topic": "a topic found under another name",
     "joint_names": "joints found under other names, left out, or not named in the messages",
     "joint_order": "commands of one joint that another follows",
     "trajectory": "commands that came as trajectories, and when each point holds",
     "unit": "numbers that cannot be of the stated unit, or were converted",
-    "time_not_monotonic": "times that go backwards",
-    "time_repeated": "samples with the host time of the one before",
-    "gap": "more than 3.5 periods without a sample",
-    "dropped": "single samples missing",
-    "burst": "samples read from a buffer, not when measured",
-    "clock_skew": "clocks that disagree or drift",
+    "time_not_monotonic": "times that go backwards", "time_repeated": "samples with the host time of the one before",
+    "gap": "more than 3.5 periods without a sample", "dropped": "single samples missing",
+    "burst": "samples read from a buffer, not when measured", "clock_skew": "clocks that disagree or drift",
     "held": "samples that repeat the one before while the joint moves",
-    "stuck": "a channel that never changes where it must",
-    "spike": "single samples far from both neighbours",
+    "stuck": "a channel that never changes where it must", "spike": "single samples far from both neighbours",
     "wrap": "a signed number read as unsigned, or an angle that starts again",
-    "saturation": "values that pile up at their largest",
-    "lost_sign": "an effort without its sign",
-    "sign_mismatch": "an effort of the opposite sign to the stated one",
-    "nan": "values that are not finite",
+    "saturation": "values that pile up at their largest", "lost_sign": "an effort without its sign",
+    "sign_mismatch": "an effort of the opposite sign to the stated one", "nan": "values that are not finite",
     "absent": "a joint without any value",
-}
+}  # fmt: skip
 """Every kind of finding, of the reader's and the audit's."""
 
 
@@ -69,16 +61,9 @@ def _of_joints(r: Recording) -> list[Finding]:
     """Return findings about values; each message tells of every joint."""
     found: list[Finding] = []
     for check in (
-        audit_values.commanded,
-        audit_values.finite,
-        audit_values.wraps,
-        audit_values.spikes,
-        audit_values.held,
-        audit_values.stuck,
-        audit_values.saturation,
-        audit_values.signs,
-        audit_values.units,
-    ):
+        audit_values.commanded, audit_values.finite, audit_values.wraps, audit_values.spikes, audit_values.held,
+        audit_values.stuck, audit_values.saturation, audit_values.signs, audit_values.units,
+    ):  # fmt: skip
         found += check(r)
     faulty = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
     return [*found, *reach.unreachable(r, faulty)]
@@ -103,19 +88,11 @@ def summary(r: Recording) -> str:
         f" effort {r.effort_is}"
     ]
     parts = (
-        ("commands", r.commands),
-        ("states", r.states.position),
-        ("  velocity", r.states.velocity),
-        ("  effort", r.states.effort),
-        ("temperature", r.temperature),
-        ("duty", r.duty),
-        ("enabled", r.enabled),
-        ("supply voltage", r.supply_voltage),
-        ("tactile", r.tactile),
-        ("external force", r.external_force),
-        ("object pose", r.object_pose),
-        ("imu", r.imu),
-    )
+        ("commands", r.commands), ("states", r.states.position), ("  velocity", r.states.velocity),
+        ("  effort", r.states.effort), ("temperature", r.temperature), ("duty", r.duty), ("enabled", r.enabled),
+        ("supply voltage", r.supply_voltage), ("tactile", r.tactile), ("external force", r.external_force),
+        ("object pose", r.object_pose), ("imu", r.imu),
+    )  # fmt: skip
     for name, s in parts:
         if s is not None and len(s):
             rate = (len(s) - 1) / (s.t[-1] - s.t[0]) if len(s) > 1 and s.t[-1] > s.t[0] else float("nan")

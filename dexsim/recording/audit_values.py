@@ -50,14 +50,9 @@ def channels(r: Recording) -> Iterator[tuple[Series, str, str, np.ndarray]]:
     """Yield (series, quantity, joint, values [T]) of every per-joint signal."""
     s = r.states
     for series, name in (
-        (r.commands, "command"),
-        (s.position, "position"),
-        (s.velocity, "velocity"),
-        (s.effort, "effort"),
-        (r.temperature, "temperature"),
-        (r.duty, "duty"),
-        (r.enabled, "enabled"),
-    ):
+        (r.commands, "command"), (s.position, "position"), (s.velocity, "velocity"), (s.effort, "effort"),
+        (r.temperature, "temperature"), (r.duty, "duty"), (r.enabled, "enabled"),
+    ):  # fmt: skip
         if series is not None and len(series):
             for j, joint in enumerate(r.joints):
                 yield series, name, joint, series.value[:, j]

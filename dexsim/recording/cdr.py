@@ -28,12 +28,9 @@ def definition(kind: str) -> str:
 
 
 def joint_state(
-    stamp_ns: int,
-    names: Sequence[str],
-    position: np.ndarray | None,
-    velocity: np.ndarray | None = None,
+    stamp_ns: int, names: Sequence[str], position: np.ndarray | None, velocity: np.ndarray | None = None,
     effort: np.ndarray | None = None,
-) -> bytes:
+) -> bytes:  # fmt: skip
     """Return sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
     data = bytearray(_named(tuple(names)))
     struct.pack_into("<iI", data, 4, *divmod(stamp_ns, 1_000_000_000))

@@ -141,13 +141,9 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str], ti
 
 
 def of_columns(
-    path: Path,
-    raw: Mapping[str, Any],
-    findings: list[Finding],
-    remap: Mapping[str, str],
-    meta: Mapping[str, str],
+    path: Path, raw: Mapping[str, Any], findings: list[Finding], remap: Mapping[str, str], meta: Mapping[str, str],
     time_unit: str = "",
-) -> Table:
+) -> Table:  # fmt: skip
     """Return the table in columns by name: numbers [T], or texts [T] (of a text file) that only the columns' names tell
     how to read."""
     named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
@@ -295,12 +291,9 @@ def _lines_of_joints(raw: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(
-    path: Path,
-    raw: Mapping[str, Any],
-    roles: Mapping[str, tuple[str, str, str, str]],
-    findings: list[Finding],
+    path: Path, raw: Mapping[str, Any], roles: Mapping[str, tuple[str, str, str, str]], findings: list[Finding],
     named: set[str],
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:  # fmt: skip
     """Return (columns as numbers, those without any left out; of columns with empty places, where there is a value
     [T]). Texts that are none are found, but in columns that no role asks for. named: columns that the user named."""
     out: dict[str, np.ndarray] = {}
@@ -577,11 +570,7 @@ def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
     findings = more + (
         [
             Finding(
-                "malformed",
-                "",
-                np.nan,
-                bad,
-                f"{bad} lines have not as many values as there are names; left out",
+                "malformed", "", np.nan, bad, f"{bad} lines have not as many values as there are names; left out",
                 "error",
             )
         ]

@@ -78,12 +78,9 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[A
         if position is None:
             raise ValueError("no field 'position'")
         return JointSample(
-            list(names),
-            floats(position),
-            floats(first(m, "velocity", "velocities")),
-            floats(first(m, "effort", "efforts", "current")),
-            stamp,
-        )
+            list(names), floats(position), floats(first(m, "velocity", "velocities")),
+            floats(first(m, "effort", "efforts", "current")), stamp,
+        )  # fmt: skip
 
     return Reader(read)
 

@@ -87,15 +87,9 @@ class Plan:
 
 
 def plan(
-    m: Mechanism,
-    joints: Sequence[str] | None = None,
-    kinds: Sequence[str] | None = None,
-    seed: int = 0,
-    rate: float = 100.0,
-    limits: Limits = Limits(),
-    repeats: int = 1,
-    say: Callable[[str], None] = lambda text: None,
-) -> Plan:
+    m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str] | None = None, seed: int = 0,
+    rate: float = 100.0, limits: Limits = Limits(), repeats: int = 1, say: Callable[[str], None] = lambda text: None,
+) -> Plan:  # fmt: skip
     """Return a safe sequence of motions of `joints` (default all) of these `kinds` (default all), in an order shuffled
     by `seed`.
 
@@ -157,12 +151,7 @@ def plan(
         parts += [source.command, rest]
         segments.append(
             Segment(
-                source.kind,
-                source.joints,
-                source.command,
-                source.scale,
-                at * dt,
-                (at + len(source.command)) * dt,
+                source.kind, source.joints, source.command, source.scale, at * dt, (at + len(source.command)) * dt,
                 first.get(index),
             )
         )
@@ -225,26 +214,19 @@ def write_commands(p: Plan, path: str | Path) -> None:
         width=10**6,
     )
     meta = {
-        "source": "sim",
-        "robot": m.robot,
-        "effort_is": "none",
-        "effort_sign": "+1",
+        "source": "sim", "robot": m.robot, "effort_is": "none", "effort_sign": "+1",
         "gravity": " ".join(f"{g:g}" for g in m.spec.option.gravity),
         "notes": "commands to send, not a measurement; kind, joints, start, end: " + notes.strip(),
-    }
+    }  # fmt: skip
     with Writer(path, m.joints, meta, start_ns=1_000_000_000) as w:
         for t, row in zip(p.t, p.value, strict=True):
             w.add_command(float(t), row)
 
 
 def next_recording(
-    path: str | Path,
-    m: Mechanism,
-    joints: Sequence[str] | None = None,
-    kinds: Sequence[str] | None = None,
-    seed: int = 0,
-    limits: Limits = Limits(),
-) -> Plan:
+    path: str | Path, m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str] | None = None,
+    seed: int = 0, limits: Limits = Limits(),
+) -> Plan:  # fmt: skip
     """Return the recording that a diagnosis asks for: a safe plan of these joints and kinds of motion, written as
     `path`."""
     made = plan(m, joints, kinds, seed, limits=limits)
@@ -266,10 +248,7 @@ def summary(p: Plan) -> dict:
         },
         "segments": [
             {
-                "kind": s.kind,
-                "joints": list(s.joints),
-                "start": round(s.start, 3),
-                "end": round(s.end, 3),
+                "kind": s.kind, "joints": list(s.joints), "start": round(s.start, 3), "end": round(s.end, 3),
                 "scale": round(s.scale, 3),
             }
             | ({} if s.repeats is None else {"repeats": s.repeats})
@@ -295,12 +274,9 @@ def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Li
         if kind not in KINDS:
             raise UserError(f"kinds={kind}: must be among {', '.join(KINDS)}")
     for name, low, high in (
-        ("speed", 0.01, 1.0),
-        ("torque", 0.01, 1.0),
-        ("margin", 0.0, 0.4),
-        ("clearance", 0.0, 0.05),
+        ("speed", 0.01, 1.0), ("torque", 0.01, 1.0), ("margin", 0.0, 0.4), ("clearance", 0.0, 0.05),
         ("current", 1e-3, 1e3),
-    ):
+    ):  # fmt: skip
         if getattr(limits, name) is None:
             continue
         if not low <= getattr(limits, name) <= high:
@@ -336,16 +312,9 @@ def _free(
 
 
 def _motion(
-    m: Mechanism,
-    kind: str,
-    group: tuple[str, ...],
-    free: dict[str, tuple[float, float]],
-    home: np.ndarray,
-    limits: Limits,
-    check: safety.ContactCheck,
-    dt: float,
-    seed: int,
-) -> tuple[Segment | None, str]:
+    m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tuple[float, float]], home: np.ndarray,
+    limits: Limits, check: safety.ContactCheck, dt: float, seed: int,
+) -> tuple[Segment | None, str]:  # fmt: skip
     """Return the largest safe version of a motion, or None and why there is none."""
     scale, why = 1.0, ""
     for _ in range(TRIES):
@@ -366,16 +335,9 @@ def _motion(
 
 
 def _command(
-    m: Mechanism,
-    kind: str,
-    group: tuple[str, ...],
-    free: dict[str, tuple[float, float]],
-    home: np.ndarray,
-    limits: Limits,
-    dt: float,
-    seed: int,
-    scale: float,
-) -> np.ndarray | None:
+    m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tuple[float, float]], home: np.ndarray,
+    limits: Limits, dt: float, seed: int, scale: float,
+) -> np.ndarray | None:  # fmt: skip
     """Return targets [T, J]: from home to each joint's centre, the motion, and back."""
     kp, stall, allowed = m.column("kp"), m.column("torque_limit"), limits.torques(m)
     rng = np.random.default_rng(seed)

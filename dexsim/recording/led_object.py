@@ -98,13 +98,9 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     body.add_freejoint(name=JOINT)
     if not about or about["shape"] not in library():
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[MARKER, 0, 0],
-            contype=0,
-            conaffinity=0,
-            rgba=[0.9, 0.6, 0.1, 0.8],
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8],
             mass=0.01,
-        )
+        )  # fmt: skip
         return "marked"
     shape, size = library()[about["shape"]], np.array(about["size"], float)
     common: dict[str, Any] = dict(

@@ -102,12 +102,9 @@ def of_hand(
 
 
 def mechanism(
-    model: str | Path | None = None,
-    servo: str | Path | dict | None = None,
-    joints: Sequence[str] | None = None,
-    gravity: Sequence[float] | np.ndarray | None = None,
-    hand: Hand | None = None,
-) -> Mechanism:
+    model: str | Path | None = None, servo: str | Path | dict | None = None, joints: Sequence[str] | None = None,
+    gravity: Sequence[float] | np.ndarray | None = None, hand: Hand | None = None,
+) -> Mechanism:  # fmt: skip
     """Return the mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a
     hand (its hand.yaml names servo and joints); by default `hand`, or the xHand, and its own.
 
@@ -266,22 +263,11 @@ class Run:
 
 
 def drive(
-    m: Mechanism,
-    commands: Series,
-    columns: Sequence[str],
-    duration: float,
-    initial: np.ndarray | None = None,
-    timestep: float = 0.002,
-    enabled: Series | None = None,
-    frame_s: float = 0.02,
-    pairs: Sequence[ContactPair] = (),
-    follow: tuple[str, Series] | None = None,
-    velocity: np.ndarray | None = None,
-    target: np.ndarray | None = None,
-    columns_of: Mapping[str, Series] | None = None,
-    led: Led | None = None,
-    setpoint: np.ndarray | None = None,
-) -> Run:
+    m: Mechanism, commands: Series, columns: Sequence[str], duration: float, initial: np.ndarray | None = None,
+    timestep: float = 0.002, enabled: Series | None = None, frame_s: float = 0.02, pairs: Sequence[ContactPair] = (),
+    follow: tuple[str, Series] | None = None, velocity: np.ndarray | None = None, target: np.ndarray | None = None,
+    columns_of: Mapping[str, Series] | None = None, led: Led | None = None, setpoint: np.ndarray | None = None,
+) -> Run:  # fmt: skip
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
     commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]:
@@ -386,13 +372,9 @@ def drive(
         engine.step(min(every, steps - first), before_each)
         forces.append(engine.t.pair_normal[0].numpy().copy())
     return Run(
-        np.arange(steps) * timestep,
-        **out,
-        qpos=np.array(frames),
-        frame_s=every * timestep,
-        model=engine.mjm,
+        np.arange(steps) * timestep, **out, qpos=np.array(frames), frame_s=every * timestep, model=engine.mjm,
         pair_normal=np.array(forces).reshape(len(frames), len(pairs)),
-    )
+    )  # fmt: skip
 
 
 def recorded(
@@ -406,41 +388,25 @@ def recorded(
     value[:, [m.joints.index(c) for c in columns]] = commands.value
     gravity = " ".join(f"{g:g}" for g in m.spec.option.gravity)
     meta = {
-        "schema": "1",
-        "source": "sim",
-        "robot": m.robot,
-        "joint_names": ",".join(m.joints),
-        "effort_is": "torque_Nm",
-        "effort_sign": "+1",
-        "gravity": gravity,
-        "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False),
-    }
+        "schema": "1", "source": "sim", "robot": m.robot, "joint_names": ",".join(m.joints), "effort_is": "torque_Nm",
+        "effort_sign": "+1", "gravity": gravity, "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False),
+    }  # fmt: skip
     series = lambda x, topic: Series(t, x[::every], topic, t.copy())  # noqa: E731
     sensed = () if m.hand is None else m.hand.sensed
     frames = np.arange(len(run.qpos)) * run.frame_s
     angles = [np.interp(t - run.t[0], frames, run.qpos[:, run.model.joint(j).qposadr[0]]) for j in sensed]
     out = Recording(
-        Path("simulated.mcap"),
-        DEFAULTS | meta,
-        m.joints,
-        Series(commands.t, value, COMMANDS, commands.t.copy()),
+        Path("simulated.mcap"), DEFAULTS | meta, m.joints, Series(commands.t, value, COMMANDS, commands.t.copy()),
         States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)),
-        start_ns=start_ns,
-        hand=m.hand,
-    )
+        start_ns=start_ns, hand=m.hand,
+    )  # fmt: skip
     return out.with_followers(sensed, np.stack(angles, 1) if sensed else np.zeros((len(t), 0)))
 
 
 def replay(
-    recording: Recording,
-    m: Mechanism,
-    timestep: float = STEP,
-    pairs: Sequence[ContactPair] = (),
-    follow: str | None = None,
-    hold: str = "recorded",
-    start: float = 0.0,
-    end: float | None = None,
-) -> Run:
+    recording: Recording, m: Mechanism, timestep: float = STEP, pairs: Sequence[ContactPair] = (),
+    follow: str | None = None, hold: str = "recorded", start: float = 0.0, end: float | None = None,
+) -> Run:  # fmt: skip
     """Drive the mechanism with a recording's commands from its first position and speed at `start` s or later on, to
     `end` s (None: of the recording), as a free run without correction; supply and temperatures as they were recorded.
     The run's times are the recording's.
@@ -474,33 +440,18 @@ def replay(
     path = None if follow is None or pose is None else (follow, replace(pose, t=np.asarray(pose.t) - start))
     begins = setpoints_at(recording, m, m.table.nominal(m.joints), commands, recording.joints, start, timestep)
     run = drive(
-        m,
-        given,
-        recording.joints,
-        (last if end is None else end) - start + timestep,
-        initial,
-        timestep,
-        enabled,
-        pairs=pairs,
-        follow=path,
-        velocity=velocity,
-        target=target,
+        m, given, recording.joints, (last if end is None else end) - start + timestep, initial, timestep, enabled,
+        pairs=pairs, follow=path, velocity=velocity, target=target,
         columns_of=_recorded_columns(recording, m, place, start),
-        led=Led({j: paths[j] for j in held}) if held else None,
-        setpoint=begins,
-    )
+        led=Led({j: paths[j] for j in held}) if held else None, setpoint=begins,
+    )  # fmt: skip
     return replace(run, t=run.t + start)
 
 
 def setpoints_at(
-    recording: Recording,
-    m: Mechanism,
-    rows: np.ndarray,
-    commands: Series,
-    columns: Sequence[str],
-    start: float,
+    recording: Recording, m: Mechanism, rows: np.ndarray, commands: Series, columns: Sequence[str], start: float,
     dt: float,
-) -> np.ndarray | None:
+) -> np.ndarray | None:  # fmt: skip
     """Return setpoint and its speed [J, 2] of a mechanism's joints with servo columns `rows` [J, C] at `start` s in a
     recording, after its commands [K, len(columns)] since its begin; None where no profile limits any, NaN as of
     `setpoint.setpoints`."""

@@ -66,10 +66,7 @@ def collect(
             if stated.get(key, text) != text:
                 findings.append(
                     Finding(
-                        "metadata_override",
-                        "",
-                        NAN,
-                        1,
+                        "metadata_override", "", NAN, 1,
                         f"{key}: '{brief(stated[key])}' as recorded, '{brief(text)}' by {source}; the latter is used",
                         "info",
                     )
@@ -99,11 +96,7 @@ def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> lis
         default(key, value, "warning" if important else "info")
     return [
         Finding(
-            "missing_metadata",
-            "",
-            NAN,
-            1,
-            f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)",
+            "missing_metadata", "", NAN, 1, f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)",
             severity,
         )
         for key, value, severity in missing

@@ -39,14 +39,10 @@ _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7
 
 
 def read(
-    path: str | Path,
-    remap: Mapping[str, str] | None = None,
-    meta: Mapping[str, Any] | None = None,
-    joints: Sequence[str] | None = None,
-    audit: bool = True,
-    hand: Hand | None = None,
+    path: str | Path, remap: Mapping[str, str] | None = None, meta: Mapping[str, Any] | None = None,
+    joints: Sequence[str] | None = None, audit: bool = True, hand: Hand | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
-) -> Recording:
+) -> Recording:  # fmt: skip
     """Return the recording in an MCAP file, in a folder that `ros2 bag record` wrote, in a CSV or NPZ file with named
     columns (`columns.py`), or in an episode of a data set (`readers.py`): "DATASET#3".
 
@@ -78,14 +74,9 @@ def read(
 
 
 def _read(
-    path: Path,
-    remap: dict[str, str],
-    given: dict[str, Any],
-    joints: Sequence[str] | None,
-    audit: bool,
-    hand: Hand | None,
-    limits: Mapping[str, tuple[float, float]] | None,
-) -> Recording:
+    path: Path, remap: dict[str, str], given: dict[str, Any], joints: Sequence[str] | None, audit: bool,
+    hand: Hand | None, limits: Mapping[str, tuple[float, float]] | None,
+) -> Recording:  # fmt: skip
     meta, units = split(given)
     base, part = readers.address(path)
     dataset = readers.reader_of(base) if base.exists() else None
@@ -655,12 +646,9 @@ class _Reading:
             return None
         stamp = np.array([np.nan if s is None else (s - self.start_ns) * 1e-9 for _, s, _ in messages])
         return Series(
-            t,
-            np.array([v for v, _, _ in messages]).reshape(len(t), size),
-            topic,
-            None if np.isnan(stamp).all() else stamp,
-            messages[0][2],
-        )
+            t, np.array([v for v, _, _ in messages]).reshape(len(t), size), topic,
+            None if np.isnan(stamp).all() else stamp, messages[0][2],
+        )  # fmt: skip
 
 
 class _TableReading(_Reading):

@@ -33,21 +33,15 @@ METADATA = "dexsim"  # name of the MCAP metadata record
 ATTACHMENT = "config.yaml"  # name of the attachment with the resolved config
 EFFORT_IS, TACTILE_UNIT = ("current_A", "torque_Nm", "none"), ("N", "count")
 KEYS: dict[str, str] = {
-    "schema": "version of this format: 1",
-    "source": "real or sim",
-    "robot": "e.g. xhand_right",
-    "joint_names": "comma-separated: the order of unnamed arrays",
-    "effort_is": "current_A, torque_Nm or none",
+    "schema": "version of this format: 1", "source": "real or sim", "robot": "e.g. xhand_right",
+    "joint_names": "comma-separated: the order of unnamed arrays", "effort_is": "current_A, torque_Nm or none",
     "effort_sign": "per joint: +1 where positive effort drives to positive position, -1, or 0 where the sign is lost",
-    "tactile_unit": "N or count",
-    "tactile_lsb": "newtons a count, or unknown",
+    "tactile_unit": "N or count", "tactile_lsb": "newtons a count, or unknown",
     "tactile_axis_sign": "three signs that bring the vendor's taxel axes to ours",
     "tactile_layout": "name of the taxel layout, e.g. xhand_right",
-    "gravity": "in the model's world frame, e.g. 0 0 -9.81",
-    "servo": "YAML over servo.yaml for this recording",
-    "notes": "free text",
-    "rate": "Hz: of the samples of a file without times",
-}
+    "gravity": "in the model's world frame, e.g. 0 0 -9.81", "servo": "YAML over servo.yaml for this recording",
+    "notes": "free text", "rate": "Hz: of the samples of a file without times",
+}  # fmt: skip
 """Metadata keys and what each means; all values are text."""
 DEFAULTS: dict[str, str] = {
     "schema": "1", "source": "real", "robot": "unknown", "effort_sign": "+1", "tactile_unit": "count",
@@ -63,11 +57,8 @@ UNIT_KEYS: dict[str, tuple[str, ...]] = {
 """Optional keys, the same as `units.QUANTITY` (`recording/units.py`), which knows more."""
 
 ALLOWED: dict[str, tuple[float, float]] = {
-    "gravity": (-100.0, 100.0),
-    "tactile_axis_sign": (-1.0, 1.0),
-    "tactile_lsb": (1e-9, 1e3),
-    "rate": (1e-3, 1e6),
-}
+    "gravity": (-100.0, 100.0), "tactile_axis_sign": (-1.0, 1.0), "tactile_lsb": (1e-9, 1e3), "rate": (1e-3, 1e6),
+}  # fmt: skip
 """What the numbers of a key may be: m/s2, sign, N a count. Gravity may be zero: of a joint that it does not load."""
 SEVERITIES = ("info", "warning", "error")
 
@@ -253,13 +244,10 @@ class Recording:
         commands, position = own(self.commands), own(s.position)
         assert commands is not None and position is not None
         out = replace(
-            self,
-            joints=tuple(self.joints[j] for j in columns),
-            commands=commands,
+            self, joints=tuple(self.joints[j] for j in columns), commands=commands,
             states=States(position, own(s.velocity), own(s.effort)),
-            meta=self.meta | {"effort_sign": ",".join(f"{int(self.effort_sign[j]):+d}" for j in columns)},
-            findings=[],
-        )
+            meta=self.meta | {"effort_sign": ",".join(f"{int(self.effort_sign[j]):+d}" for j in columns)}, findings=[],
+        )  # fmt: skip
         for name in ("temperature", "duty", "enabled"):
             setattr(out, name, own(getattr(self, name)))
         return out

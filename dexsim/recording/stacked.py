@@ -192,10 +192,7 @@ VECTORS = {
     "wrench": Plain(WRENCH, 6, (0, 1, 2, 3, 4, 5)),
     "pose": Plain(POSE, 7, (0, 1, 2, 6, 3, 4, 5)),
     "imu": Plain(
-        IMU_TYPE,
-        37,
-        (3, 0, 1, 2, 13, 14, 15, 25, 26, 27),
-        ((4, slice(0, 4)), (16, slice(4, 7)), (28, slice(7, 10))),
+        IMU_TYPE, 37, (3, 0, 1, 2, 13, 14, 15, 25, 26, 27), ((4, slice(0, 4)), (16, slice(4, 7)), (28, slice(7, 10))),
     ),
 }
 """What `decode.vector_reader` reads by kind; quaternions w first."""

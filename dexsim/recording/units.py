@@ -29,16 +29,12 @@ SPEEDS = {
     "rpm": TURN / 60, "m/s": 1.0, "mm/s": 1e-3, "°/s": np.pi / 180,
 }  # fmt: skip
 UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "command": LENGTHS,
-    "position": LENGTHS,
-    "velocity": SPEEDS,
+    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}, "command": LENGTHS,
+    "position": LENGTHS, "velocity": SPEEDS,
     "effort": {"a": 1.0, "ma": 1e-3, "nm": 1.0, "n.m": 1.0, "n": 1.0, "mnm": 1e-3, "mn.m": 1e-3, "ncm": 1e-2},
-    "temperature": {"degc": 1.0, "c": 1.0, "°c": 1.0},
-    "duty": {"1": 1.0, "%": 0.01, "percent": 0.01, "permille": 1e-3},
-    "enabled": {},
-    "supply_voltage": {"v": 1.0, "mv": 1e-3},
-}
+    "temperature": {"degc": 1.0, "c": 1.0, "°c": 1.0}, "duty": {"1": 1.0, "%": 0.01, "percent": 0.01, "permille": 1e-3},
+    "enabled": {}, "supply_voltage": {"v": 1.0, "mv": 1e-3},
+}  # fmt: skip
 """Plain units of each quantity, in SI."""
 RANGES = {"percent": (0.0, 100.0), "signed_percent": (-100.0, 100.0), "normalized": (-1.0, 1.0),
           "fraction": (0.0, 1.0), "registers": (0.0, 1000.0)}  # fmt: skip
@@ -119,12 +115,9 @@ class Units:
     joint, where it is known; where: names the recording in errors; modelled: the limits are of its own model."""
 
     def __init__(
-        self,
-        stated: Mapping[str, str],
-        limits: Mapping[str, tuple[float, float]] | None,
-        where: str,
+        self, stated: Mapping[str, str], limits: Mapping[str, tuple[float, float]] | None, where: str,
         modelled: bool = False,
-    ):
+    ):  # fmt: skip
         self.stated, self.limits, self.where, self.modelled = dict(stated), dict(limits or {}), where, modelled
         for key in self.stated:
             quantity = key.partition(".")[0]

@@ -89,11 +89,6 @@ def random_motion(a: float, v: float, dt: float, rng: np.random.Generator, secon
 
 
 KINDS: dict[str, Waveform] = {
-    "triangles": triangles,
-    "ladder": ladder,
-    "chirp": chirp,
-    "steps": steps,
-    "holds": holds,
-    "random": random_motion,
-}
+    "triangles": triangles, "ladder": ladder, "chirp": chirp, "steps": steps, "holds": holds, "random": random_motion,
+}  # fmt: skip
 """Name -> motion. "random" moves all joints at once, the others one joint of each finger."""

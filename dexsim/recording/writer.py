@@ -35,16 +35,10 @@ class Writer:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        joints: Sequence[str],
-        meta: Mapping[str, Any] | None = None,
-        start_ns: int | None = None,
-        config: str | None = None,
-        chunk_s: float = 1.0,
-        chunk_bytes: int = 1 << 18,
+        self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any] | None = None,
+        start_ns: int | None = None, config: str | None = None, chunk_s: float = 1.0, chunk_bytes: int = 1 << 18,
         sensed: Sequence[str] = (),
-    ):
+    ):  # fmt: skip
         self.path, self.joints, self.sensed = Path(path).expanduser(), tuple(joints), tuple(sensed)
         self.start_ns = time.time_ns() if start_ns is None else int(start_ns)
         self.meta = {"schema": "1", "joint_names": ",".join([*joints, *sensed])}
@@ -85,14 +79,9 @@ class Writer:
         self._joints(schema.COMMANDS, t, position, None, None, stamp)
 
     def add_state(
-        self,
-        t: float,
-        position: np.ndarray,
-        velocity: np.ndarray | None = None,
-        effort: np.ndarray | None = None,
-        stamp: float | None = None,
-        follower: np.ndarray | None = None,
-    ) -> None:
+        self, t: float, position: np.ndarray, velocity: np.ndarray | None = None, effort: np.ndarray | None = None,
+        stamp: float | None = None, follower: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Add measured position, velocity, effort [J] each; follower [S] rad: joints without a drive."""
         if follower is not None and self.sensed:
             none = np.full(len(self.sensed), np.nan)
@@ -153,14 +142,9 @@ class Writer:
         return self.start_ns + round(t * 1e9)
 
     def _joints(
-        self,
-        topic: str,
-        t: float,
-        position: np.ndarray,
-        velocity: np.ndarray | None,
-        effort: np.ndarray | None,
+        self, topic: str, t: float, position: np.ndarray, velocity: np.ndarray | None, effort: np.ndarray | None,
         stamp: float | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         names = self.joints if len(position) == len(self.joints) else (*self.joints, *self.sensed)
         self._message(
             topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), names, position, velocity, effort)
@@ -217,12 +201,9 @@ def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]
         rest = [None if x is None else x.value[i] for x in (s.velocity, s.effort)]
         yield t, 1, w.add_state, (t, s.position.value[i], *rest, _stamp(s.position, i))
     plain = (
-        (r.temperature, w.add_temperature),
-        (r.duty, w.add_duty),
-        (r.enabled, w.add_enabled),
-        (r.supply_voltage, w.add_supply_voltage),
-        (r.tactile, w.add_tactile),
-    )
+        (r.temperature, w.add_temperature), (r.duty, w.add_duty), (r.enabled, w.add_enabled),
+        (r.supply_voltage, w.add_supply_voltage), (r.tactile, w.add_tactile),
+    )  # fmt: skip
     for order, (series, add) in enumerate(plain, start=2):
         if series is not None:
             for i, t in enumerate(series.t):

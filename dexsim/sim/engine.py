@@ -159,13 +159,9 @@ class Engine:
         Whole numbers with their lowest and highest."""
         t = self.t
         out = {
-            "time": t.time,
-            "qpos": t.qpos,
-            "qvel": t.qvel,
-            "qacc_warmstart": self._warmstart,
-            "qfrc_applied": t.qfrc_applied,
-            "xfrc_applied": t.xfrc_applied,
-        }
+            "time": t.time, "qpos": t.qpos, "qvel": t.qvel, "qacc_warmstart": self._warmstart,
+            "qfrc_applied": t.qfrc_applied, "xfrc_applied": t.xfrc_applied,
+        }  # fmt: skip
         if self.wp.outside is not None:
             out["outside"] = t.outside
         for name in dict.fromkeys((*self.field_names, *self._derived)):

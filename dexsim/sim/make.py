@@ -46,19 +46,10 @@ def newton_iterations(sim: Mapping[str, Any], engine: str) -> int:
 
 
 def make_engine(
-    spec: mujoco.MjSpec,
-    worlds: int,
-    device: str = "cpu",
-    engine: str = "auto",
-    fields: Sequence[str] = (),
-    pairs: Sequence[ContactPair] = (),
-    deterministic: bool = False,
-    nconmax: int = 40,
-    njmax: int = 160,
-    threads: int = 0,
-    collision: str = "auto",
-    solver: str = "auto",
-) -> Engine:
+    spec: mujoco.MjSpec, worlds: int, device: str = "cpu", engine: str = "auto", fields: Sequence[str] = (),
+    pairs: Sequence[ContactPair] = (), deterministic: bool = False, nconmax: int = 40, njmax: int = 160,
+    threads: int = 0, collision: str = "auto", solver: str = "auto",
+) -> Engine:  # fmt: skip
     """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a
     CPU).
 

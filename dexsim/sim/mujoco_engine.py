@@ -41,14 +41,9 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
             if (spec.geom(name) if kind == "geom" else spec.body(name)) is None:
                 raise UserError(f"contact pair: no {kind} named '{name}' in the model")
         spec.add_sensor(
-            name=f"pair_{p.name}",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=kinds[p.first[0]],
-            objname=p.first[1],
-            reftype=kinds[p.second[0]],
-            refname=p.second[1],
-            intprm=[data, 0, slots],
-        )
+            name=f"pair_{p.name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds[p.first[0]], objname=p.first[1],
+            reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, slots],
+        )  # fmt: skip
     return spec.compile()
 
 
@@ -59,14 +54,9 @@ class MujocoEngine(Engine):
     _derived = _DERIVED
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        worlds: int,
-        fields: Sequence[str],
-        pairs: Sequence[ContactPair],
-        threads: int,
+        self, model: mujoco.MjModel, worlds: int, fields: Sequence[str], pairs: Sequence[ContactPair], threads: int,
         real: type = wp.float64,
-    ):
+    ):  # fmt: skip
         super().__init__(model, worlds, "cpu", fields, pairs)
         self.real = real
         self._launch = Launches("cpu")
@@ -173,12 +163,9 @@ class MujocoEngine(Engine):
         level = self._fields.get("dof_frictionloss", self.mjm.dof_frictionloss[None].copy())
         self._before = np.zeros(self.t.qvel.shape)
         arrays = [
-            kernels.friction_rows(self.mjm),
-            level,
-            self._fields["dof_invweight0"],
-            self._before,
+            kernels.friction_rows(self.mjm), level, self._fields["dof_invweight0"], self._before,
             *map(self.batch.bind, read),
-        ]
+        ]  # fmt: skip
         self._outside_args = [*map(view, arrays), self.wp.qfrc_applied, self.wp.outside]
 
     def _one_step(self) -> None:
@@ -226,16 +213,9 @@ class MujocoEngine(Engine):
         if not self.pairs:
             return
         args = [
-            *self._contact_args,
-            self._slots,
-            _LOST,
-            self.wp.flags,
-            FLAG_NAN,
-            self.wp.pair_normal,
-            self.wp.pair_force,
-            self._overflow,
-            self._most,
-        ]
+            *self._contact_args, self._slots, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force,
+            self._overflow, self._most,
+        ]  # fmt: skip
         self._launch("contacts", kernels.read_contacts, (self.n, len(self.pairs)), args)
         sound = self.t.flags.numpy() == 0
         self._peak[0] = max(self._peak[0], self._ncon.reshape(-1).max(initial=0, where=sound))

@@ -30,20 +30,9 @@ _IPOS = [-2e-3, 1e-3, 1e-3]
 _IQUAT = [0.9998, 0.0, 0.02, 0.0]
 
 OBJECT_FIELDS = (
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_iquat",
-    "geom_pos",
-    "geom_quat",
-    "geom_size",
-    "geom_dataid",
-    "geom_rbound",
-    "geom_aabb",
-    "geom_friction",
-    "geom_solref",
-    "opt.gravity",
-)
+    "body_mass", "body_inertia", "body_ipos", "body_iquat", "geom_pos", "geom_quat", "geom_size", "geom_dataid",
+    "geom_rbound", "geom_aabb", "geom_friction", "geom_solref", "opt.gravity",
+)  # fmt: skip
 """Model fields that vary by world in this scene."""
 
 
@@ -103,15 +92,9 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
     body.mass, body.ipos, body.iquat = 0.1, _IPOS, _IQUAT
     body.inertia = [4e-5, 4.1e-5, 4.2e-5]
     common = dict(
-        pos=_OFFSET,
-        quat=_TILT,
-        contype=1,
-        conaffinity=2,
-        condim=4,
-        group=3,
-        rgba=[0.85, 0.45, 0.2, 1.0],
+        pos=_OFFSET, quat=_TILT, contype=1, conaffinity=2, condim=4, group=3, rgba=[0.85, 0.45, 0.2, 1.0],
         friction=[1e-3, 1e-4, 1e-4],
-    )
+    )  # fmt: skip
     g = mujoco.mjtGeom
     body.add_geom(name=SLOTS[0], type=g.mjGEOM_BOX, size=[0.08, 0.08, 0.08], **common)
     body.add_geom(name=SLOTS[1], type=g.mjGEOM_SPHERE, size=[0.08, 0, 0], **common)
@@ -140,13 +123,9 @@ def _variant_table(spec: mujoco.MjSpec, variants: list[Variant], slots: tuple[st
             for k in range(len(v.shape.hulls)):
                 name = _mesh_name(v.shape, v.scale, k)
                 probe_body.add_geom(
-                    name=f"probe_{name}",
-                    type=mujoco.mjtGeom.mjGEOM_MESH,
-                    meshname=name,
-                    mass=0,
-                    contype=0,
+                    name=f"probe_{name}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=0, contype=0,
                     conaffinity=0,
-                )
+                )  # fmt: skip
     m = probe.compile()
     dataid = np.full((V, S), m.geom(SLOTS[3]).dataid[0], dtype=np.int32)
     dataid[:, :3] = -1

@@ -59,10 +59,7 @@ def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
     chosen = [
         (owner, name, getattr(owner, name))
         for owner, name in (
-            (wp, "launch"),
-            (context, "launch"),
-            (wp, "capture_while"),
-            (wp, "get_suggested_block_size"),
+            (wp, "launch"), (context, "launch"), (wp, "capture_while"), (wp, "get_suggested_block_size"),
         )
     ]
     wp.launch = context.launch = launch

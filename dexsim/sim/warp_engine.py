@@ -43,18 +43,9 @@ class WarpEngine(Engine):
     _derived = _DERIVED
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        worlds: int,
-        device: str,
-        fields: Sequence[str],
-        pairs: Sequence[ContactPair],
-        deterministic: bool,
-        nconmax: int,
-        njmax: int,
-        collision: str,
-        solver: str = "auto",
-    ):
+        self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair],
+        deterministic: bool, nconmax: int, njmax: int, collision: str, solver: str = "auto",
+    ):  # fmt: skip
         super().__init__(model, worlds, device, fields, pairs)
         self.real = wp.float32
         why_not = narrow_phase.unsupported(model)

@@ -81,16 +81,9 @@ class LiveView:
     """
 
     def __init__(
-        self,
-        env: Any,
-        policy: Policy,
-        name: str,
-        choices: list[str],
-        load: Callable[[str], Policy],
-        host: str,
-        port: int,
-        run: Followed | None = None,
-    ) -> None:
+        self, env: Any, policy: Policy, name: str, choices: list[str], load: Callable[[str], Policy], host: str,
+        port: int, run: Followed | None = None,
+    ) -> None:  # fmt: skip
         viser: Any = importlib.import_module("viser")  # slow to load
 
         live_gate.check_free(host, port)
@@ -157,25 +150,16 @@ class LiveView:
             buttons = gui.add_button_group("", tuple(BUTTONS))
             speed = gui.add_button_group("speed", tuple(SPEEDS))
             world = gui.add_slider(
-                "world",
-                min=0,
-                max=max(self.env.num_envs - 1, 1),
-                step=1,
-                initial_value=0,
+                "world", min=0, max=max(self.env.num_envs - 1, 1), step=1, initial_value=0,
                 disabled=self.env.num_envs == 1,
-            )
+            )  # fmt: skip
             policy = gui.add_dropdown("policy", choices, initial_value=self.name)
             at = gui.add_slider("checkpoint", min=0, max=1, step=1, initial_value=1, visible=self._run is not None)
             own = gui.add_checkbox("own command", initial_value=False, visible=hasattr(self.env, "fixed_command"))
             command = gui.add_slider(
-                "command",
-                min=0.0,
-                max=1.0,
-                step=0.05,
-                initial_value=0.5,
-                disabled=True,
+                "command", min=0.0, max=1.0, step=0.05, initial_value=0.5, disabled=True,
                 visible=hasattr(self.env, "fixed_command"),
-            )
+            )  # fmt: skip
         self._facts = gui.add_html("")
         with gui.add_folder("Touch"):
             feels = bool(self.env.pads)
@@ -195,13 +179,9 @@ class LiveView:
             {
                 h._impl.uuid: check
                 for h, check in (
-                    (pause, live_gate.truth),
-                    (own, live_gate.truth),
-                    (buttons, live_gate.one_of(BUTTONS)),
-                    (speed, live_gate.one_of(SPEEDS)),
-                    (world, live_gate.number(0, max(self.env.num_envs - 1, 1))),
-                    (policy, live_gate.one_of(choices)),
-                    (at, live_gate.number(0, MOST_CHECKPOINTS)),
+                    (pause, live_gate.truth), (own, live_gate.truth), (buttons, live_gate.one_of(BUTTONS)),
+                    (speed, live_gate.one_of(SPEEDS)), (world, live_gate.number(0, max(self.env.num_envs - 1, 1))),
+                    (policy, live_gate.one_of(choices)), (at, live_gate.number(0, MOST_CHECKPOINTS)),
                     (command, live_gate.number(0, 1)),
                 )
             },
@@ -263,13 +243,9 @@ class LiveView:
                 self._nodes[body] = scene.add_frame(f"/bodies/{body}", show_axes=False)
                 for k, mesh in enumerate(meshes.get(body, []) if body != thing else []):
                     scene.add_mesh_simple(
-                        f"/bodies/{body}/{k}",
-                        mesh.vertices.astype(np.float32),
-                        mesh.faces,
-                        color=_lighter(mesh.rgba),
-                        opacity=None if mesh.rgba[3] >= 1 else mesh.rgba[3],
-                        flat_shading=True,
-                    )
+                        f"/bodies/{body}/{k}", mesh.vertices.astype(np.float32), mesh.faces, color=_lighter(mesh.rgba),
+                        opacity=None if mesh.rgba[3] >= 1 else mesh.rgba[3], flat_shading=True,
+                    )  # fmt: skip
             layout = self.env.touch.layout
             self._points = []
             for f, name in enumerate(layout.bodies if self.env.pads else ()):
@@ -278,21 +254,15 @@ class LiveView:
                     scene.add_point_cloud(
                         f"/bodies/{model.body(name).id}/taxels",
                         (layout.point[f, :count] + LIFT * layout.normal[f, :count]).astype(np.float32),
-                        np.full((count, 3), 210, np.uint8),
-                        point_size=0.0011,
-                        point_shape="circle",
-                        precision="float32",
-                        point_shading="flat",
+                        np.full((count, 3), 210, np.uint8), point_size=0.0011, point_shape="circle",
+                        precision="float32", point_shading="flat",
                     )
                 )
         for old in self._object:
             old.remove()
         self._object = [
             scene.add_mesh_simple(
-                f"/bodies/{thing}/object{k}",
-                m.vertices.astype(np.float32),
-                m.faces,
-                color=_lighter(m.rgba),
+                f"/bodies/{thing}/object{k}", m.vertices.astype(np.float32), m.faces, color=_lighter(m.rgba),
                 flat_shading=True,
             )
             for k, m in enumerate(meshes.get(thing, []))

@@ -29,15 +29,10 @@ def room(height: int, text: bool, bars: bool) -> tuple[int, int]:
 
 
 def annotate(
-    frame: np.ndarray,
-    text: str = "",
-    force: Sequence[float] | None = None,
-    command: float | Sequence[float] | None = None,
-    names: Sequence[str] = (),
-    full: float = 10.0,
-    height: int | None = None,
-    pads: Sequence[np.ndarray] | None = None,
-) -> np.ndarray:
+    frame: np.ndarray, text: str = "", force: Sequence[float] | None = None,
+    command: float | Sequence[float] | None = None, names: Sequence[str] = (), full: float = 10.0,
+    height: int | None = None, pads: Sequence[np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return a frame [H, W, 3] uint8 with a title above it and one bar for each finger below it; nothing is covered.
 
     Args:
@@ -67,15 +62,9 @@ def annotate(
 
 
 def _bars(
-    draw: ImageDraw.ImageDraw,
-    force: np.ndarray,
-    command: float | Sequence[float] | None,
-    names: Sequence[str],
-    full: float,
-    box: tuple[int, int, int, int],
-    small: int,
-    begin: float = 0.1,
-) -> None:
+    draw: ImageDraw.ImageDraw, force: np.ndarray, command: float | Sequence[float] | None, names: Sequence[str],
+    full: float, box: tuple[int, int, int, int], small: int, begin: float = 0.1,
+) -> None:  # fmt: skip
     """Draw bars into box (left, top, width, height), in pixels; each begins at this share of its column."""
     x, top, width, height = box
     targets = None if command is None else np.broadcast_to(np.asarray(command, float), force.shape)

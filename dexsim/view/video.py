@@ -73,15 +73,10 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def render(
-    clips: Sequence[Clip],
-    path: Path,
-    dt: float,
-    names: Sequence[str] = (),
-    full: float = 10.0,
-    size: tuple[int, int] = (480, 368),
-    camera: dict[str, Any] | None = None,
+    clips: Sequence[Clip], path: Path, dt: float, names: Sequence[str] = (), full: float = 10.0,
+    size: tuple[int, int] = (480, 368), camera: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> str:
+) -> str:  # fmt: skip
     """Write an mp4 of the clips side by side, in real time; returns the backend used.
 
     Args:

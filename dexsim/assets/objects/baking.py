@@ -50,16 +50,9 @@ def shape_from_hulls(name: str, hulls: list[np.ndarray], held_out: bool = False,
     volume, _, inertia = mass_properties(union_boundary(hulls))
     grid = bake_grid(hulls, spacing)
     return Shape(
-        name=name,
-        kind="grid",
-        held_out=held_out,
-        hulls=hulls,
-        grid=grid,
-        volume=volume,
-        inertia_unit=inertia,
-        extents=np.ptp(np.concatenate(hulls), axis=0),
-        grid_error=grid_error(hulls, grid),
-    )
+        name=name, kind="grid", held_out=held_out, hulls=hulls, grid=grid, volume=volume, inertia_unit=inertia,
+        extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=grid_error(hulls, grid),
+    )  # fmt: skip
 
 
 def pack(shape: Shape) -> dict[str, np.ndarray]:
@@ -78,17 +71,12 @@ def pack(shape: Shape) -> dict[str, np.ndarray]:
     # The high and the low bytes apart compress better than in turns.
     split = np.ascontiguousarray(code).view(np.uint8).reshape(*code.shape, 2)
     return {
-        "held_out": np.array(shape.held_out),
-        "hulls": np.concatenate(shape.hulls).astype(np.float32),
-        "hull_sizes": np.array([len(h) for h in shape.hulls], np.int32),
-        "volume": np.array(shape.volume),
-        "inertia_unit": shape.inertia_unit,
-        "origin": shape.grid.origin,
-        "spacing": np.array(shape.grid.spacing),
-        "grid_error": np.array(shape.grid_error),
-        "data_low": np.ascontiguousarray(split[..., 0]),
+        "held_out": np.array(shape.held_out), "hulls": np.concatenate(shape.hulls).astype(np.float32),
+        "hull_sizes": np.array([len(h) for h in shape.hulls], np.int32), "volume": np.array(shape.volume),
+        "inertia_unit": shape.inertia_unit, "origin": shape.grid.origin, "spacing": np.array(shape.grid.spacing),
+        "grid_error": np.array(shape.grid_error), "data_low": np.ascontiguousarray(split[..., 0]),
         "data_high": np.ascontiguousarray(split[..., 1]),
-    }
+    }  # fmt: skip
 
 
 def unpack(name: str, stored: dict[str, np.ndarray]) -> Shape:
@@ -100,13 +88,7 @@ def unpack(name: str, stored: dict[str, np.ndarray]) -> Shape:
     data = (code.astype(float) * UNIT).astype(np.float32)
     mean, largest = (float(e) for e in stored["grid_error"])
     return Shape(
-        name=name,
-        kind="grid",
-        held_out=bool(stored["held_out"]),
-        hulls=hulls,
-        grid=Grid(stored["origin"], float(stored["spacing"]), data),
-        volume=float(stored["volume"]),
-        inertia_unit=stored["inertia_unit"],
-        extents=np.ptp(np.concatenate(hulls), axis=0),
-        grid_error=(mean, largest),
-    )
+        name=name, kind="grid", held_out=bool(stored["held_out"]), hulls=hulls,
+        grid=Grid(stored["origin"], float(stored["spacing"]), data), volume=float(stored["volume"]),
+        inertia_unit=stored["inertia_unit"], extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=(mean, largest),
+    )  # fmt: skip

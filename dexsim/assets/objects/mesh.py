@@ -194,14 +194,9 @@ def _made(paths: Sequence[Path], surfaces: Sequence[Any], scale: float, parts: i
         spacing = (np.ptp(np.concatenate(hulls), axis=0).max() + 2 * MARGIN) / _CELLS
         shape = shape_from_hulls(paths[0].stem, hulls, spacing=spacing)
     return replace(
-        shape,
-        volume=volume,
-        inertia_unit=axes.T @ inertia @ axes,
-        notes=tuple(notes),
-        file_centre=centre,
-        file_axes=axes,
-        file_scale=scale,
-    )
+        shape, volume=volume, inertia_unit=axes.T @ inertia @ axes, notes=tuple(notes), file_centre=centre,
+        file_axes=axes, file_scale=scale,
+    )  # fmt: skip
 
 
 def _shape_of_parts(name: str, hulls: list[np.ndarray]) -> Shape:
@@ -212,13 +207,6 @@ def _shape_of_parts(name: str, hulls: list[np.ndarray]) -> Shape:
     spacing = (np.ptp(np.concatenate(hulls), axis=0).max() + 2 * MARGIN) / _FINE_CELLS
     grid = parts.grid(hulls, spacing)
     return Shape(
-        name=name,
-        kind="grid",
-        held_out=False,
-        hulls=hulls,
-        grid=grid,
-        volume=0.0,
-        inertia_unit=np.eye(3),
-        extents=np.ptp(np.concatenate(hulls), axis=0),
-        grid_error=parts.grid_error(hulls, grid),
-    )
+        name=name, kind="grid", held_out=False, hulls=hulls, grid=grid, volume=0.0, inertia_unit=np.eye(3),
+        extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=parts.grid_error(hulls, grid),
+    )  # fmt: skip

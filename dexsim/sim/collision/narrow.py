@@ -113,20 +113,14 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
     pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
     n.deep_number.zero_()
     wp.launch(
-        kernels.apart,
-        dim=d.naconmax,
-        inputs=[pairs, n._mat],
-        outputs=[n._out, n._deep, n._enclosing, n.deep_number],
+        kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number],
         block_dim=n.block_dim,
-    )
+    )  # fmt: skip
     threads = min(d.naconmax, 1 << 15)
     wp.launch(
-        kernels.overlapping,
-        dim=threads,
-        inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads],
-        outputs=[n._out],
-        block_dim=32,
-    )
+        kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads],
+        outputs=[n._out], block_dim=32,
+    )  # fmt: skip
     if n.cylinders:
         wp.launch(kernels.beside_cylinder, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out], block_dim=32)
 
