@@ -38,6 +38,8 @@ SETTINGS = {
         "task.observe.orientation=quaternion",
         "task.observe.force_weighted=false",
         "task.observe.last_action=step",
+        "agent=ppo_lstm",  # a network with memory, which must carry on as it does in play
+        "agent.actor.rnn_hidden_dim=16",
     ),
 }
 
@@ -96,13 +98,11 @@ def episode(made, tmp_path_factory):
     with torch.no_grad():
         for _ in range(40):
             obs, before = env.get_observations(), env.target[1].numpy().copy()
-            action = 0.5 * policy(obs)  # gently: the cube stays for a while
-            env.step(action)
+            seen, action = obs["actor"][1].numpy().copy(), policy(obs).clone()
+            env.step(0.5 * action)  # gently: the cube stays for a while
             if bool(env.done[1]):
                 break
-            rows.append(
-                (obs["actor"][1].numpy().copy(), policy(obs)[1].numpy().copy(), before, env.target[1].numpy().copy())
-            )
+            rows.append((seen, action[1].numpy(), before, env.target[1].numpy().copy()))
     path = tap.save(tmp_path_factory.mktemp("mcap") / "episode.mcap")[0]
     return read(path, audit=False), *(np.stack(x) for x in zip(*rows, strict=True))
 
