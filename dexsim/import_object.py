@@ -75,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
             (stage / f"part_{k}.obj").write_text(hull_obj(points), encoding="ascii")
         if given["picture"] == "true":
             draw(shape, path, stage / "picture.png")
-    print(f"{out}: dexsim train task=grasp objects='[{out}]'")
+    print(f"{out}: dexsim train objects='[{out}]'")
     return 0
 
 

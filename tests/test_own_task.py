@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import re
@@ -153,17 +154,24 @@ def test_installed_packages_bring_tasks(folder, monkeypatch, capsys):
 
 
 def test_task_names_stand_in_their_own_files_only():
-    """Nothing but a task's own file, its settings and the default knows it by name."""
-    names = "|".join(registry.built_in())
-    literal = re.compile(rf"""["']({names})["']""")
-    own = re.compile(r"(tasks|deploy)/(grasp|rotate)\w*\.py$")
+    """Nothing but a task's own file, its settings and the default knows it by name: no text of the program is one, or
+    holds `task=NAME`. Docstrings may, and help texts (module constants), whose examples are typed by users."""
+    literal = re.compile(rf"^(task[=/])?({'|'.join(registry.built_in())})$|\btask=({'|'.join(registry.built_in())})\b")
+    own = re.compile(r"(tasks|deploy)/(of_)?(grasp|rotate)\w*\.py$")
     found = []
     for path in sorted((ROOT / "dexsim").rglob("*.py")):
         if own.search(path.as_posix()):
             continue
-        for k, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if literal.search(line) and not re.search(ALLOWED.get(path.name, "$^"), line):
-                found.append(f"{path.relative_to(ROOT)}:{k}: {line.strip()}")
+        code = path.read_text(encoding="utf-8")
+        tree, lines = ast.parse(code), code.splitlines()
+        texts = [x for x in ast.walk(tree) if isinstance(x, ast.Expr)]
+        texts += [x for x in tree.body if isinstance(x, ast.Assign) and isinstance(x.value, ast.Constant)]
+        free = {id(x.value) for x in texts}
+        for x in ast.walk(tree):
+            text = x.value if isinstance(x, ast.Constant) and id(x) not in free else None
+            if isinstance(text, str) and literal.search(text):
+                if not re.search(ALLOWED.get(path.name, "$^"), line := lines[x.lineno - 1]):
+                    found.append(f"{path.relative_to(ROOT)}:{x.lineno}: {line.strip()}")
     assert not found, "\n".join(found)
 
 

@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
         f"\n{out}/hand.yaml holds {len(result.hand['guessed'])} guesses. Look at {out}/picture.png, correct hand.yaml,"
         " run this again."
     )
-    print(f"Then: dexsim import-hand check {out}, and dexsim train task=grasp hand={out}")
+    print(f"Then: dexsim import-hand check {out}, and dexsim train hand={out}")
     return 0
 
 

@@ -50,7 +50,7 @@ def search(folder: Path, count: int, seed: int = 0) -> Region:
     with tempfile.TemporaryDirectory() as place:
         hand = Path(place) / "hand"
         shutil.copytree(folder, hand)  # any characters may be in the folder's own name, which the settings parse
-        begun = start.for_train(["task=grasp", "device=cpu", f"worlds={WORLDS}", f"hand={hand}"], CONFIGS)
+        begun = start.for_train(["device=cpu", f"worlds={WORLDS}", f"hand={hand}"], CONFIGS)
         assert begun is not None  # only --help has nothing to begin
         env = GraspEnv(begun.cfg, WORLDS, "cpu", seed, "mujoco")
     half, area = WORLDS * math.ceil(count / 2 / WORLDS), env.unit * AREA

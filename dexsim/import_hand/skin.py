@@ -344,7 +344,7 @@ def main(argv: list[str]) -> int:
     if given.get("picture", "true") == "true":
         show(done, out, print)
     at = out.relative_to(Path.cwd()) if out.is_relative_to(Path.cwd()) else out
-    print(f"{at}/{FILE}: {len(done.pads)} pads; look at {at}/hand_skin.png. dexsim train task=grasp hand={at}")
+    print(f"{at}/{FILE}: {len(done.pads)} pads; look at {at}/hand_skin.png. dexsim train hand={at}")
     return 0
 
 

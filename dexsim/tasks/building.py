@@ -322,6 +322,7 @@ class Built(VecEnv):
         # worlds of which an observation was not finite: of any group, then of each
         self._blind = torch.zeros(1 + MOST_GROUPS, n, dtype=torch.bool, device=dev)
         self.last: dict[str, torch.Tensor] = {}  # figures [N] of each world's last ended episode
+        self.figures: dict[str, torch.Tensor] = {}  # the same, of the present one
         self._wrong = None  # world-steps that were not finite since the last `check`, by source
         self._sources = ()
         self._steps_since = 0

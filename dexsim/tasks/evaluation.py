@@ -85,7 +85,7 @@ def _play(
     end = torch.full((n,), -1, dtype=torch.long, device=dev)
     figures = {name: torch.zeros(n, device=dev) for name in env.last}
     films = list(range(min(SHOWN, n))) if film else []
-    models, qpos, forces = [env.drawn_model(w) for w in films], [], []
+    models, qpos, forces, texts = [env.drawn_model(w) for w in films], [], [], []
     for k in range(env.max_episode_length):
         obs, reward, done, extras = env.step(policy(obs))
         total += reward * alive
@@ -98,6 +98,8 @@ def _play(
         if films and k * env.dt < SHOWN_S:
             qpos.append(env.engine.t.qpos[films].double().cpu().numpy())
             forces.append(env.touch.force_clean[films][:, : env.fingers].cpu().numpy())
+            now = [(name, env.figures[name].tolist()) for name in list(figures)[:2] if name in env.figures]
+            texts.append([", ".join(f"{name} {value[w]:.3g}" for name, value in now) for w in films])
         if k % 20 == 19:
             if progress is not None:
                 at = before + min(n, episodes - before) * (k + 1) // env.max_episode_length
@@ -114,9 +116,9 @@ def _play(
     return out, {
         "model": models, "dt": env.dt, "names": env.hand.finger_names, "full": 5.0,
         "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
-        "label": [f"{', '.join(f'{name} {float(figures[name][w]):.2g}' for name in list(figures)[:2])}" for w in films],
-        "overlay": [{"force": np.stack([f[i] for f in forces[:s]])} for i, s in enumerate(stop)],
-        "camera": env.camera,
+        "overlay": [{"force": np.stack([f[i] for f in forces[:s]]), "text": [t[i] for t in texts[:s]]}
+                    for i, s in enumerate(stop)],
+        "camera": env.camera, "colours": True,
     }  # fmt: skip
 
 

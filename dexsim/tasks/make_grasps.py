@@ -208,7 +208,7 @@ def ensure(
         return
     if not os.access(file.parent, os.W_OK):
         raise UserError(
-            f"hand={hand.name}: has no held poses for task=rotate to begin with, and {file.parent} cannot be written;"
+            f"hand={hand.name}: has no held poses to begin with, and {file.parent} cannot be written;"
             f" make them with dexsim stable-grasps hand={hand.folder} out=FILE and give task.initial.poses=FILE"
         )
     report(f"no held poses of hand={hand.name} yet: looking for {count}, to be kept in {file} ...")

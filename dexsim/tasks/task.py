@@ -46,7 +46,7 @@ STATE = (
     "q", "qd", "torque", "target", "action", "last_action", "object_pose", "object_velocity", "object_joint",
     "object_speed", "tips", "tip_force", "finger_force", "self_force", "palm_force", "reward", "done", "time_out",
     "nan", "obs", "engine", "servo", "touch", "objects", "sampler", "rng", "task", "cfg", "hand", "joints", "fingers",
-    "pads", "commands", "last", "dt", "device", "num_envs", "num_actions",
+    "pads", "commands", "last", "figures", "dt", "device", "num_envs", "num_actions",
 )  # fmt: skip
 """What every environment holds by these names."""
 
@@ -164,7 +164,6 @@ class Task(HandEnv):
         self.last: dict[str, torch.Tensor] = {
             x.name: torch.zeros(n, device=dev) for x in self._terms["metric"] if not x.options["now"]
         }
-        self._figures: dict[str, torch.Tensor] = {}
         if self.scene.object is not None:
             self.set_objects()
         self.prepare_task()
@@ -519,20 +518,20 @@ class Task(HandEnv):
             value = x.method(self, **self._params("metric", x))
             if value.shape != (self.num_envs,):
                 raise UserError(f"metric {x.name}: has shape {list(value.shape)}, must be [{self.num_envs}]")
-            self._figures[x.name] = value.float()
+            self.figures[x.name] = value.float()
         return out
 
     def _judge(self, ends: dict, terms: dict) -> tuple[torch.Tensor, torch.Tensor]:
         judged = super()._judge(ends, terms)
         for name, held in self.last.items():
-            held.copy_(torch.where(self.done, torch.nan_to_num(self._figures[name]), held))
+            held.copy_(torch.where(self.done, torch.nan_to_num(self.figures[name]), held))
         return judged
 
     def figure_units(self) -> dict[str, str]:
         return {x.name: x.unit for x in self._terms["metric"] if x.name in self.last}
 
     def metrics(self) -> dict[str, torch.Tensor]:
-        return {f"task/{name}": value.mean() for name, value in (self._figures | self.last).items()}
+        return {f"task/{name}": value.mean() for name, value in (self.figures | self.last).items()}
 
     # -- observations
     # ------------------------------------------------------------------------------------------------------------

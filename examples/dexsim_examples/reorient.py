@@ -6,13 +6,13 @@ from dexsim import rotation
 from dexsim.tasks import Task, command, done, event, memory, metric, observe, reward
 from dexsim_examples import rows
 
-REACHED = 0.4  # rad
-PATIENCE = 8.0  # s of training per goal
+REACHED, PATIENCE = 0.4, 8.0  # rad; s of training per goal
 
 
 class Reorient(Task):
     """Turn a cube in the palm to any orientation, one goal after another."""
 
+    camera = {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0}
     settings = {
         "episode_s": 24.0,
         "evaluation": {"cap_s": 200.0},
@@ -68,7 +68,7 @@ class Reorient(Task):
         self.progress = self.angle - angle + self.tilt - tilt
         self.reached = (angle < REACHED) & (self.drift() < 0.06) & ~self.nan
         self.goals += self.reached
-        self.since = torch.where(self.reached, 0.0, self.since + self.dt)
+        self.since += self.dt
         renew = self.reached | ((self.since > PATIENCE) & self.learning)
         self.since = torch.where(renew, 0.0, self.since)
         self.renew("goal", renew)

@@ -201,7 +201,7 @@ def into_diagnosis(d: Diagnosis, felt: TouchResult) -> None:
 SHARED = ("object.friction", "contact.stiffness")  # a world has one for all fingertips
 
 HEAD = """\
-# What diagnose.py found of touch and contact: python train.py task=grasp tactile_file=FILE (play.py too) lays it over
+# What diagnose.py found of touch and contact: python train.py tactile_file=FILE (play.py too) lays it over
 # the tactile group and the task's ranges. value is the best guess; low to high is drawn anew in each world at each
 # episode.
 """
