@@ -208,10 +208,9 @@ def main(argv: list[str]) -> int:
         table = ServoTable.load(Path(own["in"]).expanduser())
         data = to_bam(table, own["joint"], number("armature", 0.0), own["actuator"])
         content, note = json.dumps(data, indent=2) + "\n", f"kp {table.value(own['joint'], 'kp').value:g} duty per rad"
-    part = out.with_name(f".{out.name}.part")
     try:
-        part.write_text(content, encoding="utf-8")
-        part.replace(out)
+        with files.beside(out) as part:
+            part.write_text(content, encoding="utf-8")
     except OSError as error:
         raise UserError(f"out={out}: cannot be written: {error.strerror}") from None
     print(f"written  {out}; {note}")

@@ -31,7 +31,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from dexsim import typed, yaml_text
+from dexsim import files, typed, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES, Column, did_you_mean
 from dexsim.errors import UserError
 
@@ -193,11 +193,9 @@ class ServoTable:
     def save(self, path: str | Path) -> None:
         """Writes the table as a `servo.yaml`, replacing the file only once the new one is complete."""
         path = Path(path)
-        temporary = path.with_name(path.name + ".part")
         try:
-            text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=120)
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(path)
+            with files.beside(path) as part:
+                part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, width=120), encoding="utf-8")
         except OSError as error:
             raise UserError(f"servo file '{path}' cannot be written: {error}.") from None
 

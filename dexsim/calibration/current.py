@@ -86,9 +86,8 @@ def half(
                 out.levels[joint], out.files[joint] = levels, path.name
     if not out.levels:
         raise UserError(
-            f"{', '.join(str(p) for p in paths[:3])}: no press found: commands (or the force) must hold still for 0.2 s"
-            " at"
-            " several levels while a fingertip presses with more than 0.3 N"
+            f"{', '.join(str(p) for p in paths[:3])}: no press found: commands (or the force) must hold still for 0.2 "
+            "s at several levels while a fingertip presses with more than 0.3 N"
         )
     for joint in hand.joints:
         if joint not in out.levels:

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from dexsim import typed, yaml_text
+from dexsim import files, typed, yaml_text
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.tactile.layout import touch_shape
@@ -217,10 +217,9 @@ def save(path: str | Path, content: dict[str, Any], hand: Hand | None = None) ->
     xHand)."""
     Calibration.from_dict(content, str(path), hand=hand)
     path = Path(path)
-    part = path.with_name(f".{path.name}.tmp")
     try:
-        part.write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
-        part.replace(path)
+        with files.beside(path) as part:
+            part.write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
 
@@ -235,8 +234,7 @@ def _content(raw: Any, where: str, hand: Hand) -> Content:
                 if key not in known:
                     raise UserError(
                         f"{where}: {part}{'.' if part else ''}{key}: no such "
-                        f"{'key' if part in ('', 'touch') else 'joint'};"
-                        f" there are: {', '.join(known)}"
+                        f"{'key' if part in ('', 'touch') else 'joint'}; there are: {', '.join(known)}"
                     )
         raw = {k: raw[k] for k in Content.__struct_fields__ if k in raw}
         if isinstance(raw.get("joints"), dict):

@@ -194,9 +194,8 @@ def _tried(data: bytes, policy: Path, p: dict[str, Any]) -> None:
         ) from None
     if out.shape != (1, p["action_size"]) or not np.issubdtype(out.dtype, np.floating):
         raise UserError(
-            f"{policy}: gives {out.dtype} of shape {list(out.shape)}, must give floats of shape [1,"
-            f" {p['action_size']}]; export the"
-            " bundle again"
+            f"{policy}: gives {out.dtype} of shape {list(out.shape)}, must give floats of shape [1, "
+            f"{p['action_size']}]; export the bundle again"
         )
     if not np.isfinite(out).all():
         raise UserError(

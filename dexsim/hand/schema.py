@@ -162,9 +162,8 @@ def write(file: HandFile, path: Path) -> None:
     text = to_yaml(file)
     if len(text.encode()) > files.MAX_TEXT:
         raise UserError(f"hand {path}: {len(text)} characters, at most {files.MAX_TEXT} are read")
-    new = path.with_suffix(".yaml.new")
-    new.write_text(text, encoding="utf-8")
-    new.replace(path)
+    with files.beside(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 class _Dumper(yaml.SafeDumper):

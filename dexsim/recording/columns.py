@@ -215,8 +215,7 @@ def of_columns(
     if not {"position", "command"} & set(found):
         raise UserError(
             f"recording {path}: no column of position or command; columns: {_list(raw)}. Name them like "
-            "'position.elbow',"
-            " or say which with remap.position.JOINT=COLUMN"
+            "'position.elbow', or say which with remap.position.JOINT=COLUMN"
         )
     unused = [c for c in raw if c not in roles]
     if unused:

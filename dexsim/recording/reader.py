@@ -447,9 +447,8 @@ class _Reading:
         if seen:
             if unnamed > len(listed or seen):
                 raise UserError(
-                    f"recording {self.path}: {unnamed} values a message without names, but"
-                    f" joint_names lists {len(listed or seen)};"
-                    " state them all with meta.joint_names=a,b,..."
+                    f"recording {self.path}: {unnamed} values a message without names, but joint_names lists "
+                    f"{len(listed or seen)}; state them all with meta.joint_names=a,b,..."
                 )
             return list(seen)
         if joints is not None and unnamed == len(joints):
@@ -661,8 +660,7 @@ class _TableReading(_Reading):
         if topics:
             raise UserError(
                 f"recording {path}: has columns, no topics (remap.{topics[0]}); say remap.QUANTITY.JOINT=COLUMN, "
-                "quantities:"
-                f" {', '.join(columns.QUANTITIES)}"
+                f"quantities: {', '.join(columns.QUANTITIES)}"
             )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
         self.start_ns, self.config, self.sources, self.si = table.start_ns, None, {}, table.si

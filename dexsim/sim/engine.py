@@ -198,9 +198,8 @@ class Engine:
         if flags:
             p = self.peaks()
             raise UserError(
-                f"contact overflow (flags {flags:#x}{_pairs(flags)}): peak {p['contacts']:.1f} contacts a world of"
-                f" sim.nconmax={p['nconmax']} on average, {p['rows']:.0f} constraint rows of"
-                f" sim.njmax={p['njmax']}; raise the one that is full (e.g."
-                f" sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
+                f"contact overflow (flags {flags:#x}{_pairs(flags)}): peak {p['contacts']:.1f} contacts a world of "
+                f"sim.nconmax={p['nconmax']} on average, {p['rows']:.0f} constraint rows of sim.njmax={p['njmax']}; "
+                f"raise the one that is full (e.g. sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
             )
         self.t.overflow.zero_()
