@@ -169,10 +169,10 @@ def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarr
     either is right.
     """
     out: dict = {"equal": 0, "off": 0, "ill": 0, "reference_off": 0, "worst": 0.0, "exact": {}, "poses_off": []}
-    apart = np.linalg.norm(want[2] - got[2], axis=1)
+    separated = np.linalg.norm(want[2] - got[2], axis=1)
     near = np.isfinite(got[0])
     other = (want[0] < 0) & (np.abs(depth + want[0]) < LEVEL) & (np.linalg.norm(want[1] - got[1], axis=1) > 1e-3)
-    for i in np.flatnonzero(near & (apart > LIMIT)):
+    for i in np.flatnonzero(near & (separated > LIMIT)):
         also = [got[1][i]] if other[i] else []
         mine, theirs = (errors(model, poses, i, [want[1][i], *also], x[2][i]) for x in (got, want))
         if max(mine, theirs) > LIMIT:
@@ -192,6 +192,6 @@ def judge(model: mujoco.MjModel, poses, want: tuple, got: tuple, depth: np.ndarr
                 out["poses_off"].append(reported | {"off_m": mine, "exact_place": at.tolist()})
         elif theirs <= LIMIT:
             out["equal"] += 1
-    rest = apart[near & (apart <= LIMIT)]
+    rest = separated[near & (separated <= LIMIT)]
     out["worst"] = max(out["worst"], float(rest.max(initial=0.0)))
     return out

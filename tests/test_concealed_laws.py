@@ -168,9 +168,9 @@ def test_limits():
     for knee in (0.0, 4.0):
         for voltage in (0.0, 1.0):
             o = run(4, 5, goal[:, None, None], knee=knee, voltage=voltage, **common)["torque"][:, 0, -1]
-            asked = goal * (0.5 if voltage else 1.0)  # a duty of 1 is the limit
+            requested = goal * (0.5 if voltage else 1.0)  # a duty of 1 is the limit
             assert o == pytest.approx(
-                asked / (1 + (asked / 0.5) ** 4) ** 0.25 if knee else np.minimum(asked, 0.5), rel=1e-4
+                requested / (1 + (requested / 0.5) ** 4) ** 0.25 if knee else np.minimum(requested, 0.5), rel=1e-4
             )
     o = run(
         2,
@@ -265,11 +265,11 @@ def test_touch_laws():
     y = touch.relaxing({"fraction": 0.4, "time_constant": 0.8, "branches": 2.0}, hold)[501:, 0]
     s = t[1:2500]
     assert y == pytest.approx(2.0 * 0.2 * (np.exp(-s / 0.8) + np.exp(-s / 0.1)), abs=2e-3)
-    told = touch_cases.SECOND["hysteresis"].report(
+    reported = touch_cases.SECOND["hysteresis"].report(
         None, [hold[:, 0]], {"fraction": 0.4, "time_constant": 0.8, "branches": 2.0}
     )
-    near = touch.relaxing({**told, "branches": 1.0}, hold)[501:, 0]
-    assert 0.1 < told["time_constant"] < 0.8 and np.sqrt(np.mean((near - y) ** 2)) < 0.25 * np.sqrt(np.mean(y**2))
+    near = touch.relaxing({**reported, "branches": 1.0}, hold)[501:, 0]
+    assert 0.1 < reported["time_constant"] < 0.8 and np.sqrt(np.mean((near - y) ** 2)) < 0.25 * np.sqrt(np.mean(y**2))
     one = touch_cases._one_branch(None, [hold[:, 0]], {"fraction": 0.4, "time_constant": 0.8, "branches": 1.0})
     assert one == pytest.approx({"fraction": 0.4, "time_constant": 0.8}, rel=0.05)
 
@@ -294,8 +294,8 @@ def test_touch_laws():
     centre = len(xy) // 2
     assert plain[-1].argmax() == centre and (second[-1] > 1e-3).sum() > (first[-1] > 1e-3).sum()
     assert second[-1].sum() == pytest.approx(plain[-1].sum(), rel=0.01) == first[-1].sum()
-    left = touch_cases.SECOND["crosstalk"].report(pad, [], {"crosstalk": 0.3})["fraction"]
-    assert second[-1, centre] == pytest.approx((1 - left) * plain[-1, centre], rel=0.05)
+    remaining = touch_cases.SECOND["crosstalk"].report(pad, [], {"crosstalk": 0.3})["fraction"]
+    assert second[-1, centre] == pytest.approx((1 - remaining) * plain[-1, centre], rel=0.05)
     late = [touch.readings(pad, touch.DEFAULTS | {"delay": 0.03, "window": w}, q, force).sum(1) for w in (0.0, 1.0)]
     # of what grows evenly both are late by the same
     assert late[0][100:190] == pytest.approx(late[1][100:190], abs=1e-6)

@@ -178,8 +178,8 @@ def test_the_actor_feels_what_the_sensor_measured(env, monkeypatch):
         monkeypatch.setattr(env.touch, name, torch.full_like(getattr(env.touch, name), 1.0 + k))
     obs = env.observe(advance=False)
     for group, force, centre in (("actor", 1.0, 2.0), ("critic", 3.0, 4.0)):
-        felt = obs[group][:, SLICES["contact_force"]]
-        torch.testing.assert_close(felt, torch.full_like(felt, force / env.f_max))
+        sensed = obs[group][:, SLICES["contact_force"]]
+        torch.testing.assert_close(sensed, torch.full_like(sensed, force / env.f_max))
         assert (obs[group][:, SLICES["contact_centre"]] == centre).all(), group
 
 

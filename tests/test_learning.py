@@ -142,8 +142,8 @@ def test_episodes_that_begin_anew_on_resume_do_not_end_together(tmp_path, monkey
         again.learn(2, stop=lambda: True)  # nothing is learned: what is at its beginning
         return begun, again.env.episode_length_buf
 
-    before, kept = ages_after_resume()
-    assert torch.equal(before, made.env.episode_length_buf) and torch.equal(kept, before)
+    before, retained = ages_after_resume()
+    assert torch.equal(before, made.env.episode_length_buf) and torch.equal(retained, before)
     keep = dummy_task.DummyEnv.load_state_dict
 
     def anew(self, state):

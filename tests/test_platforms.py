@@ -104,15 +104,15 @@ def test_each_system_has_its_opengl(monkeypatch, platform, names):
 
 def test_a_process_is_asked_for_without_a_signal_on_windows(monkeypatch):
     """Windows' answers, given by a stand-in for its kernel: running, ended, not there, somebody else's."""
-    asked = []
+    requested = []
 
     class Kernel:
         def OpenProcess(self, rights, inherit, pid):
-            asked.append(pid)
+            requested.append(pid)
             return pid if pid < 3 else 0
 
         def GetLastError(self):
-            return 5 if asked[-1] == 4 else 87
+            return 5 if requested[-1] == 4 else 87
 
         def GetExitCodeProcess(self, handle, status):
             status._obj.value = 259 if handle == 1 else 0
@@ -164,13 +164,13 @@ def test_each_answer_where_what_it_asks_is_taken_away(monkeypatch, tmp_path):
         for call in (system.give_back, system.leave_terminal, lambda: system.after_fork(pytest.fail)):
             call()
         system.limit(1.0, 1)  # nothing is limited
-        asked = []
-        less.setattr(os, "kill", lambda pid, number: asked.append(number))
+        requested = []
+        less.setattr(os, "kill", lambda pid, number: requested.append(number))
         for platform, how, words in (("win32", signal.SIGTERM, "screen"), ("darwin", signal.SIGINT, "screen"),
                                      ("linux", signal.SIGINT, "apt-get")):  # fmt: skip
             less.setattr(system, "sys", types.SimpleNamespace(platform=platform))
             system.stop(7)
-            assert asked.pop() == how and words in system.no_renderer()
+            assert requested.pop() == how and words in system.no_renderer()
             assert system.start_method() == ("fork" if platform == "linux" else "spawn")
         for name in ("SIGHUP", "SIGQUIT", "SIGUSR1", "SIGTSTP", "SIGXCPU", "SIGALRM", "SIGPWR"):
             less.delattr(signal, name)

@@ -100,7 +100,7 @@ class Hub(http.server.BaseHTTPRequestHandler):
     """As much of Hugging Face's server as a download asks for: one repository with one policy."""
 
     CONTENT, COMMIT = b"", "1" * 40
-    asked: list[str] = []
+    requested: list[str] = []
 
     def do_HEAD(self):
         self._answer(False)

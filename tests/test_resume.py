@@ -92,12 +92,12 @@ def test_every_part_that_changes_is_kept():
     anew by each step."""
     for task in ("grasp", "rotate"):
         made = runner(task, "mujoco", *FEELS, n=23)
-        env, kept = made.env, {t.data_ptr() for t, _, _ in worlds.live(made.env).values()}
+        env, retained = made.env, {t.data_ptr() for t, _, _ in worlds.live(made.env).values()}
         own = {k: v for k, v in vars(env).items() if isinstance(v, torch.Tensor) and v.dim() and v.shape[0] == 23}
         before = {k: v.clone() for k, v in own.items()}
         for k in range(30):
             env.step(torch.full((23, 12), 0.5 * (-1) ** k))
-        changed = {k for k, v in own.items() if not torch.equal(v, before[k]) and v.data_ptr() not in kept}
+        changed = {k for k, v in own.items() if not torch.equal(v, before[k]) and v.data_ptr() not in retained}
         computed = {"_action_in", "reward", "done", "time_out", "tip_force", "finger_force", "self_force", "palm_force",
                     "d_rot", "d_pos", "reached", "dropped", "tipped", "nan_end"}  # fmt: skip
         assert changed <= computed, changed - computed

@@ -193,9 +193,9 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
 
     stamps, targets = np.split(state[..., slots["stamp0"] : slots["stamp0"] + 2 * queue], 2, axis=-1)
     by_name = {name: params[..., i] for name, i in INDEX.items()}
-    kept = {name for c in COLUMNS if c.feature in features for name in c.remembers}
+    retained = {name for c in COLUMNS if c.feature in features for name in c.remembers}
     step = Step(engine.dt, state[..., slots["fresh"]] != 0 if extra else True)
-    step.memory |= {name: state[..., slots[name]] for name in kept}
+    step.memory |= {name: state[..., slots[name]] for name in retained}
     delay = command_delay(by_name, 1.0, features, step)
     target = target_in_force(1.0, stamps, targets, delay, engine.dt)
     known = {name: state[..., slots[name]] for name in EXTRA_SLOTS if name not in MEMORY} if extra else {}
@@ -210,7 +210,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         features=features,
         base_armature=armature,
         **known,
-        memory={name: step.memory[name] for name in kept},
+        memory={name: step.memory[name] for name in retained},
         dragging=np.take_along_axis(q - home, source, 1),
         others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
         loop_motor=np.array([False, True, False]),
@@ -231,7 +231,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         got |= {name: servo.state[..., slots[name]].numpy() for name in ("line_a", "line_b") if "play" in features}
         got |= {"taken": servo.state[..., slots["taken"]].numpy()} if "presliding" in features else {}
         got |= {"integral": servo.state[..., slots["integral"]].numpy()} if "controller" in features else {}
-        got |= {name: servo.state[..., slots[name]].numpy() for name in kept}
+        got |= {name: servo.state[..., slots[name]].numpy() for name in retained}
     if "play" in features:
         got |= {
             "rotor": servo.state[..., slots["rotor"]].numpy(),

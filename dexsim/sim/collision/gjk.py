@@ -395,11 +395,11 @@ def touching(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: 
             done = int(1)
             for j in range(ways):
                 u = wp.where(j == 0, -v / d, wp.normalize(gap))
-                apart = separation(a, b, vertex, R, p, u)
-                if apart > t.dist + LEAST:
+                width = separation(a, b, vertex, R, p, u)
+                if width > t.dist + LEAST:
                     done = int(0)
-                if apart > t.dist - LEAST:
-                    t.dist = apart
+                if width > t.dist - LEAST:
+                    t.dist = width
                     t.normal = u
             tries += 3 * done
         else:

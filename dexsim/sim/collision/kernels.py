@@ -255,7 +255,7 @@ def add(
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
-def apart(
+def separate(
     pairs: Pairs,
     mat: Materials,
     # out
