@@ -113,8 +113,8 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
     pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
     n.deep_number.zero_()
     wp.launch(
-        kernels.separate, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number],
-        block_dim=n.block_dim,
+        kernels.separate, dim=d.naconmax, inputs=[pairs, n._mat],
+        outputs=[n._out, n._deep, n._enclosing, n.deep_number], block_dim=n.block_dim,
     )  # fmt: skip
     threads = min(d.naconmax, 1 << 15)
     wp.launch(
