@@ -162,10 +162,14 @@ def sure_and_wrong(said: Row, hidden: Sequence[str]) -> bool:
     return any(f[2] >= SURE and len(f[3]) < 2 and f[0] not in hidden for f in said["findings"])
 
 
-def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, float]]:
-    """Return of each line that tells the time left of a search (s since the start, share done, s left as said), then
-    when the search ended (share 1); empty where none was told. lines: (s since the start, text)."""
-    found = [(t, LEFT.search(line)) for t, line in lines]
-    ended = next((t for t, line in lines if line.strip().startswith("searched ")), None)
-    said = [(t, 0.01 * float(m[1]), float(m[2])) for t, m in found if m]
-    return [] if ended is None else [*said, (ended, 1.0, 0.0)]
+def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, float, float]]:
+    """Return of each line that tells the time left of a search or of replays (s since the start, share done, s left as
+    said, s that were left); none of what did not end. lines: (s since the start, text)."""
+    out, said = list[tuple[float, float, float, float]](), list[tuple[float, float, float]]()
+    for t, line in lines:
+        if m := LEFT.search(line):
+            said.append((t, 0.01 * float(m[1]), float(m[2])))
+        elif line.strip().startswith(("searched ", "replayed ")):
+            out += [(*x, t - x[0]) for x in said]
+            said = []
+    return out

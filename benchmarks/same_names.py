@@ -112,14 +112,8 @@ def right(row: dict[str, Any], version: str) -> bool:
 
 
 def told_right(rows: Sequence[dict[str, Any]], version: str) -> str:
-    """Return how many of the times left that searches told were right within a third, in words."""
-    right = [
-        abs(remaining - (end - t)) <= THIRD * (end - t)
-        for r in rows
-        if (times := r[version].get("times"))
-        for end in (times[-1][0],)
-        for t, _, remaining in times[:-1]
-    ]
+    """Return how many of the times left that were told were right within a third, in words."""
+    right = [abs(said - was) <= THIRD * was for r in rows for _, _, said, was in r[version].get("times", ())]
     return f"{sum(right)} of {len(right)}"
 
 

@@ -341,9 +341,9 @@ def test_the_choice_keeps_to_the_time_there_is(budget, share, monkeypatch):
         r.smooth()
     case, clock, real = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0], [0.0], full_model.free_runs
 
-    def slow(spec, joints, worlds, *rest):
+    def slow(spec, joints, worlds, *rest, **more):
         clock[0] += sum(w.duration for w in worlds)
-        return real(spec, joints, worlds, *rest)
+        return real(spec, joints, worlds, *rest, **more)
 
     monkeypatch.setattr(full_model, "free_runs", slow)
     monkeypatch.setattr(full_model.time, "monotonic", lambda: clock[0])

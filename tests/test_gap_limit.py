@@ -168,6 +168,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
         m=SimpleNamespace(joints=("j",)),
         readable=[],
         by_name={},
+        progress=None,
         notes=[],
         clock=SimpleNamespace(lap=lambda _: None),
     )

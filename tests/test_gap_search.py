@@ -213,6 +213,18 @@ def test_progress_says_what_is_done_and_no_time_that_nobody_knows(capsys, monkey
     ]
     says(2.0, 5, "wrist", 60.0)
     assert capsys.readouterr().out.strip() == "searching wrist (3/5), 40 % done, about 60 s left"
+    # replays of known sizes, on two lanes
+    now, every = [100.0], compute.told([40.0, 20.0, 20.0, 10.0], 2, "the files", says)
+    monkeypatch.setattr(compute.time, "monotonic", lambda: now[0])
+    for at, k, part in ((100, 0, 0), (100, 1, 0), (110, 1, 1), (110, 2, 0), (119, 0, 1), (119, 3, 0), (121, 2, 1),
+                        (124, 3, 1)):  # fmt: skip
+        now[0] = float(at)
+        every(k, part)
+    assert [line.strip() for line in capsys.readouterr().out.splitlines()] == [
+        "replaying the files, 22 % done, about 15 s left",
+        "replaying the files, 67 % done, about 5 s left",
+        "replayed the files",
+    ]
 
 
 @pytest.mark.parametrize("lanes", [1, 3])

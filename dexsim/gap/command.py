@@ -307,7 +307,7 @@ def available(device: str) -> str:
 
 
 class Progress:
-    """Which joint is searched, and the time left."""
+    """Which joint is searched or what is replayed, and the time left."""
 
     EVERY = 3.0  # s between lines while none is done, where they are not written over each other
 
@@ -316,8 +316,8 @@ class Progress:
         self.live = sys.stdout.isatty()
         self.said, self.searched = 0.0, -1
 
-    def __call__(self, done: float, total: int, name: str, left: float | None = None) -> None:
-        """done of total are searched, the one under way in part; left: s, where that is known."""
+    def __call__(self, done: float, total: int, name: str, left: float | None = None, doing: str = "search") -> None:
+        """done of total are searched (doing: a verb), the one under way in part; left: s, where that is known."""
         now = time.perf_counter()
         if not done:  # what was before says nothing of how long it takes
             self.start = now
@@ -326,11 +326,10 @@ class Progress:
         self.said, self.searched, spent = now, int(done), now - self.start
         part = f", {100 * done / total:.0f} % done" if 0.0 < done < total else ""
         tail = f", about {left:.0f} s left" if left is not None else f", {spent:.0f} s so far" if part else ""
-        text = (
-            f"  searching {name} ({int(done) + 1}/{total}){part}{tail}"
-            if done < total
-            else f"  searched {total} in {spent:.0f} s"
-        )
+        if done < total:
+            text = f"  {doing}ing {name}" + (f" ({int(done) + 1}/{total})" if doing == "search" else "") + part + tail
+        else:
+            text = f"  {doing}ed {name}" if name else f"  {doing}ed {total} in {spent:.0f} s"
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 

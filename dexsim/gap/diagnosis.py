@@ -586,7 +586,7 @@ class Drives(Steps):
             w.limit.leave_out("not replayed in the engine that trains")
             engine = "none"
         try:
-            self.written = best(s.device, engine, lambda: w.limit.until(1 - PLANNING))
+            self.written = best(s.device, engine, lambda: w.limit.until(1 - PLANNING), w.progress)
         except UserError as error:
             w.notes.append(f"not replayed in the engine that trains: {error}")
             engine = "none"

@@ -56,6 +56,8 @@ KINDS = 0.7  # of the time that there is for the choice: what every joint as its
 MORE = 2.0  # times as much of it is replayed, or none again
 LEAST = 0.1  # of each part held out: by less nothing is chosen
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
+STEPPED = 8  # worlds that a step takes as long for as for itself
+REPLAYED = "what may be written"
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BELIEVED = "believed"  # candidate: nothing is changed
@@ -333,9 +335,11 @@ def free_runs(
     timestep: float = STEP,
     engine: str = "auto",
     torque: bool = False,
+    progress: Callable[..., None] | None = None,
 ) -> list:
     """Return reported positions [T, J] of each world at every step, from its first position and speed on, as one batch
-    a drive and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead."""
+    a drive and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead. progress: of
+    `compute.told`."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         # as long as the longest of a batch all of it runs
@@ -356,7 +360,9 @@ def free_runs(
         return _batch(spec, joints, [worlds[i] for i in mine], together, device, timestep, engine, torque)
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
-    for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores), strict=True):
+    sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
+    tell = compute.told(sizes, cores, REPLAYED, progress)
+    for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores, tell), strict=True):
         for i, q in zip(mine, moved, strict=True):
             out[i] = q
     return out
@@ -616,17 +622,18 @@ def write_best(
     device: str = "cpu",
     engine: str = "mujoco",
     room: Callable[[], float] = lambda: math.inf,
+    progress: Callable[..., None] | None = None,
 ) -> Written:
     """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
     engine: of `REPLAY`; none: by the search's own plant; room: s that there are for it; too few: by the begin of each
-    part held out, by the search's own plant where that is less than `LEAST`. Raises UserError where the model or a
-    drive does not serve the engine."""
+    part held out, by the search's own plant where that is less than `LEAST`. progress: of `compute.told`. Raises
+    UserError where the model or a drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if engine == "none" or not cases or not len(windows[0].window):
         return Written(candidates, errors, {j: choose(x, noise[j]) for j, x in errors.items()})
     by = {j: {c.name: c for c in given} for j, given in candidates.items()}
-    kept, kinds = Kept(m, runs, recordings, cases, windows[0]), kinds_of(by)
+    kept, kinds = Kept(m, runs, recordings, cases, windows[0], progress), kinds_of(by)
     # of each part; s of a choice
     share, pace = min(1.0, PROBE / max(kept.seconds)) if math.isfinite(room()) else 1.0, 0.0
 
@@ -661,7 +668,8 @@ def rms(missed: Sequence[np.ndarray]) -> float:
 
 
 class Kept:
-    """What was held out of the fit, replayed. windows: of all of it; recordings, starts, ends [W] s of each part."""
+    """What was held out of the fit, replayed. windows: of all of it; progress: of `compute.told`; recordings, starts,
+    ends [W] s of each part."""
 
     def __init__(
         self,
@@ -670,7 +678,9 @@ class Kept:
         recordings: Mapping[str, Recording],
         cases: Sequence[Case],
         windows: Windows,
+        progress: Callable[..., None] | None = None,
     ):
+        self._progress = progress
         self.m, self.runs, self.cases, self.windows, self.by_name = m, runs, cases, windows, recordings
         t = cases[0].plant.t
         self.recordings = [recordings[runs[int(r)].name] for r in windows.run]
@@ -714,7 +724,7 @@ class Kept:
                 if what not in self._known:
                     new[what] = w
         device = "cpu" if engine == "mujoco" else device
-        found = free_runs(self.m.spec, self.m.joints, [*new.values()], device, STEP, engine)
+        found = free_runs(self.m.spec, self.m.joints, [*new.values()], device, STEP, engine, progress=self._progress)
         for what, q in zip(new, found, strict=True):
             self._known[what] = self._missed(what[0], share, q)
         return [{c.joint: [self._known[x][i] for x in parts] for i, c in enumerate(self.cases)} for parts in asked]
