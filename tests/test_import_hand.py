@@ -322,6 +322,10 @@ BAD = {
                             '<parent link="index_far"/><child link="index_near"/>', 1), r"must be one tree",
     ),
     "degrees": (lambda t: t.replace('upper="1.7"', 'upper="97"', 1), r"joint 'index_1'.*in degrees"),
+    "radians read as degrees": (
+        lambda t: re.sub(r'(lower|upper)="([-0-9.]+)"', lambda x: f'{x[1]}="{np.deg2rad(float(x[2])):.5f}"', t),
+        r"no joint turns farther than 0.0\d+ rad: .*read as degrees",
+    ),
     "endless": (
         lambda t: t.replace('name="ring_1" type="revolute"', 'name="ring_1" type="continuous"'),
         r"joint 'ring_1' has no limits",

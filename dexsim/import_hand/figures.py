@@ -60,6 +60,7 @@ def check(
     _size(motions, where)
     for j in tree.every:
         _limits(m, j, where, source.limits.get(m.joint(j).name))
+    _degrees(m, tree, where)
     out = Figures({}, {}, {}, {})
     for x in motions:
         for j in x.finger.joints:
@@ -213,6 +214,17 @@ def _limits(m: mujoco.MjModel, j: int, where: str, stated: tuple[float, float] |
         raise UserError(
             f"{where}: joint '{name}' has limits {low:g} to {high:g} rad, more than a turn: in degrees?"
             ' (MJCF: <compiler angle="degree">; URDF: radians)'
+        )
+
+
+def _degrees(m: mujoco.MjModel, tree: Tree, where: str) -> None:
+    """Raise UserError where no hinge turns farther than a turn in radians would be in degrees."""
+    hinges = [j for j in tree.every if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    most = np.abs(m.jnt_range[hinges]).max(initial=0.0)
+    if hinges and most < np.deg2rad(2 * np.pi):
+        raise UserError(
+            f"{where}: no joint turns farther than {most:.2g} rad: limits in radians, read as degrees? (MJCF, which"
+            ' reads degrees by default, also in a file that others include: <compiler angle="radian">)'
         )
 
 
