@@ -27,11 +27,11 @@ DEFAULTS = {"joints": 12, "seconds": 60, "device": "cpu", "hidden": True, "recor
 def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool, seed: int) -> tuple[list[Path], str]:
     """Return `recordings` recordings of `count` joints, `seconds` in all; returns their paths and the joint that hides
     something."""
-    from dexsim.assets import xhand
     from dexsim.recording import write
     from dexsim.recording.mechanism import drive, mechanism, recorded
     from dexsim.recording.realistic import realistic
     from dexsim.recording.schema import COMMANDS, Series
+    from tools.assets import xhand
 
     rng = np.random.default_rng(seed)
     joints = list(xhand.JOINTS) if count == 12 else ["mid_joint1", "mid_joint2", "ring_joint1", *xhand.JOINTS][:count]

@@ -37,12 +37,12 @@ import warp as wp
 
 from benchmarks import tools
 from benchmarks.options import options
-from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.sim.collision import NarrowPhase
 from dexsim.sim.collision.shapes import hull_corners
 from tests.places import exact, judge
+from tools.assets import xhand
 
 MARGIN = 0.0015
 REFERENCE, MUJOCO_WARP = (1e-14, 200), (1e-6, 35)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.recording import Recording, Series, States
 from dexsim.recording.schema import (
     COMMANDS,
@@ -19,6 +18,7 @@ from dexsim.recording.schema import (
     TACTILE,
     TEMPERATURES,
 )
+from tools.assets import xhand
 
 META = DEFAULTS | {"source": "real", "robot": "rig", "effort_is": "current_A", "tactile_lsb": "0.1", "joint_names": ""}
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 import yaml
 
-from dexsim.assets import xhand
 from dexsim.calibration import command, current, line, presses, rubber, simulate, taxels
 from dexsim.calibration.file import Calibration, save
 from dexsim.calibration.line import Levels
@@ -22,6 +21,7 @@ from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, 
 from dexsim.recording.writer import write
 from dexsim.tactile.reference import mooney_rivlin_force
 from tests.made_hand import made_hand
+from tools.assets import xhand
 
 HAND = load_hand("xhand")
 

@@ -13,7 +13,6 @@ from bundles import QUIET, make_checkpoint
 from replay_hand import ReplayHand
 
 from dexsim import export
-from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import main as command
 from dexsim.deploy import bundle
@@ -26,6 +25,7 @@ from dexsim.deploy.timing import Timing
 from dexsim.deploy.vision import CameraPose, FixedPlace, Frame, Vision, centroid
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
+from tools.assets import xhand
 
 torch.set_num_threads(1)
 

@@ -23,7 +23,6 @@ from bundles import make_checkpoint
 from test_deploy import FakeHand, recorder_at
 
 from dexsim import export, system
-from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import _Stop
 from dexsim.deploy import bundle
@@ -34,6 +33,7 @@ from dexsim.deploy.safety import Guard
 from dexsim.deploy.vision import FixedPlace
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
+from tools.assets import xhand
 
 torch.set_num_threads(1)
 PLACE = np.array([0.055, 0.0, 0.04])

@@ -13,11 +13,11 @@ import yaml
 from bundles import make_checkpoint
 
 from dexsim import export
-from dexsim.assets import xhand
 from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.tasks import observations
+from tools.assets import xhand
 
 
 @pytest.fixture(scope="module")

@@ -297,8 +297,8 @@ def test_links_that_touch_each_other_are_cut_out():
     """Thumb against index in the xHand's own model: the stretch in which they press is no free air."""
     import mujoco
 
-    from dexsim.assets import xhand
     from dexsim.gap.read import Run, inputs
+    from tools.assets import xhand
 
     model = xhand.hand_spec().compile()
     data = mujoco.MjData(model)

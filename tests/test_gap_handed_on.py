@@ -14,7 +14,6 @@ from worlds import grasp_cfg, grasp_env
 
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.finding import Finding
@@ -26,6 +25,7 @@ from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import realistic
 from dexsim.recording.schema import COMMANDS, Series
+from tools.assets import xhand
 
 JOINT = "index_joint2"
 

@@ -9,7 +9,6 @@ import pytest
 from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.body import add_mass
 from dexsim.gap.effects.catalogue import EFFECTS
@@ -21,6 +20,7 @@ from dexsim.gap.read import Run, conditions
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch, search_joint, widened, without_search
+from tools.assets import xhand
 
 OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 

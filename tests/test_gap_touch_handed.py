@@ -13,7 +13,6 @@ import yaml
 from bundles import make_checkpoint
 from worlds import grasp_cfg, grasp_env, task_cfg
 
-from dexsim.assets import xhand
 from dexsim.cli import help as help_page
 from dexsim.cli import start
 from dexsim.errors import UserError
@@ -28,6 +27,7 @@ from dexsim.gap.touch.judge import chord
 from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.tactile.file import load
+from tools.assets import xhand
 
 INDEX, MID = 1, 2
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from worlds import grasp_cfg, grasp_env
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.tasks import grasp_eval, make_env, observations
+from tools.assets import xhand
 
 N = 8
 QUIET = (

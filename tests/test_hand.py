@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.hand import load_hand, schema
 from dexsim.hand.skin import tip_skins
 from tests.made_hand import _MODEL, content, made_hand
+from tools.assets import xhand
 
 
 def posed(hand, angles):

@@ -13,11 +13,11 @@ from bundles import make_checkpoint
 from recordings import signal
 
 from dexsim import excite, export, import_object
-from dexsim.assets import xhand
 from dexsim.cli import stable_grasps
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.import_hand import moves
+from tools.assets import xhand
 
 torch.set_num_threads(1)
 MINE = b"a day's work"

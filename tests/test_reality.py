@@ -8,13 +8,13 @@ import pytest
 import torch
 import yaml
 
-from dexsim.assets import xhand
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.tactile.config import COLUMNS
 from dexsim.tasks import make_env, reality
+from tools.assets import xhand
 
 
 def world(*overrides: str) -> dict:

@@ -18,10 +18,10 @@ from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.recording import Writer, cdr, read, ros2, write
 from dexsim.recording.schema import IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH
+from tools.assets import xhand
 
 DEFINITIONS = {kind: cdr.definition(kind) for kind in (IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH)}
 HEADER = {"stamp": {"sec": 12, "nanosec": 34}, "frame_id": "palm"}

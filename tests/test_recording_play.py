@@ -11,7 +11,6 @@ import yaml
 from rig import pendulum_spec
 
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.cli import recorded as replay_cli
 from dexsim.cli import start
 from dexsim.errors import UserError
@@ -21,6 +20,7 @@ from dexsim.recording import mechanism as mech
 from dexsim.recording.audit import audit, table
 from dexsim.recording.compare import compare
 from dexsim.recording.realistic import Hardware, realistic, sample_times
+from tools.assets import xhand
 
 torch.set_num_threads(1)
 SERVO = {

@@ -8,7 +8,7 @@ import pytest
 import torch
 from worlds import grasp_env
 
-from dexsim.assets import xhand
+from tools.assets import xhand
 
 N = 12
 FINGER = 2  # middle

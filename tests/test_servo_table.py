@@ -10,9 +10,9 @@ import yaml
 
 from dexsim.actuator import COLUMNS, ServoTable, describe
 from dexsim.actuator.columns import INDEX, NAMES
-from dexsim.assets.xhand import JOINTS
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
+from tools.assets.xhand import JOINTS
 
 SERVOS = CONFIGS / "servo"
 

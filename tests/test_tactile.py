@@ -12,7 +12,6 @@ import torch
 import warp as wp
 from tactile_fixtures import SPRING, flat_layout, primitives, random_rotation, touch
 
-from dexsim.assets import xhand
 from dexsim.assets.objects import Grid, library
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
@@ -24,6 +23,7 @@ from dexsim.tactile.pressing import presses, skin_of
 from dexsim.tactile.sdf import Shapes, distance, normal
 from dexsim.tactile.sensors import Sensors
 from dexsim.tactile.shapes import TouchShape, bake_convex
+from tools.assets import xhand
 
 SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0, 0), "capsule": (0.019, 0.011, 0), "cylinder": (0.02, 0.03, 0)}
 

@@ -11,7 +11,6 @@ from tactile_fixtures import primitives
 from test_nosync import NoSync, _strict
 from worlds import grasp_cfg, grasp_env
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.gap.touch import plant as touch_plant
 from dexsim.hand import load_hand
@@ -21,6 +20,7 @@ from dexsim.tactile.config import tactile_config
 from dexsim.tactile.pads import THICKNESS, pad_configs, value_range
 from dexsim.tactile.posed import PosedEngine
 from dexsim.tactile.sensors import Sensors
+from tools.assets import xhand
 
 RADIUS, MIDDLE, FORCE = 0.012, 66, 3.0
 INDEX, MID = 1, 2

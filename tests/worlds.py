@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import torch
 
-from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.paths import CONFIGS
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, hand_object_scene
 from dexsim.tasks.objects import Objects
+from tools.assets import xhand
 
 IMPEDANCE = 0.95
 ALL = ["box", "sphere", "capsule", *(n for n, s in library().items() if s.kind == "grid")]

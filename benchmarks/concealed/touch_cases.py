@@ -92,7 +92,7 @@ REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across
 def bench(finger: str, where: Path):
     """Return the rig as it is believed (rig.xml, rig's servo.yaml in `where`) and its pad for the plant."""
     from benchmarks.press_rig import RADIUS, SERVO, spec
-    from dexsim.assets import xhand
+    from tools.assets import xhand
 
     s, _, press, slide = spec(finger)
     model = s.compile()
@@ -205,7 +205,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
         "tactile_unit": "count",
         "tactile_lsb": f"{LSB:g}",
     }
-    from dexsim.assets import xhand
+    from tools.assets import xhand
 
     pad_number = xhand.FINGERS.index(finger)
     when = []

@@ -28,10 +28,10 @@ import yaml
 
 from benchmarks import press_rig
 from benchmarks.real import common
-from dexsim.assets import xhand
 from dexsim.gap.rules import TOUCH
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
+from tools.assets import xhand
 
 SETS = 3  # recordings of a fingertip; diagnose keeps the last out of the fit
 RATE, INNER = 90.0, 4  # readings a second; times the sensor itself runs between two

@@ -23,8 +23,8 @@ SEEDS = {"late": 4102, "stiff": 4104}
 
 def draw(name: str) -> dict:
     """Return the numbers of a world."""
-    from dexsim.assets import xhand
     from dexsim.tasks.reality import draw as other
+    from tools.assets import xhand
 
     nominal = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     world = other(SEEDS[name], nominal)

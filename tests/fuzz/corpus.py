@@ -15,10 +15,10 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from dexsim import export
-from dexsim.assets import xhand
 from dexsim.assets.objects import own
 from dexsim.learning import checkpoint
 from dexsim.recording import Recording, Series, States, schema, write
+from tools.assets import xhand
 
 ROOT = Path(__file__).parents[2]
 JOINTS = ("a", "b")

@@ -14,7 +14,6 @@ import numpy as np
 
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.assets.objects import own
 from dexsim.calibration.file import Calibration
 from dexsim.cli import settings, start
@@ -30,6 +29,7 @@ from dexsim.recording.readers import expanded
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 from dexsim.tactile import file as tactile_file
 from dexsim.tactile.layout import hand_layout
+from tools.assets import xhand
 
 from . import corpus, silence
 

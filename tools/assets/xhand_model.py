@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, HalfspaceIntersection, cKDTree
 
-from dexsim.assets import xhand
-from dexsim.assets.xhand.surface import PADS, Lattice, PadShape, tip_points, to_link, to_sensor
-from tools.assets import shells
+from tools.assets import shells, xhand
+from tools.assets.surface import PADS, Lattice, PadShape, tip_points, to_link, to_sensor
 
 # Neither is published. Armature: the order of magnitude of a small geared motor's rotor seen at the joint
 # (g cm^2 times a gear ratio of 100 to 200 squared); several times the links' own inertia about the joint.

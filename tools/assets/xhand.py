@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+import dexsim
+
 if TYPE_CHECKING:
     import mujoco
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(dexsim.__file__).parent / "assets" / "xhand"
 FINGERS = ("thumb", "index", "mid", "ring", "pinky")
 JOINTS = (
     "thumb_bend_joint", "thumb_rota_joint1", "thumb_rota_joint2",
@@ -117,7 +119,7 @@ def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
 def _tip_skin(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return `tip_skin_mesh` of all fingers with this pad."""
     from dexsim.assets.objects.geometry import hull_mesh
-    from dexsim.assets.xhand.surface import PADS, Lattice, tip_points, to_link, to_sensor
+    from tools.assets.surface import PADS, Lattice, tip_points, to_link, to_sensor
 
     pad = PADS[name]
     points = taxel_table(next(f for f in FINGERS if pad_of(f) == name))["position"].reshape(COLUMNS, ROWS, 3)
