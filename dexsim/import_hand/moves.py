@@ -120,7 +120,7 @@ def main(argv: Sequence[str]) -> int:
     table = moves(hand)
     wide = max(22, *(len(m.joint) + 2 for m in table))
     print(
-        f"{'joint':<{wide}}{'finger':<10}{'what it does':<21}{'rad, slides m':>17}{'tip goes':>10}{'closing':>10}"
+        f"{'joint':<{wide}}{'finger':<10}{'what it does':<21}{'rad (slides m)':>15}{'tip goes':>10}{'closing':>10}"
         "  links that touch"
     )
     for k, m in enumerate(table):
@@ -129,7 +129,7 @@ def main(argv: Sequence[str]) -> int:
         closing = f"{1e3 * m.closer:+.0f} mm" if m.role.startswith("bends") else ""
         touch = f"{m.touches[0]}, {m.touches[1]} at {m.touches[2]:.2f}" if m.touches else ""
         print(
-            f"{m.joint:<{wide}}{finger:<10}{m.role:<21}{f'{low:.3g} to {high:.3g}':>17}{1e3 * m.travel:>7.0f} mm"
+            f"{m.joint:<{wide}}{finger:<10}{m.role:<21}{f'{low:.3g} to {high:.3g}':>15}{1e3 * m.travel:>7.0f} mm"
             f"{closing:>10}  {touch}"
         )
     for text in faults(table):
