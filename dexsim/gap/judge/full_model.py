@@ -765,8 +765,11 @@ def composed(
             errors[j][name] = found[j]
     here = {j: dict(x) for j, x in errors.items()}  # with what the others are by then
     chosen = {j: choose(x, noise[j]) for j, x in here.items()}
+    # the better of belief and plain model of each joint: replayed beside the first, it takes hardly more time
+    plainly = {j: [n for n in (BELIEVED, "plain") if n in x] for j, x in by.items()}
+    safe_of = lambda other: {j: min(x, key=errors[j].__getitem__) if x else other[j] for j, x in plainly.items()}  # noqa: E731
     while chosen not in [c for c, _ in done] and len(done) < first + TURNS and not passed(1):
-        (together,) = replayed([chosen])
+        together = replayed([chosen] if passed(2) else [chosen, safe_of(chosen)])[0]
         done.append((chosen, together))
         moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]] and len(by[j]) > 1]
         swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
@@ -777,10 +780,9 @@ def composed(
         for j in by:
             here[j][chosen[j]] = together[j]
         chosen = {j: choose(x, noise[j]) for j, x in here.items()}
-    # of all that was replayed as a whole, and the better of belief and plain model of each joint: what nowhere follows
-    # much worse than these; that choice before others that do as well
-    plainly = {j: [n for n in (BELIEVED, "plain") if n in x] for j, x in by.items()}
-    safe = {j: min(x, key=errors[j].__getitem__) if x else chosen[j] for j, x in plainly.items()}
+    # of all that was replayed as a whole, and that: what nowhere follows much worse than it; that choice before others
+    # that do as well
+    safe = safe_of(chosen)
     if safe not in [c for c, _ in done] and not passed(1):
         done += zip([safe], replayed([safe]), strict=True)
     quiet = {j: JUDGE.within**2 * noise[j] for j in by}
