@@ -3,6 +3,8 @@ reference."""
 
 from __future__ import annotations
 
+import re
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -213,18 +215,29 @@ def test_progress_says_what_is_done_and_no_time_that_nobody_knows(capsys, monkey
     ]
     says(2.0, 5, "wrist", 60.0)
     assert capsys.readouterr().out.strip() == "searching wrist (3/5), 40 % done, about 60 s left"
-    # replays of known sizes, on two lanes
-    now, every = [100.0], compute.told([40.0, 20.0, 20.0, 10.0], 2, "the files", says)
-    monkeypatch.setattr(compute.time, "monotonic", lambda: now[0])
-    for at, k, part in ((100, 0, 0), (100, 1, 0), (110, 1, 1), (110, 2, 0), (119, 0, 1), (119, 3, 0), (121, 2, 1),
-                        (124, 3, 1)):  # fmt: skip
-        now[0] = float(at)
-        every(k, part)
-    assert [line.strip() for line in capsys.readouterr().out.splitlines()] == [
-        "replaying the files, 22 % done, about 15 s left",
-        "replaying the files, 67 % done, about 5 s left",
-        "replayed the files",
-    ]
+
+
+def test_replays_tell_the_time_left(capsys, monkeypatch):
+    """Of works of 20, 10 and 10 the first is half done after 10 s, the second done, the third not begun."""
+    size, seen = np.array([20.0, 10.0, 10.0]), np.array([[5.0, 15.0, 0.5], [5.0, 15.0, 1.0], [0.0, 0.0, 0.0]])
+    assert compute.so_far(size, seen, 2) == (0.5, pytest.approx(10.0))
+    assert compute.so_far(size, seen, 1)[1] == pytest.approx(20.0) and compute.so_far(size, 0 * seen, 2) == (0.0, None)
+    monkeypatch.setattr(compute, "LONG", 0.02)
+    monkeypatch.setattr(Progress, "EVERY", 0.0)
+
+    def work(k):
+        def of_it():
+            for part in np.linspace(0, 1, 11):
+                tell(k, part)
+                time.sleep(0.01)
+
+        return of_it
+
+    with compute.watched([1.0, 1.0, 1.0], 2, "the files", Progress()) as tell:
+        compute.forked(3, work, 2)
+    *said, end = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert end == "replayed the files" and len(said) > 2
+    assert all(re.fullmatch(r"replaying the files, \d+ % done, about 0 s left", line) for line in said)
 
 
 @pytest.mark.parametrize("lanes", [1, 3])

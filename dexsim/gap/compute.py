@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import heapq
+import mmap
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
@@ -28,7 +30,7 @@ MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
 SWITCH = 2e-4
 WORTH = 20_000  # steps of guesses that a part has at least: about 2 ms, beside the tenth of one that a launch takes
 
-LONG = 3.0  # s: steps that take less go by without a word
+LONG = 4.0  # s between two words on work that is watched; what takes less goes by without one
 
 ENDLESS = 1 << 36  # bytes of the file that a reader with a fork's limits would read: days, a TiB
 
@@ -101,68 +103,79 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
         return list(pool.map(work, range(count)))
 
 
-def forked(
-    count: int,
-    prepared: Callable[[int], Callable[[], T]],
-    at_once: int,
-    tell: Callable[[int, float], None] = lambda k, part: None,
-) -> list[T]:
+def forked(count: int, prepared: Callable[[int], Callable[[], T]], at_once: int) -> list[T]:
     """Return prepared(k)() for k below `count`, in order: side by side in forks of this process, for what is Python
-    itself; without such a fork here, one after the other. Nothing of it may touch a GPU. tell(k, part): k begins (part
-    0) or has ended (1)."""
-    forks = min(at_once, count) > 1 and system.start_method() == "fork"
+    itself; without such a fork here, one after the other. Nothing of it may touch a GPU."""
+    if min(at_once, count) <= 1 or system.start_method() != "fork":
+        return [prepared(k)() for k in range(count)]
 
-    def one(k: int, work: Callable[[], T]) -> T:
-        tell(k, 0.0)
+    def one(work: Callable[[], T]) -> T:
         try:
-            out = guard.call(work, what="a fork", size=ENDLESS) if forks else work()
+            return guard.call(work, what="a fork", size=ENDLESS)
         except UserError:  # its own, or the system has no process or memory for it
-            out = work()
-        tell(k, 1.0)
-        return out
+            return work()
 
-    if not forks:
-        return [one(k, prepared(k)) for k in range(count)]
     with ThreadPoolExecutor(at_once) as pool:
-        return list(pool.map(one, range(count), [prepared(k) for k in range(count)]))
+        return list(pool.map(one, [prepared(k) for k in range(count)]))
 
 
-class Steps:
-    """How long steps of known sizes will take, `lanes` at a time in their order: one that has ended tells it."""
+@contextmanager
+def watched(
+    sizes: Sequence[float], lanes: int, what: str, progress: Callable[..., None] | None
+) -> Iterator[Callable[[int, float], None]]:
+    """Yield tell(k, part), by which work k, in whatever fork of this process, says how much of it is done, 0 to 1.
+    progress is told every `LONG` s how far all of it is, `lanes` at a time in their order, and the time left. sizes:
+    how long each takes beside the others; what: is replayed, in words."""
+    size, seen = np.array(sizes), np.frombuffer(mmap.mmap(-1, 24 * max(len(sizes), 1))).reshape(-1, 3)
+    over = threading.Event()
 
-    def __init__(self, sizes: Sequence[float], lanes: int):
-        self._sizes, self._lanes = sizes, lanes
-        self._begun, self._took = dict[int, float](), dict[int, float]()
-
-    def tell(self, k: int, part: float) -> None:
-        """Step k has begun, is under way, or has ended (part 1)."""
+    def tell(k: int, part: float) -> None:
         now = time.monotonic()
-        begun = self._begun.setdefault(k, now)
-        if part >= 1.0:
-            self._took[k] = now - begun
+        seen[k] = (seen[k, 0] or now), now, max(part, 1e-9)
 
-    def done(self) -> float:
-        """Return the share that is done, 0 to 1."""
-        return 1.0 - sum(x for k, x in enumerate(self._sizes) if k not in self._took) / sum(self._sizes)
+    def watch(say: Callable[..., None]) -> None:
+        said = False
+        while not over.wait(LONG):
+            share, left = so_far(size, seen[: len(size)], lanes)
+            if left is not None and share < 1:
+                say(share, 1, what, left, "replay")
+                said = True
+        if said:
+            say(1, 1, what, None, "replay")
 
-    def left(self) -> float | None:
-        """Return s that are left; None before the first has ended."""
-        if not self._took:
-            return None
-        now, each = time.monotonic(), sum(self._took.values()) / sum(self._sizes[k] for k in self._took)
-        begun = [max(each * self._sizes[k] - now + t, 0.0) for k, t in self._begun.items() if k not in self._took]
-        return self._last(begun, [each * x for x in self._sizes[len(self._begun) :]])
-
-    def _last(self, begun: Sequence[float], waiting: Sequence[float]) -> float:
-        """Return s until the last ends; begun, waiting: what each takes from now on [s]."""
-        lanes = [*begun, *[0.0] * (self._lanes - len(begun))]
-        heapq.heapify(lanes)
-        for x in waiting:  # each goes where a lane is free first
-            heapq.heapreplace(lanes, lanes[0] + x)
-        return max(lanes)
+    thread = threading.Thread(target=watch, args=(progress,)) if progress else None
+    if thread:
+        thread.start()
+    try:
+        yield tell
+    finally:
+        over.set()
+        if thread:
+            thread.join()
 
 
-class Pace(Steps):
+def so_far(size: np.ndarray, seen: np.ndarray, lanes: int) -> tuple[float, float | None]:
+    """Return (share that is done, s that are left; None before anything is) of works of sizes [n]. seen [n, 3]: when
+    each began, when it was looked at [s], and how much of it was done then."""
+    begun, at, part = seen.T
+    on, share = at > begun, float(size @ part / size.sum())
+    if not on.any():
+        return share, None
+    each = (at - begun)[on].sum() / (size * part)[on].sum()
+    rest = each * size * (1 - part)
+    return share, last(rest[on & (part < 1)].tolist(), rest[~on].tolist(), lanes)
+
+
+def last(begun: Sequence[float], waiting: Sequence[float], lanes: int) -> float:
+    """Return s until the last ends of what takes so long from now on [s]: begun, and waiting for one of `lanes`."""
+    ends = [*begun, *[0.0] * (lanes - len(begun))]
+    heapq.heapify(ends)
+    for x in waiting:  # each goes where a lane is free first
+        heapq.heapreplace(ends, ends[0] + x)
+    return max(ends)
+
+
+class Pace:
     """How long searches of `count` joints will take, `lanes` at a time. How much is hidden in a joint is known when it
     is searched: the time is told from those that have ended, once they say it within `KNOWN`."""
 
@@ -170,11 +183,19 @@ class Pace(Steps):
     SPREAD, PRIOR = 0.7, 3  # of their mean, by which searches differ as a rule, and how many it counts for
 
     def __init__(self, count: int, lanes: int):
-        super().__init__([1.0] * count, lanes)
+        self._count, self._lanes = count, lanes
+        self._begun, self._took = dict[int, float](), dict[int, float]()
+
+    def tell(self, k: int, part: float) -> None:
+        """Search k has begun, is under way, or has ended (part 1)."""
+        now = time.monotonic()
+        begun = self._begun.setdefault(k, now)
+        if part >= 1.0:
+            self._took[k] = now - begun
 
     def left(self) -> float | None:
         """Return s that are left; None where they are not known."""
-        took, rest, now = np.array([*self._took.values()]), len(self._sizes) - len(self._took), time.monotonic()
+        took, rest, now = np.array([*self._took.values()]), self._count - len(self._took), time.monotonic()
         if len(took) < 3 or rest < 2 * self._lanes or took.mean() <= 0:
             return None  # when the last of those side by side ends nobody knows
         under_way = [now - t for k, t in self._begun.items() if k not in self._took]
@@ -186,25 +207,7 @@ class Pace(Steps):
             return None
         # of one that takes longer than others half of that is to come
         begun = [max(mean - t, 0.5 * mean) for t in under_way]
-        return self._last(begun, [mean] * (len(self._sizes) - len(self._begun)))
-
-
-def told(
-    sizes: Sequence[float], lanes: int, what: str, progress: Callable[..., None] | None
-) -> Callable[[int, float], None]:
-    """Return what tells `progress` of steps (`Steps`; what: they do, in words) that take longer than `LONG`: k has
-    begun or ended."""
-    steps, lock, said = Steps(sizes, lanes), threading.Lock(), [False]
-
-    def tell(k: int, part: float) -> None:
-        with lock:
-            steps.tell(k, part)
-            left, done = steps.left(), steps.done()
-            if progress and left is not None and (said[0] or left > LONG):
-                said[0] = True
-                progress(done, 1, what, left, "replay")
-
-    return tell
+        return last(begun, [mean] * (self._count - len(self._begun)), self._lanes)
 
 
 def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,

@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -56,8 +57,8 @@ KINDS = 0.7  # of the time that there is for the choice: what every joint as its
 MORE = 2.0  # times as much of it is replayed, or none again
 LEAST = 0.1  # of each part held out: by less nothing is chosen
 FAR = 0.1  # of the error: by more the engine that trains and the search's own plant differ
-STEPPED = 8  # worlds that a step takes as long for as for itself
-REPLAYED = "what may be written"
+STEPPED = 4  # worlds that a step takes as long for as for what is around them
+REPLAYED, TOLD = "what may be written", 500  # steps from one word on it to the next
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BELIEVED = "believed"  # candidate: nothing is changed
@@ -339,7 +340,7 @@ def free_runs(
 ) -> list:
     """Return reported positions [T, J] of each world at every step, from its first position and speed on, as one batch
     a drive and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead. progress: of
-    `compute.told`."""
+    `compute.watched`."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         # as long as the longest of a batch all of it runs
@@ -357,14 +358,15 @@ def free_runs(
 
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
-        return _batch(spec, joints, [worlds[i] for i in mine], together, device, timestep, engine, torque)
+        given = [worlds[i] for i in mine]
+        return _batch(spec, joints, given, together, device, timestep, engine, torque, partial(tell, k))
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
-    tell = compute.told(sizes, cores, REPLAYED, progress)
-    for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores, tell), strict=True):
-        for i, q in zip(mine, moved, strict=True):
-            out[i] = q
+    with compute.watched(sizes, cores, REPLAYED, progress) as tell:
+        for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores), strict=True):
+            for i, q in zip(mine, moved, strict=True):
+                out[i] = q
     return out
 
 
@@ -377,8 +379,9 @@ def _batch(
     timestep: float,
     kind: str,
     torque: bool,
+    tell: Callable[[float], None],
 ) -> Callable[[], list]:
-    """Return what moves these of a group's worlds: as they do in a batch of all of it."""
+    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done."""
     spec = (worlds[0].spec or spec).copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -434,7 +437,8 @@ def _batch(
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
 
     def moved() -> list:
-        shown = _stepped(engine, servo, changes, seen, given, path)
+        shown = _stepped(engine, servo, changes, seen, given, path, tell)
+        tell(1.0)
         q, *tau = (x.cpu().numpy().astype(float) for x in (shown, given) if x is not None)
         return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
 
@@ -489,9 +493,11 @@ def _stepped(
     seen: torch.Tensor,
     given: torch.Tensor | None,
     lead: Callable[[int], None],
+    tell: Callable[[float], None],
 ) -> torch.Tensor:
     """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
-    given [S, N, J]: filled with the drives' torques; lead: of `_path`."""
+    given [S, N, J]: filled with the drives' torques; lead: of `_path`; tell: how much
+    of it is done."""
     steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
@@ -500,6 +506,8 @@ def _stepped(
 
         def before_each() -> None:
             k = next(step)
+            if not k % TOLD:
+                tell(k / steps)
             if k in changes.when:
                 changes.before(k)
             lead(k)
@@ -519,6 +527,8 @@ def _stepped(
         for k in step:
             if k == steps:
                 break
+            if not k % TOLD:
+                tell(k / steps)
             changes.before(k)
             lead(k)
             seen[k].copy_(servo.position())
@@ -626,7 +636,7 @@ def write_best(
 ) -> Written:
     """Choose of each joint the candidate that follows what was held out best. noise: floor of each joint [rad or m];
     engine: of `REPLAY`; none: by the search's own plant; room: s that there are for it; too few: by the begin of each
-    part held out, by the search's own plant where that is less than `LEAST`. progress: of `compute.told`. Raises
+    part held out, by the search's own plant where that is less than `LEAST`. progress: of `compute.watched`. Raises
     UserError where the model or a drive does not serve the engine."""
     errors = {j: {c.name: c.plant for c in given} for j, given in candidates.items()}
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
@@ -668,8 +678,8 @@ def rms(missed: Sequence[np.ndarray]) -> float:
 
 
 class Kept:
-    """What was held out of the fit, replayed. windows: of all of it; progress: of `compute.told`; recordings, starts,
-    ends [W] s of each part."""
+    """What was held out of the fit, replayed. windows: of all of it; progress: of `compute.watched`; recordings,
+    starts, ends [W] s of each part."""
 
     def __init__(
         self,
