@@ -291,14 +291,14 @@ def touch_kernels(
 
 
 @wp.func
-def per_weight(pads: Pads, groups: Groups, distance: wp.array3d(dtype=float), w: int, g: int, level: float):
-    """Return one over the sum of a group's weights."""
+def weight_of(pads: Pads, groups: Groups, distance: wp.array3d(dtype=float), w: int, g: int, level: float):
+    """Return the sum of a group's weights."""
     whole = float(0.0)
     for i in range(groups.first[g], groups.first[g + 1]):
         f = groups.pads[i]
         for t in range(pads.count[f]):
             whole += spread_weight(distance[w, f, t], pads.taxel[f, t][3], level)
-    return 1.0 / whole
+    return whole
 
 
 def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool, selves: bool) -> Callable:
@@ -328,6 +328,7 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                 b = pose_in(here.xpos, here.xmat, w, body, here.object_body[o])
                 level = float(0.0)
                 scale = float(1.0)
+                share = float(1.0)
                 near = bool(True)
                 if wp.static(solver):
                     nearest = float(FAR)
@@ -338,7 +339,8 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                             out.distance[w, f, t] = d
                             nearest = wp.min(nearest, d)
                     level = spread_level(nearest, law.reach)
-                    scale = pressed * per_weight(pads, groups, out.distance, w, g, level)
+                    share = weight_of(pads, groups, out.distance, w, g, level)
+                    scale = pressed / share
                 else:
                     near = may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3])
                 if near:
@@ -350,16 +352,16 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                             p = pads.taxel[f, t]
                             c = float(0.0)
                             if wp.static(solver):
-                                c = scale * spread_weight(out.distance[w, f, t], p[3], level)
+                                c = spread_weight(out.distance[w, f, t], p[3], level)
                             else:
                                 d = distance(shapes, shape, size, a * xyz(p) + b)
                                 if d < 0.0:
                                     c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
                             s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                             if wp.static(raw):
-                                out.felt[w, f, t] = out.felt[w, f, t] + c
-                        out.force[w, f] = out.force[w, f] + s[3]
-                        out.centre[w, f] = out.centre[w, f] + xyz(s)
+                                out.felt[w, f, t] = out.felt[w, f, t] + scale * c
+                        out.force[w, f] = out.force[w, f] + pressed * (s[3] / share)  # of a pad alone, all of it
+                        out.centre[w, f] = out.centre[w, f] + scale * xyz(s)
         for i in range(first, end):
             f = groups.pads[i]
             moment = out.centre[w, f]
@@ -394,7 +396,7 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                                 out.distance[w, f, t] = d
                                 nearest = wp.min(nearest, d)
                 level = spread_level(nearest, law.reach)
-                scale = other * per_weight(pads, groups, out.distance, w, g, level)
+                scale = other / weight_of(pads, groups, out.distance, w, g, level)
                 for i in range(first, end):
                     f = groups.pads[i]
                     for t in range(pads.count[f]):
