@@ -152,18 +152,18 @@ class ByPad:
         args = [wp.from_torch(mask), self._row["gain"], self._m.gain, episode, self.seed, gain]
         wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
 
-    def launch_skin(self, touch: Tactile, felt: wp.array) -> wp.array:
-        """Return felt forces [N, F, T] N as they reach each taxel's wire; `felt` itself where nothing lies between.
+    def launch_skin(self, touch: Tactile, forces: wp.array) -> wp.array:
+        """Return felt forces [N, F, T] N as they reach each taxel's wire; `forces` itself where nothing lies between.
         touch: `Tactile`."""
         m, n, f = self._m, self.shape[0], self.shape[1]
         if self.rubber:
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
-            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, felt, m.spread]
+            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, forces, m.spread]
             wp.launch(kernel, dim=(n, f), inputs=args, device=self.device)
-            felt = m.spread
+            forces = m.spread
         if self.hysteresis:
             args = [
-                felt,
+                forces,
                 self._row["hysteresis"],
                 self._row["hysteresis_time"],
                 touch.imperfect.now,
@@ -172,19 +172,19 @@ class ByPad:
                 m.skin,
             ]
             wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
-            felt = m.skin
+            forces = m.skin
         if self.mixes:
             wp.launch(
                 mix,
                 dim=self.shape,
-                inputs=[felt, self._row["crosstalk"], m.order, m.beside, m.mixed],
+                inputs=[forces, self._row["crosstalk"], m.order, m.beside, m.mixed],
                 device=self.device,
             )
-            felt = m.mixed
-        return felt
+            forces = m.mixed
+        return forces
 
     def launch_stuck(self, touch: Tactile) -> None:
-        """Readings that never change, over those that were just written into the ring."""
+        """Write readings that never change over those that were just written into the ring."""
         m = touch.imperfect
         if self._m.stuck_at.shape[0]:
             args = [self._m.stuck, self._m.stuck_at, m.effects.lsb, m.tick, float(self.cfg.full_scale), m.ring]
@@ -220,7 +220,8 @@ class ByPad:
 
 @wp.func
 def rubber_pressure(depth: float, thickness: float, c10: float, c01: float):
-    """Pa of a Mooney-Rivlin layer pressed in by `depth` [m]; see `dexsim.tactile.kernel.taxel_force`."""
+    """Return the pressure [Pa] of a Mooney-Rivlin layer pressed in by `depth` [m]; see
+    `dexsim.tactile.kernel.taxel_force`."""
     l = 1.0 - wp.min(depth / thickness, wp.static(MAX_STRAIN))
     return 2.0 * (1.0 / (l * l) - l) * (c10 + c01 / l)
 
@@ -248,14 +249,14 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
         law: Law,
         shapes: Shapes,
         skins: Skins,
-        felt: wp.array3d(dtype=float),
+        forces: wp.array3d(dtype=float),
         # out
         out: wp.array3d(dtype=float),
     ):
         w, f = wp.tid()
         n = pads.count[f]
-        for t in range(felt.shape[2]):
-            out[w, f, t] = felt[w, f, t]
+        for t in range(forces.shape[2]):
+            out[w, f, t] = forces[w, f, t]
         shape = here.shape_id[w, 0]
         pressed = float(1.0)
         if wp.static(solver):
@@ -298,7 +299,7 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
                 else:
                     if d < 0.0:
                         was = taxel_force(wp.static(kind), law, k, -d, area, law.threshold[w])
-                other = felt[w, f, t] - was
+                other = forces[w, f, t] - was
                 if other > wp.static(LEFT):
                     z += other
             out[w, f, t] = z
@@ -308,7 +309,7 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
 
 @wp.kernel(enable_backward=False)
 def relax_pads(
-    felt: wp.array3d(dtype=float),
+    forces: wp.array3d(dtype=float),
     fraction: wp.array2d(dtype=float),
     time_constant: wp.array2d(dtype=float),
     time: wp.array(dtype=float),
@@ -318,12 +319,12 @@ def relax_pads(
     # out
     out: wp.array3d(dtype=float),
 ):
-    """The standard linear solid of `dexsim.tactile.measure`, its constants by pad."""
+    """Apply the standard linear solid of `dexsim.tactile.measure`, its constants by pad."""
     w, f, t = wp.tid()
     dt = float(0.0)
     if last[w] >= 0.0:
         dt = time[w] - last[w]
-    z = felt[w, f, t]
+    z = forces[w, f, t]
     s = relax(state[w, f, t], z, dt, time_constant[w, f])
     state[w, f, t] = s
     out[w, f, t] = rubber_force(z, s, fraction[w, f])
@@ -331,19 +332,19 @@ def relax_pads(
 
 @wp.kernel(enable_backward=False)
 def mix(
-    felt: wp.array3d(dtype=float),
+    forces: wp.array3d(dtype=float),
     crosstalk: wp.array2d(dtype=float),
     order: wp.array2d(dtype=int),
     beside: wp.array3d(dtype=int),
     # out
     out: wp.array3d(dtype=float),
 ):
-    """A taxel keeps 1 - c of its force and gives c in equal parts to those beside it: the pad's sum stays. Then each
-    wire carries the taxel at order[t]."""
+    """Mix forces: a taxel keeps 1 - c of its own and gives c in equal parts to those beside it: the pad's sum stays.
+    Then each wire carries the taxel at order[t]."""
     w, f, t = wp.tid()
     k = order[f, t]
     c = crosstalk[w, f]
-    z = felt[w, f, k]
+    z = forces[w, f, k]
     if c > 0.0:
         got = float(0.0)
         for i in range(beside.shape[2]):
@@ -353,7 +354,7 @@ def mix(
                 for h in range(beside.shape[2]):
                     if beside[f, j, h] >= 0:
                         many += 1.0
-                got += felt[w, f, j] / many
+                got += forces[w, f, j] / many
         z = (1.0 - c) * z + c * got
     out[w, f, t] = z
 
@@ -368,7 +369,7 @@ def lay_gains(
     # in and out
     gain: wp.array3d(dtype=float),
 ):
-    """Gains that were drawn, times the taxel's own (uniform in its range), or the pad's."""
+    """Set the gains: those that were drawn, times the taxel's own (uniform in its range), or the pad's."""
     w, f, t = wp.tid()
     if mask[w]:
         g = of_pad[w, f]
@@ -389,7 +390,7 @@ def stick(
     # out
     ring: wp.array4d(dtype=float),
 ):
-    """Taxels [S, 2] (pad, taxel) read what they always read, in whole counts where there are counts."""
+    """Let taxels [S, 2] (pad, taxel) read what they always read, in whole counts where there are counts."""
     w, i = wp.tid()
     ring[tick[0] % ring.shape[0], w, where[i, 0], where[i, 1]] = counts(value[i], lsb[w], 0.0, full_scale)
 
@@ -405,8 +406,8 @@ def choose(
     part: wp.array2d(dtype=float),
     late: wp.array(dtype=int),
 ):
-    """The two readings between which each pad's delayed moment lies, and how far along; `dexsim.tactile.measure.stamp`
-    has noted the times. older -1: none is as old yet."""
+    """Find the two readings between which each pad's delayed moment lies, and how far along;
+    `dexsim.tactile.measure.stamp` has noted the times. older -1: none is as old yet."""
     w, f = wp.tid()
     n = stamps.shape[1]
     wanted = time[w] - delay[w, f]
@@ -458,7 +459,8 @@ def pick(
     out: wp.array4d(dtype=float),
     out_shear: wp.array4d(dtype=wp.vec2),
 ):
-    """Each pad's delayed reading into one slot, interpolated and again in whole counts; 0 where there is none yet."""
+    """Write each pad's delayed reading into one slot, interpolated and again in whole counts; 0 where there is none
+    yet."""
     w, f, t = wp.tid()
     a = older[w, f]
     b = newer[w, f]

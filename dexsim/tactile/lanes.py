@@ -76,7 +76,7 @@ def lowest_bit(bits: int) -> int:  # type: ignore[empty-body]
 
 @wp.func
 def lanes_min(v: float):
-    """The least value of all lanes, in all lanes."""
+    """Return the least value of all lanes, in all lanes."""
     for k in range(5):
         v = wp.min(v, lane_xor(v, 1 << k))
     return v
@@ -84,7 +84,7 @@ def lanes_min(v: float):
 
 @wp.func
 def lanes_sum(v: float):
-    """The sum of all lanes, in all lanes."""
+    """Return the sum of all lanes, in all lanes."""
     for k in range(5):
         v += lane_xor(v, 1 << k)
     return v
@@ -92,7 +92,7 @@ def lanes_sum(v: float):
 
 @wp.func
 def lanes_sum4(v: wp.vec4, lane: int):
-    """The sum of all lanes, in all lanes; 10 shuffles instead of 20.
+    """Return the sum of all lanes, in all lanes; 10 shuffles instead of 20.
 
     Two halvings leave each lane one component, summed over 4 lanes; three exchanges complete it; lane 8 c then holds
     component c.

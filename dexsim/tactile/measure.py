@@ -58,13 +58,14 @@ def relax(state: float, elastic: float, dt: float, time: float):
 
 @wp.func
 def rubber_force(elastic: float, state: float, fraction: float):
-    """Standard linear solid: the elastic force plus a branch that has relaxed to `state`; rubber does not pull."""
+    """Return the force of a standard linear solid: the elastic force plus a branch that has relaxed to `state`; rubber
+    does not pull."""
     return wp.max(elastic + fraction * (elastic - state), 0.0)
 
 
 @wp.func
 def cap(f: wp.vec2, limit: float):
-    """Coulomb: the same direction, no longer than the limit."""
+    """Cap a friction force by Coulomb: the same direction, no longer than the limit."""
     size = wp.length(f)
     if size > limit:
         f = f * (limit / size)
@@ -73,7 +74,7 @@ def cap(f: wp.vec2, limit: float):
 
 @wp.func
 def counts(f: float, lsb: float, low: float, high: float):
-    """Rounded to whole counts of `lsb` [N] between low and high; lsb 0: as it is."""
+    """Round to whole counts of `lsb` [N] between low and high; lsb 0: as it is."""
     if lsb > 0.0:
         f = lsb * wp.clamp(wp.round(f / lsb), low, high)
     return f
@@ -84,7 +85,7 @@ def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
     """Return one thread per (world, pad, taxel): felt force in, reading of this moment into slot `tick` of the ring."""
 
     def measure_taxels(
-        felt: wp.array3d(dtype=float),
+        forces: wp.array3d(dtype=float),
         here: Surroundings,
         pads: Pads,
         effects: Effects,
@@ -93,7 +94,7 @@ def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
     ):
         w, f, t = wp.tid()
         slot = m.tick[0] % m.ring.shape[0]
-        elastic = felt[w, f, t]
+        elastic = forces[w, f, t]
         z = elastic
         if wp.static(hysteresis):
             dt = float(0.0)
@@ -106,7 +107,7 @@ def taxel_kernel(shear: bool, hysteresis: bool, noise: bool) -> wp.Kernel:
         r = wp.vec3(0.0, 0.0, 0.0)
         if wp.static(noise):
             if t < pads.count[f]:
-                rng = wp.rand_init(m.seed + 7919 * m.tick[0], (w * felt.shape[1] + f) * felt.shape[2] + t)
+                rng = wp.rand_init(m.seed + 7919 * m.tick[0], (w * forces.shape[1] + f) * forces.shape[2] + t)
                 sigma = effects.noise[w]
                 r = wp.vec3(sigma * wp.randn(rng), sigma * wp.randn(rng), sigma * wp.randn(rng))
                 if g == 0.0:
@@ -187,7 +188,7 @@ def stamp(
 
 @wp.kernel(enable_backward=False)
 def clock(time: wp.array(dtype=Any), now: wp.array(dtype=float), tick: wp.array(dtype=int)):
-    """The engine's time [s] in float32, and one more reading."""
+    """Copy the engine's time [s] in float32, and count one more reading."""
     w = wp.tid()
     now[w] = float(time[w])
     if w == 0:
@@ -204,7 +205,7 @@ def draw_gains(
     # out
     gain: wp.array3d(dtype=float),
 ):
-    """Gains 1 + spread * normal, at least 0; a share `dead` of the taxels has gain 0."""
+    """Draw gains 1 + spread * normal, at least 0; a share `dead` of the taxels has gain 0."""
     w, f, t = wp.tid()
     if mask[w]:
         rng = wp.rand_init(seed + 104729 * episode[w], (w * gain.shape[1] + f) * gain.shape[2] + t)

@@ -81,9 +81,9 @@ def load4(data: wp.array(dtype=wp.vec4), i: int) -> wp.vec4:
 def sd_cells(
     data: wp.array(dtype=wp.vec4), offset: int, n: wp.vec3i, origin: wp.vec3, h: float, scale: float, q: wp.vec3
 ):
-    """Trilinear inside the grid. Outside: sqrt(gap^2 + v^2), gap the distance to the grid's box and v the value at the
-    nearest point c of it. That is a lower bound of the true distance for any shape inside the box (for k in the box,
-    |q - k|^2 >= |q - c|^2 + |c - k|^2), positive and continuous."""
+    """Read a grid: trilinear inside it. Outside: sqrt(gap^2 + v^2), gap the distance to the grid's box and v the value
+    at the nearest point c of it. That is a lower bound of the true distance for any shape inside the box (for k in the
+    box, |q - k|^2 >= |q - c|^2 + |c - k|^2), positive and continuous."""
     # in cells; the reciprocals are the same for all points
     g = q * (1.0 / (scale * h)) - origin * (1.0 / h)
     x = wp.clamp(g[0], 0.0, float(n[0] - 1))
@@ -118,13 +118,13 @@ def sd_cells(
 
 @wp.func
 def sd_grid(s: Shapes, i: int, scale: float, q: wp.vec3):
-    """Signed distance [m] of q to grid shape i at this scale."""
+    """Return the signed distance [m] of q to grid shape i at this scale."""
     return sd_cells(s.data, s.offset[i], s.dims[i], s.origin[i], s.spacing[i], scale, q)
 
 
 @wp.func
 def primitive(kind: int, size: wp.vec3, q: wp.vec3):
-    """Signed distance [m] of q to a primitive of this size."""
+    """Return the signed distance [m] of q to a primitive of this size."""
     d = float(0.0)
     if kind == wp.static(BOX):
         d = sd_box(q, size)
@@ -139,7 +139,7 @@ def primitive(kind: int, size: wp.vec3, q: wp.vec3):
 
 @wp.func
 def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
-    """Signed distance [m] of q to shape i of the set, at this world's size."""
+    """Return the signed distance [m] of q to shape i of the set, at this world's size."""
     d = float(0.0)
     if s.kind[i] == wp.static(GRID):
         d = sd_grid(s, i, size[0], q)
@@ -150,7 +150,7 @@ def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
 
 @wp.func
 def bound_radius(s: Shapes, i: int, size: wp.vec3):
-    """Radius [m] of a sphere about the frame's origin that holds the shape."""
+    """Return the radius [m] of a sphere about the frame's origin that holds the shape."""
     kind = s.kind[i]
     r = float(0.0)
     if kind == wp.static(BOX):
@@ -168,19 +168,19 @@ def bound_radius(s: Shapes, i: int, size: wp.vec3):
 
 @wp.func
 def boxes_apart(a: wp.mat33, b: wp.vec3, middle: wp.vec3, half: wp.vec3, other_middle: wp.vec3, other_half: wp.vec3):
-    """Whether a face of one of two boxes separates them; the first box's frame has rotation a and origin b in the
-    second's. Boxes that only edges separate count as not apart."""
+    """Return whether a face of one of two boxes separates them; the first box's frame has rotation a and origin b in
+    the second's. Boxes that only edges separate count as not apart."""
     d = a * middle + b - other_middle
     e = wp.transpose(a) * d
-    apart = bool(False)
+    clear = bool(False)
     for k in range(3):
         reach = wp.abs(a[k, 0]) * half[0] + wp.abs(a[k, 1]) * half[1] + wp.abs(a[k, 2]) * half[2]
         if wp.abs(d[k]) > other_half[k] + reach:
-            apart = True
+            clear = True
         reach = wp.abs(a[0, k]) * other_half[0] + wp.abs(a[1, k]) * other_half[1] + wp.abs(a[2, k]) * other_half[2]
         if wp.abs(e[k]) > half[k] + reach:
-            apart = True
-    return apart
+            clear = True
+    return clear
 
 
 @wp.func
@@ -191,9 +191,9 @@ def in_box(q: wp.vec3, middle: wp.vec3, half: wp.vec3):
 
 @wp.func
 def normal(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
-    """Outward unit normal at the surface point nearest to q: the gradient of the distance, by central differences of
-    1e-3 of the size or a grid's spacing. Exact but at edges, where the nearest point is not one. For inspection and
-    tests: no force needs it, since each taxel presses along its own normal."""
+    """Return the outward unit normal at the surface point nearest to q: the gradient of the distance, by central
+    differences of 1e-3 of the size or a grid's spacing. Exact but at edges, where the nearest point is not one. For
+    inspection and tests: no force needs it, since each taxel presses along its own normal."""
     e = 1.0e-5
     if s.kind[i] == wp.static(GRID):
         e = 0.5 * s.spacing[i] * size[0]
