@@ -365,18 +365,6 @@ def test_catalogue_is_that_of_the_specification():
                 assert p.low < p.high
 
 
-def test_gravity_a_little_askew_is_a_belief_refitted_and_no_effect():
-    fits = []
-    for askew in (0.0, 0.012):
-        runs = [plant_run(f"r{k}", k, 4.0, {"tilt_y": askew}, seed=k) for k in (0, 1)]
-        for r in runs:
-            r.smooth()
-        fit = JointSearch(build(model(), runs)[0], [0, 1], None, [0, 1]).start().fit
-        fits.append(fit.loss)
-        assert dict(zip([p.key for p in fit.params], fit.x, strict=True))["tilt_y"] == pytest.approx(askew, abs=1e-3)
-    assert fits[1] < 1.2 * fits[0]
-
-
 # -- planted effects, in our own plant
 # ------------------------------------------------------------------------------------------------------------
 

@@ -225,9 +225,6 @@ class BeliefRules:
     # it, and dead where it is pressed and its neighbours feel twice as much
     zero: float = 2.0
     effort_zero: float = 0.01  # of the torque limit: what a reading of the effort may be off by at rest
-    # rad by which gravity, as a joint feels it, is turned: the base stands askew, links' centres lie a hundredth of a
-    # link beside the line that the model has (a standard deviation; three times as much are refitted)
-    tilt: float = 0.01
     prior: float = 30.0  # samples that one belief weighs, at one standard deviation
     trace: float = 0.02  # sigmas of the residuals that a belief must move over its range to be refitted at all
 

@@ -169,11 +169,6 @@ def _within(key: str, *columns: str) -> Param:
     return Param(key, columns, "factor", 1 - off, 1 + off, 1.0, nuisance=True, sd=0.5 * off)
 
 
-def _about_zero(column: str, sd: float) -> Param:
-    """Return what is believed to be nothing, to a standard deviation."""
-    return Param(column, (column,), "set", -3 * sd, 3 * sd, 0.0, "rad", nuisance=True, sd=sd)
-
-
 def _figures(case: Case) -> list[Param]:
     """Return the drive's figures that are believed, stated as a range or unknown."""
     out, s = [], case.scales
@@ -240,7 +235,6 @@ def _of_the_body(case: Case) -> list[Param]:
     out = [Param("inertia", ("inertia_scale",), "factor", low, high, middle, nuisance=True, sd=sd)]
     if s.gravity > 0.01 * s.tau:
         out.append(_within("gravity", "gravity_scale"))
-    out += [_about_zero(f"tilt_{k}", BELIEF.tilt) for k, size in s.tilt.items() if size > 0]
     if c.damping > 0:
         d = BELIEF.tolerance * c.damping
         out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
