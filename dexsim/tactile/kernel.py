@@ -132,7 +132,7 @@ class FlatFelt:
 
 @wp.func
 def taxel_force(kind: int, law: Law, stiffness: float, depth: float, area: float, threshold: float):
-    """Return the normal force [N] of a taxel pressed in by `depth` > 0 [m].
+    """Normal force [N] of a taxel pressed in by `depth` > 0 [m].
 
     Linear: stiffness * area * depth, an elastic foundation (paper, "Tactile Sensor Simulation": f = k d, weighted by
     the area a taxel stands for); its sum grows with about the square of the depth. Hertz: stiffness * area *
@@ -156,13 +156,13 @@ def taxel_force(kind: int, law: Law, stiffness: float, depth: float, area: float
 
 @wp.func
 def spread_level(nearest: float, reach: float):
-    """Return the distance under which taxels share the solver's force, given the nearest taxel's distance [m]."""
+    """Distance under which taxels share the solver's force, given the nearest taxel's distance [m]."""
     return wp.max(nearest + reach, 0.0)
 
 
 @wp.func
 def spread_weight(d: float, area: float, level: float):
-    """Return a taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
+    """A taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
 
     Deeper than `reach` the level is 0, the object's surface. A shallower contact, or one that falls between the taxels,
     is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous in the distances,
@@ -175,7 +175,7 @@ def spread_weight(d: float, area: float, level: float):
 
 @wp.func
 def pose_in(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
-    """Return the position of a body's origin in another body's frame."""
+    """Position of a body's origin in another body's frame."""
     return wp.transpose(xmat[w, frame]) * (xpos[w, body] - xpos[w, frame])
 
 
@@ -186,7 +186,7 @@ def turn_in(xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
 
 @wp.func
 def may_touch(shapes: Shapes, shape: int, size: wp.vec3, middle: wp.vec3, radius: float):
-    """Return whether a pad inside a sphere can reach the shape, by bounding spheres, then by the distance."""
+    """Whether a pad inside a sphere can reach the shape: first by bounding spheres, then by the distance itself."""
     near = wp.length(middle) < radius + bound_radius(shapes, shape, size)
     if near:
         # 1 mm covers the interpolation error of coarse grids
@@ -211,7 +211,7 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 @wp.func
 def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
-    """Return whether group g may touch link j: another body, and pressed where the physics says so."""
+    """Whether group g may touch link j: another body, and pressed where the physics says so."""
     near = here.link_body[j] != groups.body[g]
     if near and here.tip_column[g, j] >= 0:
         near = here.pair_normal[w, here.tip_column[g, j]] > 0.0
@@ -220,7 +220,7 @@ def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
 
 @wp.func
 def tips_apart(groups: Groups, tips: Shapes, g: int, j: int, a: wp.mat33, b: wp.vec3):
-    """Return whether group g, whose body has rotation a and origin b in that of link j, surely does not touch it."""
+    """Whether group g, whose body has rotation a and origin b in that of link j, surely does not touch it."""
     return boxes_apart(a, b, groups.middle[g], groups.half[g], tips.middle[j], tips.half[j])
 
 
@@ -526,14 +526,14 @@ def _measures(rounds: int) -> SimpleNamespace:
 def _lanes(
     solver: bool, raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, objects: int
 ) -> Callable:
-    """Return a kernel whose warp looks at `ITEMS` pairs of world and group, then measures those that are pressed."""
+    """A warp looks at `ITEMS` pairs of a world and a group, and measures, one after another, those that are pressed."""
     do = _measures(rounds)
     Reals, near_rounds, distances, shares = do.Reals, do.near_rounds, do.distances, do.shares
     width = LANES // ITEMS
 
     @wp.func
     def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
-        """Return whether object o may press group g."""
+        """Whether object o may press group g."""
         shape = here.shape_id[w, o]
         near = shape >= 0
         if near:
@@ -645,7 +645,7 @@ def _lanes_of_hand(
     raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, feel_others: bool, links: int,
     selves: bool,
 ) -> Callable:  # fmt: skip
-    """Return the same for what pads feel of the hand itself, which few do at a time."""
+    """The same for what pads feel of the hand itself, which few do at a time."""
     do = _measures(rounds)
     Reals, shares = do.Reals, do.shares
     width = LANES // HAND_ITEMS
