@@ -569,19 +569,19 @@ def _lanes(
                     out.force[pad] = 0.0
                     out.centre[pad] = here.xmat[w, body] * pads.centre[f] + here.xpos[w, body]
         if wp.static(raw):
-            todo = lane_ballot(inside and not busy and lane % wp.static(width) == 0)
-            while todo != 0:
-                one = first + lowest_bit(todo) // wp.static(width)
-                todo = todo & (todo - 1)
+            left = lane_ballot(inside and not busy and lane % wp.static(width) == 0)
+            while left != 0:
+                one = first + lowest_bit(left) // wp.static(width)
+                left = left & (left - 1)
                 w = one // wp.static(group_count)
                 g = one - w * wp.static(group_count)
                 for j in range(groups.first[g], groups.first[g + 1]):
                     for t in range(lane, wp.static(taxels), 32):
                         out.felt[(w * wp.static(pad_count) + groups.pads[j]) * wp.static(taxels) + t] = 0.0
-        todo = lane_ballot(busy and lane % wp.static(width) == 0)
-        while todo != 0:
-            one = first + lowest_bit(todo) // wp.static(width)
-            todo = todo & (todo - 1)
+        left = lane_ballot(busy and lane % wp.static(width) == 0)
+        while left != 0:
+            one = first + lowest_bit(left) // wp.static(width)
+            left = left & (left - 1)
             w = one // wp.static(group_count)
             g = one - w * wp.static(group_count)
             body = groups.body[g]
@@ -690,10 +690,10 @@ def _lanes_of_hand(
                         busy = near_link(here, groups, tips, w, g, j)
             for j in range(groups.first[g] + lane % wp.static(width), groups.first[g + 1], wp.static(width)):
                 out.force_other[w * wp.static(pad_count) + groups.pads[j]] = 0.0
-        todo = lane_ballot(busy)
-        while todo != 0:
-            part = lowest_bit(todo) // wp.static(width)
-            todo = todo & ~(wp.static((1 << width) - 1 if width < 32 else -1) << (part * wp.static(width)))
+        left = lane_ballot(busy)
+        while left != 0:
+            part = lowest_bit(left) // wp.static(width)
+            left = left & ~(wp.static((1 << width) - 1 if width < 32 else -1) << (part * wp.static(width)))
             w = (first + part) // wp.static(group_count)
             g = first + part - w * wp.static(group_count)
             n = groups.rounds[g]
