@@ -35,7 +35,7 @@ from dexsim.tactile.sdf import (
 
 ITEMS = 4
 """Pairs of a world and a group that a warp looks at for the object's touch; those that nothing presses cost little."""
-HAND_ITEMS = 4
+HAND_ITEMS = 8
 """The same for touch of the hand on itself."""
 MAX_UNROLL = 16
 """Rounds of 32 taxels, a taxel a lane, whose distances are kept in registers; more go through a thread's memory."""
@@ -73,7 +73,6 @@ class Groups:
     rounds: wp.array(dtype=int)  # [G]
     round: wp.array2d(dtype=wp.vec3i)  # [G, R] its pad, the number of its first taxel there, 1: the pad's last round
     taxel: wp.array2d(dtype=wp.vec4)  # [G, 32 R] as in `Pads`; copies of the first without area where no taxel is
-    ball: wp.array2d(dtype=wp.vec4)  # [G, R] sphere about one of a round's taxels that holds them: centre, radius
     bound: wp.array(dtype=wp.vec4)  # [G] bounding sphere: centre, radius
     middle: wp.array(dtype=wp.vec3)  # [G] bounding box, body frame
     half: wp.array(dtype=wp.vec3)  # [G]
@@ -434,39 +433,9 @@ def _measures(rounds: int) -> SimpleNamespace:
     chunk = min(CHUNK, rounds)
 
     @wp.func
-    def near_rounds(
-        s: Shapes,
-        i: int,
-        size: wp.vec3,
-        a: wp.mat33,
-        b: wp.vec3,
-        groups: Groups,
-        g: int,
-        n: int,
-        lane: int,
-        reach: float,
-    ):
-        """Return the rounds, as bits, that may have a taxel under the level. A lane asks for a round: how far one of
-        its taxels is bounds the level from above, and with the round's extent what its taxels may have from below."""
-        out = int(-1)
-        if wp.static(CHUNK < rounds <= LANES):
-            if n > wp.static(CHUNK):
-                most = float(FAR)
-                least = float(FAR)
-                if lane < n:
-                    ball = groups.ball[g, lane]
-                    most = distance(s, i, size, a * xyz(ball) + b)
-                    least = most - ball[3] - 1.0e-3  # a millimetre for coarse grids
-                out = lane_ballot(least < spread_level(lanes_min(most), reach))
-        return out
-
-    @wp.func
-    def distances(
-        s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, these: int
-    ):
-        """Return distances of this lane's taxels to a shape, in n rounds from flat index `at` on, those of the bits
-        `these`; FAR elsewhere. All primitives are one formula: a box, or a body of revolution, minus a radius; no
-        branch, a third of the code."""
+    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
+        """Return distances of this lane's taxels to a shape, in n rounds from flat index `at` on; FAR behind them. All
+        primitives are one formula: a box, or a body of revolution, minus a radius; no branch, a third of the code."""
         d = Reals(FAR)
         if s.kind[i] == wp.static(GRID):
             offset = s.offset[i]
@@ -477,9 +446,8 @@ def _measures(rounds: int) -> SimpleNamespace:
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        if wp.static(not CHUNK < rounds <= LANES) or (these & (1 << r)) != 0:
-                            q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
-                            d[r] = sd_cells(s.data, offset, dims, origin, h, size[0], q)
+                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        d[r] = sd_cells(s.data, offset, dims, origin, h, size[0], q)
         else:
             kind = s.kind[i]
             box = kind == wp.static(BOX)
@@ -490,14 +458,33 @@ def _measures(rounds: int) -> SimpleNamespace:
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        if wp.static(not CHUNK < rounds <= LANES) or (these & (1 << r)) != 0:
-                            q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
-                            x = wp.where(box, wp.abs(q[0]) - size[0], wp.sqrt(q[0] * q[0] + q[1] * q[1]) - wide)
-                            y = wp.where(box, wp.abs(q[1]) - size[1], -FAR)
-                            z = wp.abs(q[2]) - tall
-                            most = wp.max(x, wp.max(y, z))
-                            out = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0))
-                            d[r] = wp.length(out) + wp.min(most, 0.0) - round
+                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        x = wp.where(box, wp.abs(q[0]) - size[0], wp.sqrt(q[0] * q[0] + q[1] * q[1]) - wide)
+                        y = wp.where(box, wp.abs(q[1]) - size[1], -FAR)
+                        z = wp.abs(q[2]) - tall
+                        most = wp.max(x, wp.max(y, z))
+                        out = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0))
+                        d[r] = wp.length(out) + wp.min(most, 0.0) - round
+        return d
+
+    @wp.func
+    def nearer(d: Any, s: Shapes, i: int, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float):
+        """Return the lesser of the distances d and those to a grid, of taxels less than `level` [m] from its box."""
+        offset = s.offset[i]
+        dims = s.dims[i]
+        low = s.origin[i]
+        h = s.spacing[i]
+        high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
+        for c in range(wp.static(rounds // chunk)):
+            if wp.static(chunk) * c < n:
+                for k in range(wp.static(chunk)):
+                    r = wp.static(chunk) * c + k
+                    q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                    # those that are far read one cell, all the same, without a branch that others would wait at
+                    off = q - wp.max(low, wp.min(q, high))
+                    near = wp.dot(off, off) <= level * level
+                    e = sd_cells(s.data, offset, dims, low, h, 1.0, wp.where(near, q, low))
+                    d[r] = wp.min(d[r], wp.where(near, e, FAR))
         return d
 
     @wp.func
@@ -520,7 +507,7 @@ def _measures(rounds: int) -> SimpleNamespace:
             d[r] = c
         return d * (force / lanes_sum(whole))
 
-    return SimpleNamespace(Reals=Reals, near_rounds=near_rounds, distances=distances, shares=shares)
+    return SimpleNamespace(Reals=Reals, distances=distances, nearer=nearer, least_of=least_of, shares=shares)
 
 
 def _lanes(
@@ -528,7 +515,7 @@ def _lanes(
 ) -> Callable:
     """A warp looks at `ITEMS` pairs of a world and a group, and measures, one after another, those that are pressed."""
     do = _measures(rounds)
-    Reals, near_rounds, distances, shares = do.Reals, do.near_rounds, do.distances, do.shares
+    Reals, distances, shares = do.Reals, do.distances, do.shares
     width = LANES // ITEMS
 
     @wp.func
@@ -599,12 +586,7 @@ def _lanes(
                     turn = wp.transpose(here.xmat[w, here.object_body[o]])
                     a = turn * rot
                     b = turn * (pos - here.xpos[w, here.object_body[o]])
-                    size = here.shape_size[w, o]
-                    reach = float(law.reach)
-                    if not wp.static(solver):
-                        reach = 0.0 - FAR
-                    these = near_rounds(shapes, shape, size, a, b, groups, g, n, lane, reach)
-                    d = distances(shapes, shape, size, a, b, groups, n, at, these)
+                    d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
                     if wp.static(solver):
                         pressed = here.pair_normal[w, here.pair_column[g, o]]
                         mine += shares(d, groups, at, law.reach, pressed)
@@ -647,7 +629,9 @@ def _lanes_of_hand(
 ) -> Callable:  # fmt: skip
     """The same for what pads feel of the hand itself, which few do at a time."""
     do = _measures(rounds)
-    Reals, shares = do.Reals, do.shares
+    Reals, nearer, least_of, shares = do.Reals, do.nearer, do.least_of, do.shares
+    blocks = max(-(-links // LANES), 1)
+    Gaps = wp.types.vector(length=blocks, dtype=float)
     width = LANES // HAND_ITEMS
 
     @wp.func
@@ -660,16 +644,36 @@ def _lanes_of_hand(
         return near
 
     @wp.func
-    def ball_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, n: int, p: int):
-        """Return how far from link p // n the taxel in the middle of round p % n is; FAR where it is not to be felt."""
-        out = float(FAR)
-        j = p // n
-        if j < wp.static(links):
-            if may_meet(g, j, here, groups, w):
-                a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
-                b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
-                out = sd_grid(tips, j, 1.0, a * xyz(groups.ball[g, p - j * n]) + b)
-        return out
+    def to_links(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, at: int, lane: int, reach: float):
+        """Return distances to the nearest of the hand's other links, exact where they are under the level. A lane asks
+        how near its link may be; then the warp measures them, nearest first, until the rest cannot matter."""
+        body = groups.body[g]
+        gap = Gaps()
+        for k in range(wp.static(blocks)):
+            gap[k] = link_gap(here, groups, tips, w, g, 32 * k + lane)
+        d = Reals(FAR)
+        level = float(FAR)
+        more = bool(True)
+        while more:
+            least = gap[0]
+            for k in range(1, wp.static(blocks)):
+                least = wp.min(least, gap[k])
+            least = lanes_min(least)
+            more = least < level
+            if more:
+                j = int(0)
+                for k in range(wp.static(blocks)):
+                    bits = lane_ballot(gap[k] == least)
+                    if bits != 0:
+                        j = 32 * k + lowest_bit(bits)
+                for k in range(wp.static(blocks)):
+                    if j == 32 * k + lane:
+                        gap[k] = FAR
+                a = turn_in(here.xmat, w, body, here.link_body[j])
+                b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
+                d = nearer(d, tips, j, a, b, groups, groups.rounds[g], at, level)
+                level = spread_level(least_of(d), reach)
+        return d
 
     def lanes_of_hand(
         here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt
@@ -698,43 +702,30 @@ def _lanes_of_hand(
             g = first + part - w * wp.static(group_count)
             n = groups.rounds[g]
             at = g * wp.static(rounds * LANES) + lane
-            theirs = Reals(wp.static(1.0e9 if selves else 0.0))  # m, then N, of this lane's taxels
-            level = float(0.0)
-            if wp.static(selves):  # the middles of rounds bound the nearest from above
-                nearest = float(FAR)
-                for first_pair in range(0, n * wp.static(links), 32):
-                    nearest = wp.min(nearest, ball_gap(here, groups, tips, w, g, n, first_pair + lane))
-                level = spread_level(lanes_min(nearest), law.reach)
-            # A lane asks for a pair of a round and a link; the warp measures those that may be under the level.
-            for first_pair in range(0, n * wp.static(links), 32):
-                p = first_pair + lane
-                gap = ball_gap(here, groups, tips, w, g, n, p)
-                if gap < FAR:
-                    gap -= groups.ball[g, p % n][3] + 1.0e-3  # a millimetre for coarse grids
-                these = lane_ballot(gap < level)
-                while these != 0:
-                    one = first_pair + lowest_bit(these)
-                    these = these & (these - 1)
-                    j = one // n
-                    r = one - j * n
-                    a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
-                    b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
-                    v = load4(groups.taxel, at + 32 * r)
-                    e = sd_grid(tips, j, 1.0, a * xyz(v) + b)
-                    if wp.static(not selves):
-                        f = float(0.0)
-                        if e < 0.0:
-                            stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
-                            f = taxel_force(wp.static(kind), law, stiff, -e, v[3], law.threshold[w])
-                        e = f
-                    for q in range(wp.static(rounds)):
-                        if q == r:
-                            if wp.static(selves):
-                                theirs[q] = wp.min(theirs[q], e)
-                            else:
-                                theirs[q] += e
+            theirs = Reals()  # N, on this lane's taxels
             if wp.static(selves):
-                theirs = shares(theirs, groups, at, law.reach, here.pair_normal[w, here.self_column[g]])
+                d = to_links(here, groups, tips, w, g, at, lane, law.reach)
+                theirs = shares(d, groups, at, law.reach, here.pair_normal[w, here.self_column[g]])
+            else:
+                # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
+                for block in range(wp.static(blocks)):
+                    near = 32 * block + lane < wp.static(links)
+                    if near:
+                        near = near_link(here, groups, tips, w, g, 32 * block + lane)
+                    these = lane_ballot(near)
+                    while these != 0:
+                        j = 32 * block + lowest_bit(these)
+                        these = these & (these - 1)
+                        a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
+                        b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
+                        for r in range(wp.static(rounds)):
+                            p = load4(groups.taxel, at + 32 * r)
+                            q = a * xyz(p) + b
+                            if in_box(q, tips.middle[j], tips.half[j]):
+                                gap = sd_grid(tips, j, 1.0, q)
+                                if gap < 0.0:
+                                    stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
+                                    theirs[r] += taxel_force(wp.static(kind), law, stiff, -gap, p[3], law.threshold[w])
             other = float(0.0)
             for r in range(wp.static(rounds)):
                 if r < n:

@@ -367,7 +367,6 @@ def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: li
     """Return groups of pads on the device, up to `most` rounds each."""
     taxel = np.zeros((len(members), LANES * most, 4), dtype=np.float32)
     round_ = np.zeros((len(members), most, 3), dtype=np.int32)
-    ball = np.zeros((len(members), most, 4))
     box, bound, rounds = np.zeros((len(members), 2, 3)), np.zeros((len(members), 4)), []
     for g, pads in enumerate(members):
         parts = [_rows(layout, raised, f, -(-int(layout.count[f]) // LANES)) for f in pads]
@@ -377,9 +376,6 @@ def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: li
         of = [(f, t, int(t + LANES == len(x))) for f, x in each for t in range(0, len(x), LANES)]
         round_[g], round_[g, : len(of)] = of[0], of
         rounds.append(len(of))
-        for r, part in enumerate(rows[:, :3].reshape(-1, LANES, 3)):
-            apart = np.linalg.norm(part[:, None] - part, axis=2).max(1)
-            ball[g, r, :3], ball[g, r, 3] = part[apart.argmin()], apart.min()
         box[g] = rows[:, :3].min(0), rows[:, :3].max(0)
         bound[g, :3] = box[g].mean(0)
         bound[g, 3] = np.linalg.norm(rows[:, :3] - bound[g, :3], axis=1).max()
@@ -389,7 +385,6 @@ def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: li
     out.first = wp.array(np.cumsum([0, *map(len, members)]), dtype=int)
     out.rounds, out.round = wp.array(rounds, dtype=int), wp.array(round_, dtype=wp.vec3i)
     out.taxel = wp.array(taxel, dtype=wp.vec4)
-    out.ball = wp.array(ball.astype(np.float32), dtype=wp.vec4)
     # a micrometre for rounding
     out.middle = wp.array(box.mean(1).astype(np.float32), dtype=wp.vec3)
     out.half = wp.array((0.5 * (box[:, 1] - box[:, 0]) + 1e-6).astype(np.float32), dtype=wp.vec3)
