@@ -344,7 +344,7 @@ def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_pat
         raise ValueError("what nobody thought of")
 
     setattr(
-        rec.writer, {"write": "add_state", "close": "close", "thread": "_array"}[at], odd if at == "thread" else full
+        rec.writer, {"write": "add_state", "close": "close", "thread": "add_array"}[at], odd if at == "thread" else full
     )
     report = run(b, hand, recorder=rec)
     assert report.ended == "done" and report.acts == 48 and hand.relaxed_at
