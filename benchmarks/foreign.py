@@ -82,9 +82,7 @@ def diagnose(job: tuple[Path, Path, int, int]) -> None:
         for name in ("diagnosis.json", "details.json"):
             if (work / "out" / name).is_file():
                 shutil.copy(work / "out" / name, out)
-        (out / "run.json").write_text(
-            json.dumps({"seconds": took, "rc": code, "recordings": names}), encoding="utf-8"
-        )
+        (out / "run.json").write_text(json.dumps({"seconds": took, "rc": code, "recordings": names}), encoding="utf-8")
 
 
 def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:

@@ -20,9 +20,7 @@ FREE = {"contype": 0, "conaffinity": 0}  # of geoms: MuJoCo has nothing to do wi
 STEP = 1e-5  # m of the slides' encoders
 
 
-def spec(
-    finger: str = "index", hand: Hand | None = None
-) -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
+def spec(finger: str = "index", hand: Hand | None = None) -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
     """Return the rig: the distal body of a hand's finger (the xHand's) fixed at the origin, a ball on a slide
     against the pad's middle and one along it. Also the pressed point [3] m, the direction in which the ball presses
     [3] and the one in which it slides [3]."""

@@ -158,12 +158,7 @@ def encoded(
 
 
 def angle_read_as(
-    seen: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    eccentric: np.ndarray,
-    at: np.ndarray,
-    second: np.ndarray,
+    seen: np.ndarray, scale: np.ndarray, offset: np.ndarray, eccentric: np.ndarray, at: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
     """Return the angle [rad] of which such an encoder makes `seen`: the inverse of `encoded`, by Newton's method."""
     q = (seen - offset) / scale

@@ -173,10 +173,7 @@ def judged(row: dict[str, Any]) -> dict[str, bool | None]:
     if replayed is None or reported is None:
         return {"as_reported": None, "no_worse": None}
     least = min(x for x in (plain, believed) if x is not None)
-    return {
-        "as_reported": abs(replayed - reported) <= AGREE * reported,
-        "no_worse": replayed <= WORSE * least,
-    }
+    return {"as_reported": abs(replayed - reported) <= AGREE * reported, "no_worse": replayed <= WORSE * least}
 
 
 def text_of(results: Sequence[dict[str, Any]]) -> str:
