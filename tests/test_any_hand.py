@@ -221,7 +221,8 @@ def test_the_whole_chain(hands, moment, tmp_path, task, pads, capsys):
     assert len(b.manifest["joints"]) == 9 and b.manifest["fingers"] == ["a", "b", "t"]
     calibration, clock = Calibration.from_dict(b.manifest["calibration"], "bundle", None, b.hand), VirtualClock()
     driver = SimulatedXHand(b.config, calibration, clock, seed=1, grip=b.manifest.get("grip"))
-    settings = LoopSettings(seconds=0.5, home_speed=5.0, wait=0.2, grip=0.3, command=0.5)
+    given = 0.5 if task == "grasp" else None
+    settings = LoopSettings(seconds=0.5, home_speed=5.0, wait=0.2, grip=0.3, command=given)
     loop = Loop(b, driver, driver, calibration, settings, clock, keep=True)
     report = loop.run()
     assert report.ended == "done" and report.acts >= 10, report.ended
