@@ -38,7 +38,7 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
 
 
 def run(s: dict[str, Any], reading: dict[str, dict[str, str]]) -> int:
-    """Return the everything that the settings ask for."""
+    """Return everything that the settings ask for."""
     from dexsim import outputs
     from dexsim.calibration import simulate
     from dexsim.hand import load_hand

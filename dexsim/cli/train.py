@@ -16,7 +16,7 @@ from dexsim.cli.start import Start
 from dexsim.cli.watch import Watch
 from dexsim.console import program
 from dexsim.console.stop import Stop
-from dexsim.console.tables import count, duration, table
+from dexsim.console.tables import count, duration
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ranks import Ranks
@@ -123,23 +123,11 @@ def _final_episodes(runner: Runner, cfg: dict[str, Any], where: Path) -> int:
     out = folder.make(where / "play", "out=")
     about = {"checkpoint": str(where / "policy.pt"), "iteration": runner.iteration, "versions": machine.versions()}
     try:
-        metrics = replay(
-            runner.env, runner.policy(), out, episodes, seed=cfg["seed"] + 1_000_003, video=True, about=about
-        )
-        if rows := beside(cfg, metrics):
-            title = "This policy beside ten trainings by the defaults on a GPU (docs/results/index.md)"
-            print("\n" + table(title, ("metric", "this one", "lowest", "mean", "highest"), rows))
+        replay(runner.env, runner.policy(), out, episodes, seed=cfg["seed"] + 1_000_003, video=True, about=about)
     except KeyboardInterrupt:
         print("\nfinal episodes broken off; the training is saved")
         return 130
     return 0
-
-
-def beside(cfg: dict[str, Any], metrics: dict[str, Any]) -> list[tuple]:
-    """Return (metric, this policy's, and of ten trainings the lowest, mean and highest), as far as the task knows
-    (`ten_trainings`)."""
-    ten = cfg["task"].get("ten_trainings") or {}
-    return [(name, metrics[name], *given) for name, given in ten.items() if metrics.get(name) is not None]
 
 
 class Log:

@@ -268,7 +268,7 @@ class Runner(OnPolicyRunner):
         )
 
     def payload(self) -> dict[str, Any]:
-        """Return the everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
+        """Return everything that a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         actor, critic = (part.state_dict() for part in self._parts)
         data = {
             "kind": "train", "config": self._config(), "versions": self._versions, "git": self._git,

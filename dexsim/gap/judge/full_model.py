@@ -446,7 +446,7 @@ def _batch(
 
 
 def _own_figures(engine: Any, servo: Servo, worlds: Sequence[World], led: Sequence[str]) -> None:
-    """Gives each world the armature, damping and dry friction of its own model; those of `led` joints are `HEAVY`."""
+    """Give each world the armature, damping and dry friction of its own model; those of `led` joints are `HEAVY`."""
     dofs, own = engine.dof_index(servo.joints).tolist(), [i for i, w in enumerate(worlds) if w.figures is not None]
     if not own:
         return
