@@ -112,6 +112,26 @@ def test_a_run_without_the_joint_and_two_joints():
     assert [len(x) for x in channels.repeated_stretches([*runs, two], "joint")] == [0, 0, 1]
 
 
+def test_a_reading_that_is_knocked_away_at_rest_is_no_old_one():
+    """Another motor's current pulls at an encoder: the joint stands at its target, one reading twitches, and after a
+    while the readings leap away and come back. Where the joint was under way when they stood, they are old ones."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="joint"/><geom size="0.1" mass="0.1"/></body></worldbody></mujoco>'
+    )
+    target = np.repeat([0.3, -0.3, 0.2, 0.5, -0.2, 0.1, 0.4], 100)
+    knocked = run("knocked", target, follow(target))
+    q = knocked.q[:, 0]
+    for a in range(60, len(T), 100):  # it has come to rest
+        q[a : a + 40] = q[a]
+        q[a + 2] -= 0.012
+        q[a + 14 : a + 26] += 0.4 * np.exp(-np.arange(12) / 3)
+    assert channels.inspect([knocked], model, {})[0] == []
+    old = run("old", goal(1), follow(goal(1)))
+    for a in (400, 450, 500):
+        old.q[a : a + 9, 0] = old.q[a, 0]
+    assert [f.regime.split(":")[0] for f in channels.inspect([old], model, {})[0]] == ["stale"]
+
+
 def test_a_joint_that_rests_until_its_target_steps_is_not_frozen():
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><joint name="joint" range="-2 2" limited="true"/><geom size="0.1" mass="0.1"/></body>'

@@ -571,8 +571,9 @@ def _held(t: np.ndarray, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
         return bool(stepped) and t[b - 1] - t[a] > REACTS and _way(t, before, a, b) <= max(0.2 * step[b - 1], passed)
 
     jumps = [(a, b) for a, b in stood if step[b - 1] > SIGNAL.jump * usual and not woken(a, b)]
-    # a joint at rest may start with a jump: at least two must have been moving when they froze
-    if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > SIGNAL.moving * usual for a, _ in jumps) >= 2:
+    # a joint at rest may start with a jump: at least two must have been on their way when they froze (what comes and
+    # goes at once is no way)
+    if sum(a >= 4 and abs(q[a - 1] - q[a - 4]) > 3 * SIGNAL.moving * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
             out[a:b] = True
     return out
