@@ -406,3 +406,20 @@ def test_times_of_two_units_are_said(unit):
     said = [f for f in audit_time.between_topics(r) if "another unit" in f.text]
     assert {(f.kind, f.severity) for f in said} == {("clock_skew", "error")}
     assert r.commands.topic in [f.topic for f in said]
+
+
+@pytest.mark.parametrize(("sign", "lag"), [(1, 0.05), (1, 0.17), (-1, 0.05)])
+def test_a_narrow_band_is_no_other_clock(sign, lag):
+    """Of a sweep from 4 to 5 Hz three quarters of a period behind is a quarter before, and so is half of one with the
+    sign lost; of a wide one what comes first does."""
+    t, made = np.arange(0, 12, 0.01), recordings.signal(3.0)
+    for turns, seen in ((4 * t + t**2 / 24, None), (0.1 * t + t**2 / 6, 0.06)):
+        target = 0.3 * np.sin(2 * np.pi * turns)
+        value = sign * np.interp(t - lag, t, target) if seen is None else np.interp(t + seen, t, target)
+        made.commands, made.states.position = (Series(t, np.stack([x] * len(made.joints), 1), COMMANDS, None)
+                                               for x in (target, value))  # fmt: skip
+        lead = audit_time.command_lead(made)
+        if seen is None:
+            assert lead is None or lead < 0
+        else:
+            assert lead == pytest.approx(seen, abs=0.011)

@@ -13,6 +13,7 @@ GAP = 3.5  # periods without a sample
 SKEW_S = 0.010  # s between header.stamp and host time that a transport does not explain
 DRIFT_PPM = 200.0
 LEAD_S = 0.005  # s by which a response may seem to come before its command
+ALIKE = 0.15  # of a correlation: two shifts that differ by less are both likely
 TIME_UNITS = (1e3, 1e6, 1e9)
 """ms, us and ns in a second."""
 SHIFT_S = 0.2  # s by which one topic's whole span may be shifted against another's
@@ -148,7 +149,7 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
         half = len(grid) // 2
         found: list[int] = []
         for part in (slice(None), slice(0, half), slice(half, None)):
-            one = _lead(command[part], position[part], int(reach / step))
+            one = _lead(command[part], position[part], int(reach / step), alone=part == slice(None))
             if one is None:
                 break
             found.append(one)
@@ -158,9 +159,9 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
     return float(np.median(leads)) if leads else None
 
 
-def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5) -> int | None:
+def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5, alone: bool = False) -> int | None:
     """Return grid steps by which the position's change comes before the command's; None where they do not go
-    together."""
+    together; alone: and where it might as well come after it (a narrow band repeats, a lost sign is half a period)."""
     if np.ptp(command) < 0.05 or np.ptp(position) < 0.05:
         return None
     a, b = command[width:] - command[:-width], position[width:] - position[:-width]
@@ -168,7 +169,10 @@ def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5)
     size = 1 << (len(a) + reach).bit_length()
     full = np.fft.irfft(np.fft.rfft(b, size) * np.conj(np.fft.rfft(a, size)), size)
     corr = np.concatenate([full[-reach:], full[: reach + 1]]) / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12)
-    best = int(np.argmax(corr))
+    best, size = int(np.argmax(corr)), np.abs(corr)
+    peaks = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
+    if alone and best < reach and size[peaks[peaks >= reach]].max(initial=0.0) > corr[best] - ALIKE:
+        return None
     return reach - best if corr[best] > 0.8 else None
 
 
