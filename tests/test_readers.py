@@ -248,6 +248,8 @@ def test_what_is_held_out_is_taken_out_of_the_fit(tmp_path):
     (tmp_path / "run_0.csv.yaml").write_text("gravity: 0 0 0\n")
     fitted, held = inputs.parted(f"{tmp_path}/run_*.csv", f"{tmp_path}/run_3.csv")
     assert [p.name for p in fitted] == [f"run_{k}.csv" for k in range(3)] and [p.name for p in held] == ["run_3.csv"]
+    fitted, held = inputs.parted(f"{tmp_path.with_name(tmp_path.name[:-1])}?/run_[0-2].csv", f"{tmp_path}/run_[12].csv")
+    assert [p.name for p in fitted] == ["run_0.csv"] and [p.name for p in held] == ["run_1.csv", "run_2.csv"]
     fitted, held = inputs.parted(f"{tmp_path}/run_*.csv", "episodes[2:]")
     assert len(fitted) == 2 and [p.name for p in held] == ["run_2.csv", "run_3.csv"]
     with pytest.raises(UserError, match="nothing is left to fit"):

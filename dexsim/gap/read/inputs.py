@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence, Set
 from dataclasses import replace
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -367,9 +368,9 @@ def files(given: Any, key: str) -> list[Path]:
     out = []
     for item in items:
         path = Path(str(item)).expanduser()
-        if any(ch in str(item) for ch in "*?") and not path.exists():
+        if any(ch in str(item) for ch in "*?[") and not path.exists():
             base, hash_, part = path.name.partition("#")
-            found = [p for p in sorted(path.parent.glob(base)) if not p.name.endswith(".yaml")]
+            found = [Path(p) for p in sorted(glob(str(path.parent / base), recursive=True)) if not p.endswith(".yaml")]
             if not found:
                 raise UserError(f"{key}={item}: no file matches")
             out += [q for p in found for q in readers.expanded(p.with_name(p.name + hash_ + part))]
