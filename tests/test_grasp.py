@@ -362,6 +362,20 @@ def test_a_dropped_object_ends_the_episode_and_the_others_go_on(env):
     assert not env.engine.t.xfrc_applied[[3, 5]].any()
 
 
+def test_an_object_that_is_no_longer_held_ends_the_episode_while_learning(env, monkeypatch):
+    held = torch.tensor([[1.0, 0, 0, 2.0, 0]] * N)  # by the thumb and a finger
+    held[1], held[2], held[4] = torch.tensor([0, 1.0, 1.0, 1.0, 1.0]), torch.tensor([3.0, 0, 0, 0, 0]), 0.0
+    monkeypatch.setitem(env.task["termination"], "untouched", 1.0)
+    env.reset_all()
+    env.episode_length_buf = torch.tensor([int(1.0 / env.dt) + 1] * 4 + [int(1.0 / env.dt) - 1] * 4)
+    env.finger_force.copy_(held)
+    env.update()
+    assert env.is_dropped().tolist() == [False, True, True] + [False] * 5  # world 4 is too young
+    monkeypatch.setattr(env, "fixed_command", torch.zeros(N))  # of an evaluation
+    env.update()
+    assert not env.is_dropped().any()
+
+
 def test_time_out_is_flagged_apart_from_termination(env):
     env.episode_length_buf = torch.tensor([0, env.max_episode_length - 1, 0, 0, env.max_episode_length - 1, 0, 0, 0])
     env.engine.t.qpos[4, env.object_q[2]] = -0.3  # dropped in its last step: not a time-out
@@ -579,6 +593,7 @@ def test_final_observations_are_those_before_the_reset(env):
     (("task", "command", "high", 1.5), "command"),
     (("task", "contact", "impedance", 1.0), "impedance"),
     (("task", "critic", "oracle"), "task.critic"),
+    (("task", "termination", "untouched", -1.0), "termination.untouched"),
     (("task", "objects", "train", ["cube"]), "cube"),
     (("task", "objects", "held_out", []), "held_out"),
 ])  # fmt: skip

@@ -103,6 +103,10 @@ class GraspEnv(Launches):
                 f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high"
                 " <= 1"
             )
+        if (after := t["termination"].get("untouched")) is not None and not 0 <= after <= t["episode_s"]:
+            raise UserError(
+                f"task.termination.untouched={after}: must be null or lie in [0, {t['episode_s']:g}] s, an episode"
+            )
         self.thumb_range = t["command"].get("thumb")
         if self.thumb_range is not None and not _is_range(self.thumb_range):
             raise UserError(
@@ -142,10 +146,16 @@ class GraspEnv(Launches):
 
     def update(self) -> None:
         self.launch_dropped()
+        after = self.task["termination"].get("untouched")
+        if after is not None and self.fixed_command is None:  # an evaluation goes on, and counts
+            touches = self.finger_force > 0
+            lost = ~(touches[:, self.opposing].any(1) & touches[:, self.others].any(1))
+            self._dropped |= lost & (self.episode_length_buf * self.dt > after)
 
     @done(name="dropped")
     def is_dropped(self) -> torch.Tensor:
-        """centre below the palm (termination.below) or far from it (termination.distance)"""
+        """centre below the palm (termination.below) or far from it (termination.distance); or not held, while learning
+        (termination.untouched)"""
         return self._dropped
 
     # -- what is paid: every term is computed by one kernel
