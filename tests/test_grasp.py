@@ -365,15 +365,22 @@ def test_a_dropped_object_ends_the_episode_and_the_others_go_on(env):
 def test_an_object_that_is_no_longer_held_ends_the_episode_while_learning(env, monkeypatch):
     held = torch.tensor([[1.0, 0, 0, 2.0, 0]] * N)  # by the thumb and a finger
     held[1], held[2], held[4] = torch.tensor([0, 1.0, 1.0, 1.0, 1.0]), torch.tensor([3.0, 0, 0, 0, 0]), 0.0
-    monkeypatch.setitem(env.task["termination"], "untouched", 1.0)
+    lost = [False, True, True] + [False] * 5  # world 4 is too young
     env.reset_all()
-    env.episode_length_buf = torch.tensor([int(1.0 / env.dt) + 1] * 4 + [int(1.0 / env.dt) - 1] * 4)
+    env.episode_length_buf = torch.tensor([int(2.0 / env.dt) + 1] * 4 + [int(2.0 / env.dt) - 1] * 4)
     env.finger_force.copy_(held)
-    env.update()
-    assert env.is_dropped().tolist() == [False, True, True] + [False] * 5  # world 4 is too young
-    monkeypatch.setattr(env, "fixed_command", torch.zeros(N))  # of an evaluation
-    env.update()
-    assert not env.is_dropped().any()
+    for rate, command, ends in ((1.0, None, lost), (0.0, None, [False] * N), (1.0, torch.zeros(N), [False] * N)):
+        monkeypatch.setitem(env.task["termination"], "untouched", rate)
+        monkeypatch.setattr(env, "fixed_command", command)  # the last: of an evaluation
+        env.update()
+        assert env.is_dropped().tolist() == ends
+    monkeypatch.setitem(env.task["termination"], "untouched", 0.2)
+    monkeypatch.setattr(env, "fixed_command", None)
+    ended = 0
+    for _ in range(200):
+        env.update()
+        ended += int(env.is_dropped().sum())
+    assert abs(ended / 400 - 0.2) < 0.08  # 4 standard deviations
 
 
 def test_time_out_is_flagged_apart_from_termination(env):

@@ -14,7 +14,7 @@ Train a policy in many simulated worlds at once. Ctrl-C stops and saves.
 
 examples:
   dexsim train task=grasp                                the whole job, sized for this machine
-  dexsim train worlds=64 iterations=10 device=cpu        a quick look
+  dexsim train device=cpu iterations=180                 a first look that learns: five minutes on two cores
   dexsim train servo=ideal agent.algorithm.learning_rate=5e-4
   dexsim train resume=runs/grasp/<run>/last.pt iterations=2000
   dexsim train --multirun seed=1,2,3 servo=xhand,ideal   every combination, one run each (docs/howto/gpus.md)

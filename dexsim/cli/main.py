@@ -63,7 +63,7 @@ rarer:
 
 first steps:
   dexsim demo                                        a hidden effect found, a trained hand in the browser: a minute
-  dexsim train worlds=64 iterations=10 device=cpu    a first look at training
+  dexsim train device=cpu iterations=180             a first look at training: five minutes on two cores
   dexsim play policy=scripted task=grasp             a policy that needs no training
 
   dexsim COMMAND --help     its settings (key=default) and examples

@@ -65,6 +65,8 @@ def _run(
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
+    if text := cfg["task"].get("expect"):
+        print(f"expect   {text}\n")
     stop.requested()  # Ctrl-C while compiling: nothing to save
     runner = Runner(env, cfg, machine.versions(), ranks, start.typed)
     if start.data is not None:

@@ -103,10 +103,8 @@ class GraspEnv(Launches):
                 f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high"
                 " <= 1"
             )
-        if (after := t["termination"].get("untouched")) is not None and not 0 <= after <= t["episode_s"]:
-            raise UserError(
-                f"task.termination.untouched={after}: must be null or lie in [0, {t['episode_s']:g}] s, an episode"
-            )
+        if not 0 <= (rate := t["termination"].get("untouched", 0.0)) <= 1:
+            raise UserError(f"task.termination.untouched={rate}: must lie in [0, 1]")
         self.thumb_range = t["command"].get("thumb")
         if self.thumb_range is not None and not _is_range(self.thumb_range):
             raise UserError(
@@ -146,11 +144,12 @@ class GraspEnv(Launches):
 
     def update(self) -> None:
         self.launch_dropped()
-        after = self.task["termination"].get("untouched")
-        if after is not None and self.fixed_command is None:  # an evaluation goes on, and counts
+        rate = self.task["termination"].get("untouched")  # not for sure: all worlds would begin anew at once
+        if rate and self.fixed_command is None:  # an evaluation goes on, and counts
             touches = self.finger_force > 0
             lost = ~(touches[:, self.opposing].any(1) & touches[:, self.others].any(1))
-            self._dropped |= lost & (self.episode_length_buf * self.dt > after)
+            late = self.episode_length_buf * self.dt > grasp_rewards.LATE
+            self._dropped |= lost & late & (self.sampler.uniform() < rate)
 
     @done(name="dropped")
     def is_dropped(self) -> torch.Tensor:
