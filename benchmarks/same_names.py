@@ -112,9 +112,11 @@ def right(row: dict[str, Any], version: str) -> bool:
 
 
 def told_right(rows: Sequence[dict[str, Any]], version: str) -> str:
-    """Return how many of the times left that were told were right within a third, in words."""
-    right = [abs(said - was) <= THIRD * was for r in rows for _, _, said, was in r[version].get("times", ())]
-    return f"{sum(right)} of {len(right)}"
+    """Return how many numbers told for the time left were right within a third, how many spans held it."""
+    every = [x for r in rows for x in r[version].get("times", ())]
+    one, span = ([x for x in every if (x[2] == x[3]) is alone] for alone in (True, False))
+    right = sum(abs(said - was) <= THIRD * was for *_, said, was in one)
+    return f"{right} of {len(one)}, spans {sum(x[2] <= x[4] <= x[3] for x in span)} of {len(span)}"
 
 
 def text_of(rows: Sequence[dict[str, Any]]) -> str:
@@ -132,7 +134,7 @@ def text_of(rows: Sequence[dict[str, Any]]) -> str:
         said = [told_right(these, v) for v in ("before", "after")]
         lines.append((which, n, same, *of(right), *of(wrong), *took, *said))
     head = ("set", "cases", "same first name", "right before", "after", "sure and wrong before", "after",
-            "median s before", "after", "time left within a third before", "after")  # fmt: skip
+            "median s before", "after", "time left right before", "after")  # fmt: skip
     other = [r for r in rows if first(r["before"]) != first(r["after"])]
     say = lambda a: ", ".join(f"{f[0]}@{'/'.join(f[1])} {f[2]:.2f}" for f in a["findings"][:3]) or "-"  # noqa: E731
     return "\n".join(

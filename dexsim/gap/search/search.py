@@ -52,7 +52,8 @@ def search_joint(search: JointSearch) -> Outcome:
     search.fitted, search.first_laws = {}, {}
     none = search.start()
     search.none_loss = cv_loss(search, none)
-    search.progressed(0.1)
+    aside = ", quiet" if search.none_loss.sum() < SEARCH.unsettled * len(search.blocks) else ""
+    search.reached("begun", aside)
     current = none
     price: dict[str, float] = {}
     scanned: list[tuple[str, float, float]] = []
@@ -65,7 +66,8 @@ def search_joint(search: JointSearch) -> Outcome:
         if (enough and current.members) or search.deadline.over():
             break
         scan = scan_catalogue(search, current)
-        search.progressed(0.06)
+        again = " again" if current.members else ""
+        search.reached("scanned" + again, aside)
         if not scanned:
             scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
         if not scan:
@@ -76,10 +78,13 @@ def search_joint(search: JointSearch) -> Outcome:
         if not listed:
             break
         drafts = drafts_of(search, listed, current, pool, price)
+        search.reached("drafted" + again)
         for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
             if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
                 pool[member.id], price[member.id] = (member, start), p
         trials = finished_drafts(search, drafts, current)
+        follows = min(cv_loss(search, t).sum() for t in trials) < SEARCH.enough**2 * per
+        search.reached("fitted" + again, ", enough" if follows else "")
         best = best_of(search, trials, current)
         less = begun_again(search, current, trials)
         if less is not current:
@@ -116,7 +121,7 @@ def search_joint(search: JointSearch) -> Outcome:
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
-    search.progressed(0.1)
+    search.reached("ending")
     current, final = settled(search, current, pool)
     rivals = {e: x[0] for e, x in final.items()}
     confidence, gains = {e: x[1] for e, x in final.items()}, {e: x[2] for e, x in final.items()}
@@ -218,7 +223,7 @@ def drafts_of(
             if member.id in followed:
                 pool[member.id] = (member, start)
             followed[member.id] = drafts[-1][2].loss
-        search.progressed(0.03)
+        search.tell(None)
     drafts.sort(key=lambda d: d[2].loss)
     # how many are looked at: two, and others that may still win when they are fitted on long windows
     return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
@@ -243,7 +248,7 @@ def finished_drafts(
         for k, t in enumerate(trials)
     ]
     for trial in trials:
-        search.progressed(0.06)
+        search.tell(None)
         known = search.fitted.get(frozenset(trial.ids))
         if known is None or trial.fit.loss < known.fit.loss:
             search.fitted[frozenset(trial.ids)] = trial
@@ -580,7 +585,7 @@ def rivals_of(
                 if draft[2].loss > SEARCH.rival * max(short, 1.0):
                     continue
                 trial = search.finish(*draft, current, quick=True)
-            search.progressed(0.05)
+            search.tell(None)
             search.fitted[frozenset(trial.ids)] = trial
             # one that cannot follow even what it was fitted to is no rival
             if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
@@ -657,7 +662,7 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
         if not search.deadline.over():
             found.best = simpler(search, found.best)
         search.whole = search.case.plant.refined(FINER)
-    search.progressed(0.3)
+    search.reached("settling")
     polished(search, found.best), polished(search, found.none)  # kept for the judgement
 
 
