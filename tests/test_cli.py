@@ -17,7 +17,7 @@ import shell
 import torch
 import yaml
 
-from dexsim.cli import checks, console, folder, machine, settings
+from dexsim.cli import checks, console, folder, machine, settings, train
 from dexsim.console import tables
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -100,6 +100,12 @@ def test_final_episodes_with_video_or_a_reason(configs, place, capfd):
     out = capfd.readouterr().out
     assert json.loads(Path("runs/dummy/a/play/metrics.json").read_text())["episodes"] == 4
     assert ("video    runs" in out) != ("no video: no OpenGL" in out)
+
+
+def test_a_training_stands_beside_others():
+    cfg = {"task": {"expect": {"of": "ten", "hold_rate": [0.95, 0.96, 0.97], "of_another_version": [1, 2, 3]}}}
+    assert train.beside(cfg, {"hold_rate": 0.9, "other": 1.0}) == [("hold_rate", 0.9, 0.95, 0.96, 0.97)]
+    assert train.beside({"task": {}}, {"hold_rate": 0.9}) == []
 
 
 def test_nameless_runs_do_not_collide(configs, place):

@@ -16,7 +16,7 @@ from dexsim.cli.start import Start
 from dexsim.cli.watch import Watch
 from dexsim.console import program
 from dexsim.console.stop import Stop
-from dexsim.console.tables import count, duration
+from dexsim.console.tables import count, duration, table
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ranks import Ranks
@@ -65,8 +65,9 @@ def _run(
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
-    if text := cfg["task"].get("expect"):
-        print(f"expect   {text}\n")
+    if expect := cfg["task"].get("expect"):
+        ranges = (f"{name} {low:g} to {high:g}" for name, (low, _, high) in _ranges(expect).items())
+        print(f"expect   {', '.join(ranges)}: {expect['of']}\n")
     stop.requested()  # Ctrl-C while compiling: nothing to save
     runner = Runner(env, cfg, machine.versions(), ranks, start.typed)
     if start.data is not None:
@@ -125,11 +126,27 @@ def _final_episodes(runner: Runner, cfg: dict[str, Any], where: Path) -> int:
     out = folder.make(where / "play", "out=")
     about = {"checkpoint": str(where / "policy.pt"), "iteration": runner.iteration, "versions": machine.versions()}
     try:
-        replay(runner.env, runner.policy(), out, episodes, seed=cfg["seed"] + 1_000_003, video=True, about=about)
+        metrics = replay(
+            runner.env, runner.policy(), out, episodes, seed=cfg["seed"] + 1_000_003, video=True, about=about
+        )
+        if rows := beside(cfg, metrics):
+            title = f"This policy beside {cfg['task']['expect']['of']}"
+            print("\n" + table(title, ("metric", "this one", "lowest", "mean", "highest"), rows))
     except KeyboardInterrupt:
         print("\nfinal episodes broken off; the training is saved")
         return 130
     return 0
+
+
+def _ranges(expect: dict[str, Any]) -> dict[str, list[float]]:
+    return {name: given for name, given in expect.items() if name != "of"}
+
+
+def beside(cfg: dict[str, Any], metrics: dict[str, Any]) -> list[tuple]:
+    """Return (metric, this policy's, and of other trainings the lowest, mean and highest), as far as the task's
+    settings know (`expect`)."""
+    ranges = _ranges(cfg["task"].get("expect") or {})
+    return [(name, metrics[name], *given) for name, given in ranges.items() if metrics.get(name) is not None]
 
 
 class Log:
