@@ -209,14 +209,14 @@ def test_progress_says_one_time_only_where_it_is_right_within_a_third(capsys, mo
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == [
         "searching knuckle (1/1)",
-        "searching knuckle (1/1), 23 % done, 20 to 60 s left",
-        "searching knuckle (1/1), 50 % done, about 18 s left",
+        "searching knuckle (1/1), 23 % done, 20 to 60 s left to search",
+        "searching knuckle (1/1), 50 % done, about 18 s left to search",
         "searched 1 in 40 s",
     ]
     limit = compute.TimeLimit(50.0)
     for given, left, words in (
         (None, (10.0, 90.0), "0 s so far"), (limit, (10.0, 90.0), "at most 50 s left of all"),
-        (limit, (32.0, 80.0), "about 38 s left"), (None, (60.0, 60.0), "about 60 s left"),
+        (limit, (32.0, 80.0), "about 38 s left to search"), (None, (60.0, 60.0), "about 60 s left to search"),
     ):  # fmt: skip
         Progress(given)(2.0, 5, "wrist", left)
         assert capsys.readouterr().out.strip() == f"searching wrist (3/5), 40 % done, {words}"
@@ -242,7 +242,7 @@ def test_replays_tell_the_time_left(capsys, monkeypatch):
         compute.forked(3, work, 2)
     *said, end = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert end == "replayed the files" and len(said) > 2
-    assert all(re.fullmatch(r"replaying the files, \d+ % done, about 0 s left", line) for line in said)
+    assert all(re.fullmatch(r"replaying the files, \d+ % done, about 0 s left to replay", line) for line in said)
 
 
 @pytest.mark.parametrize("lanes", [1, 3])

@@ -330,22 +330,22 @@ class Progress:
             return
         self.said, self.searched, spent = now, int(done), now - self.start
         part = f", {100 * done / total:.0f} % done" if 0.0 < done < total else ""
-        tail = self.left(left) or (f", {spent:.0f} s so far" if part else "")
+        tail = self.left(left, f"left to {doing}") or (f", {spent:.0f} s so far" if part else "")
         if done < total:
             text = f"  {doing}ing {name}" + (f" ({int(done) + 1}/{total})" if doing == "search" else "") + part + tail
         else:
             text = f"  {doing}ed {name}" if name else f"  {doing}ed {total} in {spent:.0f} s"
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
-    def left(self, span: tuple[float, float] | None) -> str:
+    def left(self, span: tuple[float, float] | None, words: str = "left") -> str:
         """Return the time left in words: one number only where it is within a third of both ends of the span."""
         most = float("inf") if self.limit is None else max(self.limit.until(1.0), 0.0)
         if span is None or span[1] > self.WIDE * max(span[0], 1.0):
             return f", at most {most:.0f} s left of all" if most < float("inf") else ""
         low, high = span[0], min(span[1], max(most, span[0]))
         if high <= self.SURE * low or high < 1.5:
-            return f", about {(high + 2 * low) / 3:.0f} s left"
-        return f", {low:.0f} to {high:.0f} s left"
+            return f", about {(high + 2 * low) / 3:.0f} s {words}"
+        return f", {low:.0f} to {high:.0f} s {words}"
 
 
 def verdict(d: Diagnosis) -> str:
