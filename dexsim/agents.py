@@ -5,9 +5,9 @@ A field that is None stays as the settings have it (`dexsim/configs/agent/`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,19 +40,10 @@ class PPO:
 
     def settings(self) -> list[str]:
         """Return the settings as the command line has them."""
-        out = ["agent=ppo_lstm"] if self.recurrent else ["agent=ppo_symmetric"] if self.symmetric else []
-        both = {
-            "rnn_type": self.recurrent, "rnn_hidden_dim": self.rnn_hidden_dim,
-            "hidden_dims": None if self.hidden_dims is None else f"[{','.join(map(str, self.hidden_dims))}]",
-        }  # fmt: skip
-        out += [f"agent.{net}.{k}={v}" for net in ("actor", "critic") for k, v in both.items() if v is not None]
-        own = {"agent.actor.distribution_cfg.init_std": self.init_std, "agent.num_steps_per_env": self.steps}
-        for name in (
-            "learning_rate", "schedule", "desired_kl", "num_learning_epochs", "num_mini_batches", "clip_param", "gamma",
-            "lam", "entropy_coef", "value_loss_coef", "max_grad_norm",
-        ):  # fmt: skip
-            own[f"agent.algorithm.{name}"] = getattr(self, name)
-        return out + [f"{k}={v}" for k, v in own.items() if v is not None]
+        kind = ["agent=ppo_lstm"] if self.recurrent else ["agent=ppo_symmetric"] if self.symmetric else []
+        both = {"rnn_type": self.recurrent, "rnn_hidden_dim": self.rnn_hidden_dim, "hidden_dims": self.hidden_dims}
+        nets = {f"{net}.{name}": value for net in ("actor", "critic") for name, value in both.items()}
+        return kind + _given(nets, self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +64,14 @@ class Distillation:
 
     def settings(self) -> list[str]:
         """Return the settings as the command line has them."""
-        sizes = None if self.hidden_dims is None else f"[{','.join(map(str, self.hidden_dims))}]"
-        own = {
-            "teacher.checkpoint": f"'{self.teacher}'", "student.hidden_dims": sizes, "num_steps_per_env": self.steps,
-            "student.distribution_cfg.init_std": self.init_std, "algorithm.learning_rate": self.learning_rate,
-            "algorithm.num_learning_epochs": self.num_learning_epochs,
-            "algorithm.gradient_length": self.gradient_length,
-        }  # fmt: skip
-        return ["agent=distill", *(f"agent.{k}={v}" for k, v in own.items() if v is not None)]
+        own = {"teacher.checkpoint": f"'{self.teacher}'", "student.hidden_dims": self.hidden_dims}
+        return ["agent=distill", *_given(own, self, "student")]
+
+
+def _given(own: dict[str, Any], agent: PPO | Distillation, acts: str = "actor") -> list[str]:
+    """Return settings of `agent` that are not None: `own`, and the fields that are called as rsl-rl calls them."""
+    own |= {f"{acts}.distribution_cfg.init_std": agent.init_std, "num_steps_per_env": agent.steps}
+    ours = ("recurrent", "rnn_hidden_dim", "hidden_dims", "init_std", "steps", "symmetric", "teacher")
+    own |= {f"algorithm.{f.name}": getattr(agent, f.name) for f in fields(agent) if f.name not in ours}
+    texts = {k: f"[{','.join(map(str, v))}]" if isinstance(v, (tuple, list)) else v for k, v in own.items()}
+    return [f"agent.{k}={v}" for k, v in texts.items() if v is not None]

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from dexsim.agents import PPO, Distillation
     from dexsim.gap.inquiry import Diagnosis
     from dexsim.recording.schema import Recording
-    from dexsim.tasks.env import HandEnv
+    from dexsim.tasks.task import Task as HandTask
 
-    Task = str | type[HandEnv]
+    Task = str | type[HandTask]
     """A task by name, as "module:Class", or its class."""
 
 File = str | Path
@@ -186,7 +186,7 @@ def make_env(
     settings: Sequence[str] = (), checkpoint: File | None = None, *, hand: File | None = None,
     servo: File | None = None, objects: Sequence[File] | None = None, kept_out: Sequence[File] | None = None,
     rewards: Mapping[str, float] | None = None,
-) -> HandEnv:  # fmt: skip
+) -> HandTask:  # fmt: skip
     """Simulate many hands at one task: an rsl-rl VecEnv (`dexsim.learning.gym_env.GymVectorEnv` makes it
     gymnasium's).
 
@@ -215,12 +215,12 @@ def make_env(
     seed_all(cfg["seed"])
     machine.set_threads(cfg["device"])
     quiet_warp(cfg["device"])
-    env: HandEnv = make(cfg, cfg["worlds"], cfg["device"], cfg["seed"], cfg["sim"]["engine"])
+    env: HandTask = make(cfg, cfg["worlds"], cfg["device"], cfg["seed"], cfg["sim"]["engine"])
     env.given = begun.given
     return env
 
 
-def load_policy(checkpoint: File, env: HandEnv) -> Policy:
+def load_policy(checkpoint: File, env: HandTask) -> Policy:
     """Return the trained actor of a checkpoint, deterministic: observations of `env` -> actions [N, A].
 
     Raises:

@@ -203,17 +203,17 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     from dexsim.deploy import measure
 
     of = measure.of(env.task["name"])
-    if not hasattr(of, "SIGNALS"):
-        return _golden_terms(env, of.Observation(env), policy, model, steps, seed)
-    names = ("observation", "q", "before", "target", "begins", *(f"signal_{n}" for n in of.SIGNALS.Signals._fields))
-    series: dict[str, list] = {k: [] for k in names}
+    terms = None if hasattr(of, "SIGNALS") else of.Observation(env)
+    for row in env._sensed if terms else ():  # without the noise, delay and dropout of their readings
+        row.noise, row.dropout, row.delay = 0.0, 0.0, (0.0, 0.0)
+    series: dict[str, list] = {}
     env.rng.manual_seed(seed)
     with torch.no_grad():
         env.reset_all()
         begins = True
         for _ in range(steps):
-            obs, signals = env.get_observations(), of.signals_of(env)
-            now = {f"signal_{name}": value[0].clone() for name, value in zip(signals._fields, signals, strict=True)}
+            obs, signals = env.get_observations(), terms.of_env() if terms else of.signals_of(env)._asdict()
+            now = {f"signal_{name}": value[0].clone() for name, value in signals.items()}
             now |= {"observation": obs["actor"][0], "begins": torch.tensor(begins), "q": env.q[0].clone(),
                     "before": env.target[0].clone()}  # fmt: skip
             env.step(policy(obs))
@@ -221,77 +221,43 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
             if begins:
                 continue  # the target is the new episode's
             for name, value in (now | {"target": env.target[0].clone()}).items():
-                series[name].append(value)
-    return _with_random(series, model, steps, seed)
-
-
-def _with_random(series: dict[str, list], model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """Return what was kept of an episode, and as many random observations, with their actions."""
-    import torch
-
+                series.setdefault(name, []).append(value)
+    if not series:
+        raise UserError(f"task {env.task['name']}: each of {steps} control steps ended an episode; nothing to compare")
     rng = torch.Generator().manual_seed(seed)
-    episode = torch.stack(series["observation"])
+    episode = torch.stack(series.pop("observation"))
     spread = episode.mean(0) + 3 * episode.std(0).clamp(min=0.05) * torch.randn(steps, episode.shape[1], generator=rng)
     with torch.no_grad():
         everything = torch.cat([episode, spread])
-        begins = [bool(x) for x in series["begins"]] + [True] * steps
-        action = _actions(model, everything, begins)
-    out = {k: torch.stack(v).numpy() for k, v in series.items() if k != "observation"}
+        action = _actions(model, everything, [bool(x) for x in series["begins"]] + [True] * steps)
+    out = {k: torch.stack(v).numpy() for k, v in series.items()}
     return out | {"observation": everything.numpy(), "action": action.numpy()}
 
 
-def _golden_terms(env: Any, of: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """Return the same of a task of declared terms, without the noise, delay and dropout of its readings. begins: where
-    an episode does."""
-    import torch
-
-    for row in env._sensed:
-        row.noise, row.dropout, row.delay = 0.0, 0.0, (0.0, 0.0)
-    series: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", "begins")}
-    series |= {f"signal_{k}": [] for k in of.names}
-    env.rng.manual_seed(seed)
-    with torch.no_grad():
-        env.reset_all()
-        begins = True
-        while len(series["observation"]) < steps:
-            now = {f"signal_{k}": v[0] for k, v in of.of_env().items()}
-            now |= {"observation": env.get_observations()["actor"][0].clone(), "q": env.q[0].clone(),
-                    "before": env.target[0].clone(), "begins": torch.tensor(begins)}  # fmt: skip
-            env.step(policy(env.get_observations()))
-            begins = bool(env.done[0])
-            if begins:  # the target is the new episode's: begin with that one
-                env.reset_all()
-                continue
-            for name, value in (now | {"target": env.target[0].clone()}).items():
-                series[name].append(value)
-    return _with_random(series, model, steps, seed)
-
-
-def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
+def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, golden_rows: int) -> dict[str, Any]:
     """Return everything that a robot must know, as plain data."""
     from dexsim.deploy import bundle, measure
     from dexsim.deploy.manifests import floats
+    from dexsim.deploy.of_terms import rows
     from dexsim.learning.ppo import action_noise
     from dexsim.tactile.layout import touch_shape
 
     hand, (pads, taxels) = env.hand, touch_shape(env.hand)
     task, cfg = env.task, data["config"]
     of = measure.of(task["name"])
-    own, labels = of.parts(env), getattr(of, "SIGNALS", of)
+    own, labels = of.parts(env), of.SIGNALS.ROWS if hasattr(of, "SIGNALS") else {}
+    scaling = own.pop("scaling", {})
     if "terms" in own:
         own["terms"]["sha256"] = bundle.sha256(policy.with_name(bundle.TERMS))
     table, at = [], 0
-    for name, width, unit, source, scaling in own.pop("rows"):
-        table.append({"name": name, "start": at, "stop": at + width, "unit": unit,
-                      "frame": labels.FRAME.get(name, "palm"), "order": labels.ORDER.get(name, "as declared"),
-                      "scaling": scaling,
-                      "source": source})  # fmt: skip
+    for name, width, unit, source in rows(env):
+        _, frame, order = labels.get(name, (unit, "palm", "as declared"))
+        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": frame, "order": order,
+                      "scaling": scaling.get(name, "none"), "source": source})  # fmt: skip
         at += width
-    if at != env.obs["actor"].shape[1]:
-        raise UserError(
-            f"task.observations: its policy sees {env.obs['actor'].shape[1]} numbers, the loop builds {at}: rows of"
-            " this task that a bundle can lack are switched by task.observe"
-        )
+    if (past := next((r for r in env.actor_rows() if r.frames > 1), None)) and labels:
+        raise UserError(f"task.observations.{past.term.name}.frames={past.frames}: the deployed loop keeps no past of"
+                        " this row; export a policy that was trained without it")  # fmt: skip
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
               "lead": floats(env.lead()) if task["action"]["lead"] is None else float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
@@ -317,7 +283,7 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
         "calibration": calibration.to_dict(),
         **own,
         "servo": cfg["servo"],
-        "golden": {"file": bundle.GOLDEN, "rows": rows, "tolerance": TOLERANCE},
+        "golden": {"file": bundle.GOLDEN, "rows": golden_rows, "tolerance": TOLERANCE},
         "versions": _versions(data),
         "trained": {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "git": data["git"]},
     }  # fmt: skip
@@ -417,7 +383,7 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
         own = of.SIGNALS
         there = {k: rows[f"signal_{k}"] for k in own.Signals._fields if f"signal_{k}" in rows}  # an older one has fewer
         signals = own.Signals(**{k: torch.from_numpy(x) for k, x in there.items()})
-        return own.build(signals, of.settings(b.manifest)).numpy()
+        return of.build(signals, b.manifest).numpy()
     from dexsim.calibration.file import Calibration
 
     built = of.measure(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",

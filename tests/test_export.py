@@ -147,8 +147,9 @@ def test_builder_places_every_signal():
     s = observations.Signals(
         one(1, 12), one(2, 12), one(3, 2), one(4), one(5), one(6, 5), one(7, 5, 3), one(8, 5, 3), one(9)
     )
-    out = observations.build(s, 2.0)
-    at = observations.slices(observations.rows(12, 5, 5))
+    widths = {"joint_angle": 12, "joint_torque": 12, "object_position": 3, "object_velocity": 3, "contact_force": 5,
+              "contact_centre": 15, "fingertip_position": 15, "force_command": 1}  # fmt: skip
+    out, at = observations.build(s, [*widths], 2.0), observations.slices([*widths.items()])
     assert out.shape == (2, 66)
     for name, want in (("joint_angle", 1), ("joint_torque", 2), ("contact_force", 3), ("contact_centre", 7),
                        ("fingertip_position", 8), ("force_command", 9)):  # fmt: skip

@@ -24,7 +24,9 @@ QUIET = (
     "task.sensors.vision_z_noise=0",
 )
 NO_BIAS = ("randomize.sensors.vision_xy=0", "randomize.sensors.torque_bias=0")
-SLICES = observations.slices(observations.rows(12, 5, 5))
+WIDTHS = {"joint_angle": 12, "joint_torque": 12, "object_position": 3, "object_velocity": 3, "contact_force": 5,
+          "contact_centre": 15, "fingertip_position": 15, "force_command": 1}  # fmt: skip
+SLICES = observations.slices([*WIDTHS.items()])
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.measure import for_bundle
 from dexsim.errors import UserError
-from dexsim.tasks import observations
 
 FEW = ("task.objects.train=[box]", "task.objects.held_out=[sphere]")
 
@@ -74,7 +73,10 @@ def test_touch_is_or_is_not():
 def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
     """For a hand at rest that presses one taxel with 10 counts."""
     table, at = [], 0
-    for name, width, *_ in observations.rows(12, 5, pads, commands):
+    touch = {"contact_force": pads, "contact_centre": 3 * pads} if pads else {}
+    widths = {"joint_angle": 12, "joint_torque": 12, "object_position": 3, "object_velocity": 3, **touch,
+              "fingertip_position": 15, "force_command": commands}  # fmt: skip
+    for name, width in widths.items():
         table.append({"name": name, "start": at, "stop": at + width})
         at += width
     manifest = {"task": "grasp", "observation": table, "normalization": {"force_max_N": 10.0},

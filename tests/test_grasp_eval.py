@@ -56,7 +56,7 @@ class Stage:
 def play(away=0.0, touched=True) -> tuple[Stage, dict]:
     """Return one episode in every world of a stage."""
     stage = Stage(torch.as_tensor(away).expand(N), torch.as_tensor(touched).expand(N, 5))
-    out = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
+    out, _ = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
     stage.gravity, stage.force = torch.stack(stage.gravity), torch.stack(stage.force)
     return stage, out
 
@@ -161,7 +161,7 @@ def test_a_lift_is_gravity_of_a_carried_frame():
 def test_the_hand_is_lifted_and_shaken_instead_of_turned():
     stage = Stage(torch.zeros(N), torch.ones(N, 5, dtype=torch.bool))
     stage.task = {"evaluation": {"base": "lift"}}
-    out = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
+    out, _ = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
     g = torch.stack(stage.gravity)[:, 0].numpy()
     t = DT * np.arange(len(g))
     still = (t < SETTLE + HOLD) | ((t > SETTLE + HOLD + TURN_S) & (t < SETTLE + HOLD + TURN_S + STAY_S))

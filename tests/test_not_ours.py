@@ -174,13 +174,13 @@ def test_held_poses_are_whole_or_not_there(tmp_path, monkeypatch):
         ("sizes=[true, 1]", "edges within"),
         ("hold=[palm]", "must be palm or fingertips"),
         ("hold={a: 1}", "must be palm or fingertips"),
-        ("count='", "cannot be read as YAML"),
+        ("count='", "must be a whole number from 1"),
         ("count=true", "must be a whole number from 1"),
         ("seed=-1", "must be a whole number from 0"),
         ("seed=x", "must be a whole number from 0"),
         ("out=", "must be a file to write"),
         ("out=..", "must be a file to write"),
-        ("worlds=\x00", "cannot be read as YAML"),
+        ("worlds=\x00", "must be a whole number from 1"),
     ],
 )
 def test_values_of_held_poses_that_are_none(place, setting, said):

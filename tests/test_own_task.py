@@ -175,6 +175,14 @@ def test_task_names_stand_in_their_own_files_only():
     assert not found, "\n".join(found)
 
 
+def test_tasks_read_top_to_bottom_in_one_file():
+    """Each of dexsim's in at most 300 lines beside kernels and evaluation, each skill of the examples in 150."""
+    own = [where.partition(":")[0].replace(".", "/") + ".py" for where in registry.built_in().values()]
+    skills = [str(p.relative_to(ROOT)) for p in (ROOT / "examples" / "dexsim_examples").glob("*.py")]
+    lines = {name: len((ROOT / name).read_text(encoding="utf-8").splitlines()) for name in (*own, *skills)}
+    assert len(own) == 3 and not {k: n for k, n in lines.items() if n > (300 if k in own else 150)}
+
+
 ALLOWED = {
     "api.py": r'task: Task = "grasp"',  # the default
     "demo.py": r'"policy": "grasp"',  # the default of the demo
@@ -329,7 +337,7 @@ def test_wrong_shapes_name_their_term():
         stepped(made(Typo, worlds=1))
     with pytest.raises(UserError, match=r"reward one: has shape \[2, 1\], must be \[2\]"):
         stepped(made(Column, worlds=2))
-    with pytest.raises(UserError, match=r"termination over: gives torch.bool \[2, 12\]"):
+    with pytest.raises(UserError, match=r"termination over: has shape \[2, 12\]"):
         stepped(made(Whole, worlds=2))
     with pytest.raises(UserError, match="observation joint_position: gives"):
         made(Scalar, worlds=2)

@@ -24,10 +24,13 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
+from dexsim import door
 from dexsim.errors import UserError
 from dexsim.tasks import registry
 from dexsim.typed import finite
 
+TERMS = ("observations", "terminations", "commands", "events")
+"""Parts of a task's settings that its declared terms have."""
 WORDS = ("auto", "unknown", "inf", "null")  # strings that a number's place may hold
 
 
@@ -89,14 +92,8 @@ def _option(item: Override, options: list[str]) -> str:
     if name in options:
         return name
     if group == "task":
-        if name in registry.installed() or registry.is_class(name):
-            registry.find(name)
-            return name
-        known = [*options, *registry.installed()]
-        raise UserError(
-            f"task={name}: no such task; task can be {', '.join(known)}{_guess(name, known)}, or a class of your own,"
-            " task=module:Class"
-        )
+        registry.find(name)  # of an installed package, or a class; raises UserError for no task
+        return name
     if name.endswith((".yaml", ".yml")) and group == "servo":
         raise UserError(f"servo={name}: a file of your own is given as servo_file={name}")
     raise UserError(f"{group}={name}: no such option; {group} can be {', '.join(options)}{_guess(name, options)}")
@@ -144,7 +141,7 @@ def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tu
 def choose(cfg: DictConfig, config_dir: Path, choices: dict[str, str]) -> DictConfig:
     """Exchange whole groups of a config that came out of a checkpoint for options of the config files."""
     task = choices.get("task", "")
-    if registry.is_class(task) and OmegaConf.select(cfg, "task.class") == task:
+    if door.is_named(task) and OmegaConf.select(cfg, "task.class") == task:
         choices = {k: v for k, v in choices.items() if k != "task"}  # said only so that it may be imported
     if not choices:
         return cfg
@@ -207,9 +204,9 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
 def _of_term(cfg: DictConfig, key: str) -> Any:
     """Return the usual value of a term's setting that the task's class declares and the settings do not list; None
     for any other. Raises UserError for a term that the task has not."""
-    if key.split(".")[0] != "task" or not registry.TERMS & {key.split(".")[1]} or key.count(".") not in (2, 3):
+    if key.split(".")[0] != "task" or key.split(".")[1] not in TERMS or key.count(".") not in (2, 3):
         return None
-    declared = OmegaConf.create({"task": registry.terms(resolve(cfg))})
+    declared = OmegaConf.create({"task": registry.task_class(resolve(cfg)).declared()})
     node = _parent(declared, key)
     return OmegaConf.select(node, key.rpartition(".")[2])
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from dexsim import files, outputs, yaml_text
+from dexsim import files, outputs, typed, yaml_text
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -38,8 +36,7 @@ def tasks() -> dict[str, tuple[str, list[float]]]:
     return {carries: (name, list(edges)) for name, (carries, edges) in held.items()}
 
 
-WHOLE = {"count": (1, 10**6), "worlds": (1, 10**5), "seed": (0, 2**63 - 1)}
-"""Lowest and highest of the whole numbers."""
+USUAL = {"out": "out/stable_grasps.npz", "count": "2000", "worlds": "256", "seed": "0", "sizes": "", "hold": "palm"}
 
 
 def main(argv: list[str]) -> int:
@@ -47,32 +44,21 @@ def main(argv: list[str]) -> int:
     if any(a in ("-h", "--help", "help") for a in argv):
         print(USAGE, end="")
         return 0
-    own: dict[str, Any] = {
-        "out": "out/stable_grasps.npz", "count": 2000, "worlds": 256, "seed": 0, "sizes": None, "hold": "palm",
-    }  # fmt: skip
-    rest = []
-    for text in argv:
-        key, eq, value = text.partition("=")
-        if eq and key in own:
-            own[key] = value if key == "out" else _value(key, value)
-        else:
-            rest.append(text)
-    known = tasks()
-    if own["hold"] not in [*known]:  # a list, as what was typed may be one
-        raise UserError(f"hold={own['hold']}: must be {' or '.join(known)}")
-    task, usual = known[own["hold"]]
-    sizes = usual if own["sizes"] is None else own["sizes"]
+    mine = [a for a in argv if a.partition("=")[0] in USUAL]
+    own, known = USUAL | typed.settings(mine, USUAL), tasks()
+    task, usual = known[typed.one_of("hold", own["hold"], [*known])]
+    count = typed.whole("count", own["count"], 1, 10**6)
+    worlds, seed = typed.whole("worlds", own["worlds"], 1, 10**5), typed.whole("seed", own["seed"])
+    sizes = usual if not own["sizes"] else yaml_text.parse(own["sizes"], f"sizes={own['sizes'][:40]}")
     if not (
         isinstance(sizes, list)
         and len(sizes) == 2
         and all(type(x) in (int, float) for x in sizes)
         and 0.01 <= sizes[0] <= sizes[1] <= 0.3
     ):
-        raise UserError(f"sizes={sizes}: must be [low, high] edges within [0.01, 0.3] m")
-    for key, (low, high) in WHOLE.items():
-        if type(own[key]) is not int or not low <= own[key] <= high:
-            raise UserError(f"{key}={own[key]}: must be a whole number from {low} to {high}")
-    begun = start.for_train([f"task={task}", "device=cpu", f"worlds={own['worlds']}", *rest], CONFIGS)
+        raise UserError(f"sizes={own['sizes']}: must be [low, high] edges within [0.01, 0.3] m")
+    rest = [a for a in argv if a not in mine]
+    begun = start.for_train([f"task={task}", "device=cpu", f"worlds={worlds}", *rest], CONFIGS)
     if begun is None:
         return 0
     out = files.place(own["out"])
@@ -89,17 +75,12 @@ def main(argv: list[str]) -> int:
     generate = (make_grasps if own["hold"] == "palm" else make_fingertip_grasps).generate
     torch.set_num_threads(1)
     quiet_warp("cpu")
-    if own["sizes"] is None:  # as large for this hand as the usual ones for a hand of UNIT_SPAN
+    if not own["sizes"]:  # as large for this hand as the usual ones for a hand of UNIT_SPAN
         sizes = [hand_of(begun.cfg).span / UNIT_SPAN * x for x in sizes]
-    grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))
+    grasps = generate(begun.cfg, count, worlds, seed, tuple(sizes))
     with outputs.staged(out.parent) as stage:
         grasps.save(stage / out.name)
     what = "cubes" if grasps.names == ("box",) else ", ".join(grasps.names)
     low, high = 1000 * grasps.edge.min(), 1000 * grasps.edge.max()
     print(f"{len(grasps)} held poses, {what} of {low:.0f}-{high:.0f} mm: {out}")
     return 0
-
-
-def _value(key: str, text: str) -> Any:
-    """Return a setting as it was typed: a number, a word, a list. Raises UserError."""
-    return yaml_text.parse(text, f"{key}={text[:40]}")

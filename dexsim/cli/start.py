@@ -119,13 +119,14 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
         if data is None:
             cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
         plain = _finish(cfg, device)
-        if _another_world(plain):
-            plain, device = _elsewhere(plain, play), "cpu"
+        kind = device.partition(":")[0]
+        if _another_world(plain):  # on the CPU, all trials at once: C MuJoCo has a thread pool
+            plain, kind = _elsewhere(plain, play), "cuda"
         checks.check(play)
         if play["view"]:
             play["worlds"] = play["worlds"] or VIEW_WORLDS
             plain["tactile"]["raw"] = True  # the page shows every taxel
-        play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
+        play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[kind])
         plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
         checks.check(plain | {"agent": {}})
     return (
@@ -252,17 +253,12 @@ def _another_world(plain: dict[str, Any]) -> bool:
 
 
 def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
-    """Return the config of another world (`reality=`), on the CPU, all its trials at once: C MuJoCo has a thread
-    pool."""
+    """Return the config of another world (`reality=`), on the CPU."""
     if str(play["device"] or "cpu") != "cpu":
         raise UserError(
             f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu"
         )
     play["device"] = plain["device"] = "cpu"
-    if play["view"]:
-        play["worlds"] = play["worlds"] or VIEW_WORLDS
-        plain["tactile"]["raw"] = True  # the page shows every taxel
-    play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS["cuda"])
     from dexsim.tasks.reality import overlay
 
     return overlay(plain)

@@ -21,7 +21,7 @@ def main(argv: list[str]) -> int:
     rows = []
     for entry in registry.entries():
         try:
-            about = registry.about(registry.load(entry.where))
+            about = ((registry.load(entry.where).__doc__ or "").strip().splitlines() or [""])[0]
         except UserError as error:  # a package that is broken hides none of the others
             about = f"({error})"
         rows.append((entry.name, entry.where, entry.origin, about))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import files, guard, yaml_text
-from dexsim.deploy import manifests, measure
+from dexsim.deploy import manifests
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.load import FILE as HAND_FILE
@@ -69,7 +69,6 @@ def load(path: str | Path) -> Bundle:
     which = manifests.hand_entry(manifest, path / MANIFEST)
     hand = _hand(which, path)
     manifests.check(manifest, path / MANIFEST, hand)
-    _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
     data = _network(policy, manifest["policy"]["sha256"])
     guard.call(_tried, data, policy, manifest["policy"], what=f"{policy}", size=len(data), wanted=False)
@@ -109,18 +108,6 @@ def _hand(which: manifests.HandEntry, path: Path) -> Hand:
         return load_hand(which.name if which.folder is None else own, which.mirror, which.scale)
     except UserError as error:
         raise UserError(f"{file}: its hand cannot be read: {error}") from None
-
-
-def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
-    """Check that the network was trained on the observation that is built here, row by row."""
-    here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
-    ours = [tuple(row[:3]) for row in measure.of(m["task"]).table(m, hand)]
-    if here != ours:
-        bad = next(i for i in range(max(len(here), len(ours))) if here[i : i + 1] != ours[i : i + 1])
-        raise UserError(
-            f"{file}: observation {here[bad : bad + 1]} is not this dexsim's {ours[bad : bad + 1]}: use the dexsim of"
-            " its versions"
-        )
 
 
 def _mapping(file: Path) -> dict[str, Any]:

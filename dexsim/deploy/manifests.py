@@ -197,6 +197,7 @@ def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
                 " order"
             )
     _table(m, source)
+    _rows(m, source, hand)
     _limits(m, source, hand)
     return m
 
@@ -214,6 +215,29 @@ def _table(m: Manifest, source: object) -> None:
         raise UserError(
             f"{source}: policy.observation_size={m.policy.observation_size}, its observation table has {at}; {AGAIN}"
         )
+
+
+def _rows(m: Manifest, source: object, hand: Hand) -> None:
+    """Check that the loop builds each row, as wide as the policy was trained with; those of declared terms are built by
+    a network of the bundle's own."""
+    if m.terms is not None:
+        return
+    known, J, P = measure.of(m.task).SIGNALS.ROWS, len(hand.joints), len(hand.pads)
+    widths: dict[str, tuple[int, ...]] = {
+        "follower_angle": (len(hand.sensed),), "object_position": (3,), "object_velocity": (3,),
+        "relative_orientation": (4, 6), "contact_force": (P,), "contact_centre": (3 * P,),
+        "fingertip_position": (3 * len(hand.fingers),), "force_command": (1, 2),
+    }  # fmt: skip
+    blind = m.task_settings is not None and m.task_settings.perception == "proprioception"
+    times = m.task_settings.history if blind and m.task_settings else 1
+    for row in m.observation:
+        sizes = [times * n for n in widths.get(row.name, (J,))] if row.name in known else []
+        if row.stop - row.start not in sizes or row.unit != known[row.name][0]:
+            here = f"{' or '.join(map(str, sizes))} {known[row.name][0]}" if sizes else "no such row"
+            raise UserError(
+                f"{source}: observation {row.name} of {row.stop - row.start} {row.unit}; this dexsim builds {here}: use"
+                " the dexsim of its versions"
+            )
 
 
 def _limits(m: Manifest, source: object, hand: Hand) -> None:

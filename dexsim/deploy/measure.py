@@ -2,8 +2,8 @@
 
 Each task has a module `dexsim.deploy.of_<task>` that knows how; tasks of declared terms share `of_terms`. Such a module
 has `OPTIONS` (what `dexsim deploy` can be told for it), `SIGNALS` (the builder of its observation: `Signals`, `build`,
-`FRAME`, `ORDER`), `check` (of a manifest), `table` and `settings` (of the builder, by a manifest), `measure` (what the
-loop calls) and `parts` (of a manifest, by an environment).
+`ROWS`), `check` (of a manifest), `build` (an observation of signals, by a manifest), `measure` (what the loop calls)
+and `parts` (of a manifest, by an environment). Which rows there are follows from what the task declares.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.manifests import floats
 from dexsim.deploy.measure import PLACE, commanded, tensor
 from dexsim.errors import UserError
-from dexsim.hand import Hand
 from dexsim.tasks import observations
 
 OPTIONS = ("vision", "place", "shape")
@@ -26,41 +25,26 @@ def check(m: Any, source: object, again: str) -> None:
         raise UserError(f"{source}: lacks normalization.force_max_N, which task={m.task} needs; {again}")
 
 
-def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
-    """Return rows of the observation as this dexsim builds it."""
-    return observations.rows(len(hand.joints), len(hand.fingers), len(hand.pads), sensed=len(hand.sensed))
-
-
-def settings(m: dict[str, Any]) -> float:
-    """Return what `SIGNALS.build` takes beside signals."""
-    return float(m["normalization"]["force_max_N"])
+def build(s: observations.Signals, m: dict[str, Any]) -> torch.Tensor:
+    """Return the observation [N, D] that a manifest states."""
+    names = [row["name"] for row in m["observation"]]
+    return observations.build(s, names, float(m["normalization"]["force_max_N"]))
 
 
 def measure(bundle: Any, calibration: Calibration) -> Measure:
     """Return what the loop calls."""
-    manifest = bundle.manifest
-    width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
-    made = Measure(calibration, settings(manifest), float(manifest["rates"]["policy_period_s"]))
-    made.touch, made.commands = "contact_force" in width, width.get("force_command", 1)
-    return made
+    return Measure(calibration, bundle.manifest)
 
 
 def parts(env: Any) -> dict[str, Any]:
     """Return the parts of a manifest that differ between tasks."""
-    scaling = {
-        "tau/tau_max": "torque [N.m] / normalization.tau_max",
-        "F/F_max": "force [N] / normalization.force_max_N",
-    }
-    contact = env.pads if env.task.get("observe", {}).get("touch", True) else 0
-    commands = 1 if env.thumb_range is None else 2
-    named = {"force_command": "the commanded share of normalization.force_max_N"}
-    rows = [
-        (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
-        for name, width, unit, source in observations.rows(
-            env.num_actions, env.fingers, contact, commands, len(env.hand.sensed))  # fmt: skip
-    ]
     return {
-        "rows": rows, "initial_pose": floats(env.pose0),
+        "scaling": {
+            "joint_torque": "torque [N.m] / normalization.tau_max",
+            "contact_force": "force [N] / normalization.force_max_N",
+            "force_command": "the commanded share of normalization.force_max_N",
+        },
+        "initial_pose": floats(env.pose0),
         "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
         "normalization": {"force_max_N": float(env.f_max)},
         "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the"
@@ -72,31 +56,28 @@ def parts(env: Any) -> dict[str, Any]:
 
 def signals_of(env: Any) -> observations.Signals:
     """Return what the last observation of a simulated task was built from, noise and all."""
-    s, contact = env.sensed, env.pads if env.task.get("observe", {}).get("touch", True) else 0
+    s = env.sensed
     followers = env.q[:, :0]
     if env.hand.sensed:  # with its noise, which is nowhere else
         widths = {name: width for name, width, _ in env.describe()["observations"]["actor"]}
         parts = env.obs["actor"].split([*widths.values()], 1)
         followers = dict(zip(widths, parts, strict=True))["follower_angle"].clone()
     return observations.Signals(
-        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, :contact],
-        env.touch.centre[:, :contact], s.tip, env.force_command(), followers)  # fmt: skip
+        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, : env.pads],
+        env.touch.centre[:, : env.pads], s.tip, env.force_command(), followers)  # fmt: skip
 
 
 class Measure:
     """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last
-    height.
-
-    period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training. touch:
-    whether the policy has rows of touch (task.observe.touch). commands: 2 for a policy whose thumb has one of its own
-    (task.command.thumb), which is given the others'.
-    """
+    height."""
 
     needs: str | None = PLACE
 
-    def __init__(self, calibration: Calibration, force_max: float, period: float):
-        self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
-        self.touch, self.commands = True, 1
+    def __init__(self, calibration: Calibration, manifest: dict[str, Any]):
+        self.calibration, self.manifest = calibration, manifest
+        self.period = float(manifest["rates"]["policy_period_s"])
+        width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
+        self.commands = width.get("force_command", 1)  # 2: the thumb has one of its own, and is given the others'
         self.hand = HandKinematics(calibration.hand)
         self.reset()
 
@@ -117,10 +98,7 @@ class Measure:
         frame, which is needed; command: one number, 0..1."""
         assert seen is not None
         s = self.signals(state, seen, command)
-        force = s.touch_force[0].numpy()
-        if not self.touch:  # it is shown and recorded all the same
-            s = s._replace(touch_force=s.touch_force[:, :0], touch_centre=s.touch_centre[:, :0])
-        return self.observation(s), force
+        return build(s, self.manifest).numpy(), s.touch_force[0].numpy()
 
     def signals(self, state: HandState, place: np.ndarray, command: list[float]) -> observations.Signals:
         """See `observe`; of touch, all that the hand feels."""
@@ -137,7 +115,3 @@ class Measure:
             tensor(self._xy), z, vz,
             tensor(force), tensor(centre), tensor(tips),
             tensor([*command] * self.commands), self.hand.followers(state))  # fmt: skip
-
-    def observation(self, signals: observations.Signals) -> np.ndarray:
-        """Return [1, D] float32, by the builder that training used."""
-        return observations.build(signals, self.force_max).numpy()

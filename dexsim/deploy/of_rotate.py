@@ -16,7 +16,6 @@ from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.manifests import Observe, floats
 from dexsim.deploy.measure import ORIENTATION, commanded, tensor
 from dexsim.errors import UserError
-from dexsim.hand import Hand
 from dexsim.tasks import observations_rotate
 from dexsim.typed import convert
 
@@ -33,39 +32,27 @@ def check(m: Any, source: object, again: str) -> None:
         raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {again}")
 
 
-def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str, str]]:
-    """Return rows of the observation as this dexsim builds it."""
-    sizes = len(hand.joints), len(hand.fingers), len(hand.pads), len(hand.sensed)
-    return observations_rotate.rows(m["task_settings"], *sizes)
-
-
-def settings(m: dict[str, Any]) -> dict[str, Any]:
-    """Return what `SIGNALS.build` takes beside signals."""
-    return m["task_settings"]
+def build(s: observations_rotate.Signals, m: dict[str, Any]) -> torch.Tensor:
+    """Return the observation [N, D] that a manifest states."""
+    return observations_rotate.build(s, [row["name"] for row in m["observation"]], m["task_settings"])
 
 
 def measure(bundle: Any, calibration: Calibration) -> TurnMeasure:
     """Return what the loop calls."""
-    return TurnMeasure(calibration, bundle.manifest, float(bundle.manifest["rates"]["policy_period_s"]))
+    return TurnMeasure(calibration, bundle.manifest)
 
 
 def parts(env: Any) -> dict[str, Any]:
     """Return the same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held
     pose that is most like all others: where the fingers wait for the cube, and the targets they close to."""
     task, g = env.task, env.grasps
-    targets = task["observe"].get("last_action", "step") != "step"
-    scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
-    rows = [
-        (name, width, unit, source, scaled.get(name, "none"))
-        for name, width, unit, source in observations_rotate.rows(
-            task, env.num_actions, env.fingers, env.pads, len(env.hand.sensed))  # fmt: skip
-    ]
-    imu = task["perception"] == "imu"
+    imu, targets = task["perception"] == "imu", task["observe"].get("last_action", "step") != "step"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
     settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
     settings["reward"] = {"delta_rot": task["reward"]["delta_rot"]}
     return {
-        "rows": rows, "initial_pose": floats(g.hand[middle]),
+        "scaling": {"last_action": "(target - middle) / half of action.low..high"} if targets else {},
+        "initial_pose": floats(g.hand[middle]),
         "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
         "normalization": {},
         "task_settings": settings,
@@ -105,19 +92,16 @@ class TurnMeasure:
     training a goal is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
     """
 
-    def __init__(self, calibration: Calibration, manifest: dict[str, Any], period: float):
-        self.calibration, self.period, self.task = calibration, float(period), manifest["task_settings"]
+    def __init__(self, calibration: Calibration, manifest: dict[str, Any]):
+        self.calibration, self.manifest, self.task = calibration, manifest, manifest["task_settings"]
+        self.period = float(manifest["rates"]["policy_period_s"])
         self.needs = ORIENTATION if self.task["perception"] == "imu" else None
         self.hand = HandKinematics(calibration.hand)
         self.axis, self.turn = observations_rotate.axis_and_turn(self.task["goal"], calibration.hand.mirror)
         low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
         self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
-        self.frame = sum(row[1] for row in observations_rotate.rows(self.task, *self._sizes(), frames=1))
+        self.frame = manifest["policy"]["observation_size"] // int(self.task["history"])
         self.reset()
-
-    def _sizes(self) -> tuple[int, int, int, int]:
-        hand = self.calibration.hand
-        return len(hand.joints), len(hand.fingers), len(self.calibration.gain), len(hand.sensed)
 
     def reset(self) -> None:
         """Begin a new episode: the next orientation gives the first goal."""
@@ -137,7 +121,7 @@ class TurnMeasure:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation
         w x y z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
         s = self.signals(state, seen, target, action)
-        out = observations_rotate.build(s, self.task)
+        out = build(s, self.manifest)
         if self.task["perception"] == "proprioception":
             self._past = out.view(1, -1, self.frame)
         return out.numpy(), s.touch_force[0].numpy()

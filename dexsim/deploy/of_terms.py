@@ -19,13 +19,10 @@ from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.measure import POSE, commanded
 from dexsim.errors import UserError
-from dexsim.hand import Hand
 from dexsim.tasks.task import STATE, Task
 from dexsim.tasks.terms import Memory
 
 OPTIONS = ("vision", "shape")
-FRAME: dict[str, str] = {}
-ORDER: dict[str, str] = {}
 
 
 def signals(joints: int, fingers: int, pads: int) -> dict[str, tuple[int, ...]]:
@@ -89,7 +86,7 @@ class Observation(torch.nn.Module):
     def __init__(self, task: Task, names: list[str] | None = None):
         super().__init__()
         self.task = task
-        self.rows = [r for r in task._sensed if task._named(task.task["observations"][r.term.name]["actor"])]
+        self.rows = task.actor_rows()
         shapes = signals(len(task.hand.joints), task.fingers, task.pads)
         self.shapes = shapes | {f"command {k}": (v.shape[1],) for k, v in task.commands.items()}
         self.names = names or self._used()
@@ -136,9 +133,12 @@ def check(m: Any, source: object, again: str) -> None:
                         f" {m.policy.observation_size}; {again}")  # fmt: skip
 
 
-def table(m: dict[str, Any], hand: Hand) -> list[tuple[str, int, str]]:
-    """Return rows of the observation: as the bundle states them, since its network builds them."""
-    return [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
+def rows(env: Task) -> list[tuple[str, int, str, str]]:
+    """Return name, width, unit and source of each row that the actor of a task sees."""
+    seen = [(r.term.name, r.width * r.frames * env.history, r.unit or "1", r.term.options["real"] or r.term.text)
+            for r in env.actor_rows() if r.width]  # fmt: skip
+    commanded = [(k, v) for k, v in env.commands.items() if env.task["commands"][k]["actor"]]
+    return seen + [(k, v.shape[1] * env.history, "1", "told") for k, v in commanded]
 
 
 def parts(env: Task) -> dict[str, Any]:
@@ -146,18 +146,12 @@ def parts(env: Task) -> dict[str, Any]:
     from dexsim.deploy.manifests import floats
 
     of = Observation(env)
-    rows = []
-    for row in of.rows:
-        wide = row.width * row.frames * env.history
-        rows.append((row.term.name, wide, row.unit or "1", row.term.options["real"] or row.term.text, "none"))
-    commanded = {k: v for k, v in env.commands.items() if env.task["commands"][k]["actor"]}
-    rows += [(k, v.shape[1] * env.history, "1", "told", "none") for k, v in commanded.items()]
     width = env.sampler.width.clone()
     env.sampler.width.fill_(0.0)  # the middle of every range
     env.reset_all()
     env.sampler.width.copy_(width)
     out = {
-        "rows": rows, "initial_pose": floats(env.q[0]), "rates": {}, "normalization": {},
+        "initial_pose": floats(env.q[0]), "rates": {}, "normalization": {},
         "terms": {
             "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
             "rows": [{"name": r.term.name, "width": r.width, "frames": r.frames} for r in of.rows],
@@ -268,4 +262,4 @@ def write(env: Task, path: Any, opset: int) -> Observation:
     return of
 
 
-__all__ = ["OPTIONS", "TermsMeasure", "check", "measure", "parts", "signals", "table", "write"]
+__all__ = ["OPTIONS", "TermsMeasure", "check", "measure", "parts", "rows", "signals", "write"]

@@ -6,7 +6,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
     from dexsim.tasks.scenes import Base, Free, Hinge, Scene, Screw, Slide, Table, Thing, Tree
     from dexsim.tasks.task import Task
     from dexsim.tasks.terms import command, done, event, memory, metric, observe, reward
@@ -29,8 +28,8 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'dexsim.tasks' has no attribute {name!r}")
 
 
-def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: Any = None) -> HandEnv:
-    """Return the environment of a resolved configuration: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
+def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: Any = None) -> Task:
+    """Return the environment of a resolved configuration: a `dexsim.tasks.Task`, which is an rsl-rl VecEnv.
 
     cfg: as a plain dict; its task's class is found by `dexsim.tasks.registry`. engine: "auto", "warp" or "mujoco".
     grasps: held poses that rotation begins with (`tasks.stable_grasps.GraspSet`); by default those of

@@ -40,6 +40,16 @@ class HandEnv(Kept):
     span over UNIT_SPAN; `rise`: m by which its palm is higher than that of the hand that heights in settings are for.
     """
 
+    # what `Task` has: named ends, bool [N]; named rewards, weighted [N]; words of each reward; scalars for the log;
+    # tables of the first screen
+    setup: Callable[[], None]
+    before_physics: Callable[[], None]
+    terminated: Callable[[], dict[str, torch.Tensor]]
+    rewards: Callable[[], dict[str, torch.Tensor]]
+    reward_words: Callable[[], dict[str, str]]
+    metrics: Callable[[], dict[str, torch.Tensor]]
+    describe: Callable[[], dict[str, Any]]
+
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
         super().__init__(cfg, n_worlds, device, seed, engine)
         self._check_rewards()
@@ -61,16 +71,6 @@ class HandEnv(Kept):
                 )
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
                 raise UserError(f"task.rewards.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
-
-    @classmethod
-    def config(cls) -> dict[str, Any]:
-        """Return the settings of a task that has them in its class; see `dexsim.tasks.Task`. Raises UserError."""
-        raise UserError(f"{cls.__name__}: its settings stand in a file; derive from dexsim.tasks.Task for your own")
-
-    @classmethod
-    def declared(cls) -> dict[str, Any]:
-        """Return settings of declared terms, by part of the task's settings; see `dexsim.tasks.Task`."""
-        return {}
 
     @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:
@@ -100,42 +100,24 @@ class HandEnv(Kept):
                 )
 
     @classmethod
-    def check_deployed(cls, source: str) -> None:
-        """Raise UserError where a policy of this task cannot be exported for a robot. source: its checkpoint."""
-        raise UserError(
-            f"{source}: {cls.__name__} declares no terms, so that the deployed loop cannot build what its policy sees"
-        )
-
-    @classmethod
     def another_world(cls, u: Callable[..., float], friction: float, size: float) -> dict[str, Any]:
         """Draw what of this task differs in another world to be judged in: "randomize", ranges by name, and "sensors".
 
         u(low, high, digits): a number. friction, size [m] of the object. See `dexsim.tasks.reality`."""
         return {}
 
-    def setup(self) -> None:
-        """Allocate what the task needs; called once, before the first reset."""
+    def trial_facts(self) -> dict[str, torch.Tensor]:
+        """Return what an evaluation keeps of each episode as it begins, [N] each."""
+        return {}
 
-    def before_physics(self) -> None:
-        """Commands, pushes: once a control step, before physics."""
+    def trial_counts(self) -> dict[str, torch.Tensor]:
+        """Return what an evaluation counts, step by step, while an episode lasts, bool [N] each."""
+        return {}
 
     def feel(self) -> None:
         """Sense after the last physics step of a control step: launches only, since it is recorded in the step's
         graph."""
         self.touch.launch()
-
-    def terminated(self) -> dict[str, torch.Tensor]:
-        """Return named terminations, bool [N] each."""
-        raise NotImplementedError
-
-    def reward_words(self) -> dict[str, str]:
-        """Describe each reward term that the task knows, by its name, for the first screen."""
-        raise NotImplementedError
-
-    def mirror_signs(self) -> torch.Tensor | None:
-        """Signs [A] by which the actor's observation changes where hand and world are mirrored; None where the task
-        does not say."""
-        return None
 
     def symmetries(self) -> Sequence[Mapping[str, Callable[[torch.Tensor], torch.Tensor]]]:
         """Return situations that are as likely and end alike, beside the present one: for each, by name of a row of the
@@ -147,10 +129,6 @@ class HandEnv(Kept):
         """(name, weight, what it is) of the rewards in the settings."""
         words = self.reward_words()
         return [(name, weight, words[name]) for name, weight in self.task["rewards"].items()]
-
-    def rewards(self) -> dict[str, torch.Tensor]:
-        """Return named reward terms, weighted, [N] each."""
-        raise NotImplementedError
 
     @property
     def max_episode_length(self) -> int:
@@ -219,14 +197,16 @@ class HandEnv(Kept):
         self._log(terms, ends, torch.cat([reward, rates]).mean(1))
 
     def _check_terms(self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]) -> None:
-        """Raise UserError for a term that is not one value for each world."""
-        for kind, values in (("termination", ends), ("reward", terms)):
+        """Raise UserError for a term that is not one value for each world, or an end that is no truth value."""
+        for kind, values in (("termination", ends), ("reward", terms), ("metric", self.figures)):
             for name, value in values.items():
                 if value.shape != (self.num_envs,):
                     raise UserError(
                         f"{kind} {name}: has shape {list(value.shape)}, must be [{self.num_envs}]: one value for each"
                         " world (squeeze the last axis?)"
                     )
+                if kind == "termination" and value.dtype != torch.bool:
+                    raise UserError(f"termination {name}: gives {value.dtype}, must be bool (compare with a bound)")
         if not terms:
             name = self.task["name"]
             raise UserError(f"task {name}: has no reward; declare one, or give one a weight: task.rewards.NAME=1")
@@ -328,10 +308,6 @@ class HandEnv(Kept):
                 self._log_values = torch.zeros(values.shape, device=self.device)
         self._log_values.copy_(values)
 
-    def metrics(self) -> dict[str, torch.Tensor]:
-        """Return task metrics for the log, scalars on the device."""
-        return {}
-
     def check(self) -> None:
         """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not
         finite; write a world that was not finite to `dump_folder` (a file nan_<k>.npz). Reads from the device: once an
@@ -365,26 +341,6 @@ class HandEnv(Kept):
     def usual_ends(self) -> list[tuple[str, str]]:
         """Return rows of the ends that every task has."""
         return [("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")]
-
-    def describe(self) -> dict[str, Any]:
-        """Return tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
-        "terminations", "randomization", "notes", and "headline", names of the log that the console shows."""
-        return {
-            "observations": {group: [(group, value.shape[1], "")] for group, value in self.obs.items()},
-            "action": self.action_rows(),
-            "rewards": [row for row in self.reward_rows() if row[1]],
-            "terminations": self.usual_ends(),
-            "randomization": self.sampler.rows(),
-            "notes": self.hand_notes(),
-        }
-
-    def figure_units(self) -> dict[str, str]:
-        """Return units of the figures in `last`, which an evaluation reports."""
-        return dict.fromkeys(self.last, "")
-
-    def judge_kept_out(self, kept_out: bool) -> None:
-        """Begin episodes with objects kept out of the training from now on, or with those of it."""
-        raise UserError(f"task {self.task['name']}: has task.objects.held_out, and no judge_kept_out that draws them")
 
     def evaluate(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 
 import torch
@@ -18,13 +18,10 @@ from dexsim.tasks.structs import filled
 class Episodes(Built):
     """Worlds that begin anew where a mask says so; see `HandEnv`."""
 
-    def begin_episodes(self, mask: torch.Tensor) -> None:
-        """Sample new episodes where mask [N] holds: object, servo, initial state (through `place`)."""
-        raise NotImplementedError
-
-    def observe(self, advance: bool) -> dict[str, torch.Tensor]:
-        """Return observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
-        raise NotImplementedError
+    # what `Task` has: where mask [N] holds, a new episode (object, servo, state through `place`); groups of
+    # observations [N, D], advance: a control step has passed (sensors with memory move on)
+    begin_episodes: Callable[[torch.Tensor], None]
+    observe: Callable[..., dict[str, torch.Tensor]]
 
     def reset_all(self) -> None:
         """Begin an episode in every world."""

@@ -22,6 +22,7 @@ from dexsim import intervals
 from dexsim.errors import UserError
 from dexsim.hand.places import approach
 from dexsim.tasks import base_path, observations
+from dexsim.tasks.evaluation import Film, batches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,25 +75,17 @@ def evaluate(env: GraspEnv, policy: Policy, episodes: int, seed: int, progress: 
 def _play_all(
     env: GraspEnv, policy: Policy, episodes: int, rows: torch.Tensor, progress: Progress | None, label: str
 ) -> dict:
-    parts: list[dict] = []
     rows_before = (env._rows, env._chances)
     env.draw_from(rows)
-    done = 0
-    while done < episodes:
-        parts.append(
-            _play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes)
-        )
-        done += env.num_envs
+    found, frames = batches(lambda k: _play(env, policy, not k, progress, label, k, episodes), env.num_envs, episodes)
     env._rows, env._chances = rows_before
-    out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
-    out["frames"] = parts[0]["frames"]
-    return out
+    return found | {"frames": frames}
 
 
 def _play(
     env: GraspEnv, policy: Policy, keep_frames: bool, progress: Progress | None, label: str, done: int, episodes: int
-) -> dict:
-    """Return one episode in every world."""
+) -> tuple[dict, dict | None]:
+    """Return one episode in every world, and its frames."""
     n, dev, dt, base = env.num_envs, env.device, env.dt, _base(env)
     steps = int(round((SETTLE + HOLD + sum(base.stages)) / dt))
     training_length, env.max_episode_length = env.max_episode_length, steps + 2
@@ -119,10 +112,7 @@ def _play(
     by_tips, by_all = torch.zeros(n, device=dev), torch.zeros(n, device=dev)  # forces that press on the object
     moved, untouched = torch.zeros_like(alive), torch.zeros_like(alive)  # what went wrong within the hold
     force, torque, samples = torch.zeros_like(env.tip_force), torch.zeros_like(env.torque), torch.zeros(n, device=dev)
-    filmed = list(range(min(4, n))) if keep_frames else []
-    models = [env.drawn_model(w) for w in filmed]  # before an episode ends and its object is replaced
-    qpos, shown_force = [], []
-    drawn: dict[str, list[np.ndarray]] = {"push": [], "gravity": [], "taxels": []}
+    shot = Film(env, steps * dt if keep_frames else 0.0)
     push_force = (PUSH_WEIGHTS * 9.81 * mass)[:, None] * direction
     # |m (g + a_push)|, the push where it is drawn to act: what the fingers must carry
     load = (9.81 * mass[:, None] * down + push_force * pushed[:, None]).norm(dim=1)
@@ -161,13 +151,7 @@ def _play(
                 if t <= SETTLE + HOLD + base.stages[0]:
                     held90 &= good
                 held180 &= good
-        if filmed:
-            qpos.append(env.engine.t.qpos[filmed].double().cpu().numpy())
-            shown_force.append(env.tip_force[filmed].cpu().numpy())
-            drawn["push"].append(env.outside_force[filmed].cpu().numpy())
-            drawn["gravity"].append(env.engine.field("opt.gravity")[filmed].cpu().numpy())
-            if env.touch.raw is not None:
-                drawn["taxels"].append(env.touch.raw[filmed].cpu().numpy())
+        shot.add(force=env.tip_force, push=env.outside_force, gravity=env.engine.field("opt.gravity"))
         if progress is not None and k % 10 == 0:
             progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
     env.outside_force.zero_()
@@ -181,23 +165,14 @@ def _play(
         "alive": alive, "moved": moved, "untouched": untouched, "tips": by_tips / by_all.clamp(min=1e-6),
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
-    out["frames"] = None
-    if filmed:
-        force_shown, given = np.stack(shown_force, 1), command[filmed].cpu().numpy()
-        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"][filmed]]
-        out["frames"] = {
-            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": env.hand.finger_names,
-            "full": 1.2 * env.f_max,
-            "label": [f"{name}, {1000 * m:.0f} g, friction"
-                      f" {mu:.1f}" for name, m,
-                      mu in zip(names, out["mass"][filmed], out["friction"][filmed], strict=True)],
-            "overlay": [
-                {"force": f, "command": np.full(steps, c * env.f_max), "layout": env.touch.layout}
-                | {k: np.stack([row[i] for row in rows]) for k, rows in drawn.items() if rows}
-                for i, (f, c) in enumerate(zip(force_shown, given, strict=True))
-            ],
-        }  # fmt: skip
-    return out
+    frames = shot.frames(full=1.2 * env.f_max)
+    if frames is not None:
+        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"]]
+        frames["label"] = [f"{name}, {1000 * m:.0f} g, friction {mu:.1f}" for name, m, mu in
+                           zip(names, out["mass"], out["friction"], strict=True)][: len(shot.worlds)]  # fmt: skip
+        for row, share in zip(frames["overlay"], out["command"], strict=False):
+            row["command"] = np.full(steps, share * env.f_max)
+    return out, frames
 
 
 def _angle(t: float) -> float:
@@ -253,12 +228,14 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
     carried = can_carry(r, f_max, n)
     held = r["held"].astype(bool)
     total, torque = _of(r["force"], others).sum(1), _flexing(r, env)
+    rates = {
+        "hold_rate": (r, ~pushed & firm), "hold_rate_pushed": (r, pushed & able),
+        "hold_rate_kept_out_shapes": (k, k["pushed"].astype(bool) & able_k),
+        "hold_rate_kept_out_shapes_unpushed": (k, ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
+    }  # fmt: skip
     out: dict[str, Any] = {
         "episodes": int(len(held)), "episodes_kept_out": int(len(k["held"])),
-        "hold_rate": _rate(r["held"], ~pushed & firm),
-        "hold_rate_pushed": _rate(r["held"], pushed & able),
-        "hold_rate_kept_out_shapes": _rate(k["held"], k["pushed"].astype(bool) & able_k),
-        "hold_rate_kept_out_shapes_unpushed": _rate(k["held"], ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
+        **{name: _rate(part["held"], among) for name, (part, among) in rates.items()},
         "hold_rate_all": float(held.mean()),
         **dict(zip(_base(env).held, (_rate(r["held90"], carried), _rate(r["held180"], carried)), strict=True)),
         "force_command_correlation": _corr(r["command"][held], total[held]),
@@ -283,14 +260,7 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
         out["by_command"] = _by_command(r, held, torque)
         out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held])
         out["torque_command_correlation_interval"] = _corr_interval(r["command"][held], torque[held].sum(1))
-    for name, part, among in (
-        ("hold_rate", r, ~pushed & firm),
-        ("hold_rate_pushed", r, pushed & able),
-        ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k),
-        ("hold_rate_kept_out_shapes_unpushed", k, ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
-    ):
-        out[f"{name}_interval"] = _rate_interval(part["held"], among)
-    return out
+    return out | {f"{name}_interval": _rate_interval(part["held"], among) for name, (part, among) in rates.items()}
 
 
 def _rate_interval(ok: np.ndarray, among: np.ndarray) -> list[float] | None:

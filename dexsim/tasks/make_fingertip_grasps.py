@@ -23,6 +23,7 @@ from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tasks.building import UNIT_SPAN, hand_of
+from dexsim.tasks.make_grasps import begin, step
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
 
@@ -100,8 +101,8 @@ def candidates(
         pitch, yaw, roll = (math.radians(rng.uniform(*r)) for r in (PITCH, YAW, ROLL))
         quat = torch.tensor([1.0, 0.0, 0.0, 0.0])
         for axis, angle in (((0, 0, 1), yaw), ((0, 1, 0), -pitch), ((1, 0, 0), roll)):
-            step = rotation.about(torch.tensor(axis, dtype=torch.float32), torch.tensor(angle, dtype=torch.float32))
-            quat = rotation.multiply(quat, step)
+            part = rotation.about(torch.tensor(axis, dtype=torch.float32), torch.tensor(angle, dtype=torch.float32))
+            quat = rotation.multiply(quat, part)
         turn = rotation.to_matrix(quat).double().numpy()
         q, used = np.zeros(len(hand.joints)), []
         alone = int(rng.choice(hand.opposing)) if len(hand.opposing) > 1 else hand.opposing[0]
@@ -149,16 +150,18 @@ def settle(
     env: RotateEnv, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.Tensor
 ) -> tuple[GraspSet, torch.Tensor]:
     """Close every hand on its cube and let go of it without weight: (grasps, which are fit [N])."""
-    _begin(env, start)
+    begin(env, start)
     env.engine.field("opt.gravity").zero_()
     target = press(env, pads, start.hand, share, force)
     for _ in range(round(FIRM / env.dt)):
-        _play(env, target)
+        env.target.copy_(target)
+        step(env)
         env.engine.t.qpos[:, env.object_q] = start.pose.to(env.engine.t.qpos.dtype)
         env.engine.t.qvel[:, env.object_v] = 0.0
     target = press(env, pads, env.q.clone(), share, force)
     for _ in range(round(WEIGHTLESS / env.dt)):
-        _play(env, target)
+        env.target.copy_(target)
+        step(env)
     end = GraspSet(start.edge, env.q.clone(), target, env.object_pose.clone())
     v, w = env.object_velocity.split(3, 1)
     still = (v.norm(dim=1) < 0.02) & (w.norm(dim=1) < 0.3) & (env.qd.abs().amax(1) < 0.3)
@@ -169,13 +172,14 @@ def settle(
 def holds(env: RotateEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
     """Return which grasps [N] stay within DRIFT and TURN for HOLD seconds under their targets, in worlds drawn anew,
     each weighed in a direction of its own."""
-    _begin(env, start)
+    begin(env, start)
     down = torch.randn(len(start), 3, generator=rng)
     gravity = env.engine.field("opt.gravity")
     gravity.copy_((9.81 * down / down.norm(dim=1, keepdim=True)).to(gravity.dtype))
     ok = torch.ones(len(start), dtype=torch.bool)
     for _ in range(round(HOLD / env.dt)):
-        _play(env, start.target)
+        env.target.copy_(start.target)
+        step(env)
         ok &= (env.object_pose[:, :3] - start.pose[:, :3]).norm(dim=1) < env.unit * DRIFT
         ok &= rotation.error(env.object_pose[:, 3:], start.pose[:, 3:]) < TURN
         ok &= _by_fingertips(env)
@@ -186,20 +190,6 @@ def _by_fingertips(env: RotateEnv) -> torch.Tensor:
     other = (env.finger_force - env.tip_force).clamp(min=0).sum(1) + env.palm_force
     opposing, others = (env.tip_force[:, list(f)].sum(1) > 0.05 for f in (env.hand.opposing, env.hand.others))
     return opposing & others & (other < OTHER) & ~env.nan
-
-
-def _begin(env: RotateEnv, start: GraspSet) -> None:
-    """Start world i from row i of `start`."""
-    env.grasps, env.in_order = start, True
-    env.reset_all()
-
-
-def _play(env: RotateEnv, target: torch.Tensor) -> None:
-    """Step physics and servo alone, for one control step: no episode ends."""
-    env.target.copy_(target)
-    env.servo.send(env.target)
-    env.engine.step(env.decimation, env.servo.before_each, env.touch.launch)
-    env.read_state()
 
 
 def generate(

@@ -119,7 +119,7 @@ def _against(
 def settle(env: RotateEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit
     [N])."""
-    _begin(env, replace(start, target=start.hand))
+    begin(env, replace(start, target=start.hand))
     _play(env, LAND)
     _play(env, CLOSE, start.target)
     _play(env, SETTLE)
@@ -137,7 +137,7 @@ def settle(env: RotateEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
 
 def holds(env: RotateEnv, start: GraspSet) -> torch.Tensor:
     """Return which grasps [N] stay within DRIFT and TURN for HOLD seconds under action zero, in worlds drawn anew."""
-    _begin(env, start)
+    begin(env, start)
     ok = torch.ones(len(start), dtype=torch.bool)
     for _ in range(int(round(HOLD / env.dt))):
         _play(env, env.dt)
@@ -153,7 +153,7 @@ def _smallest(env: RotateEnv) -> torch.Tensor:
     ])  # fmt: skip
 
 
-def _begin(env: RotateEnv, start: GraspSet) -> None:
+def begin(env: RotateEnv, start: GraspSet) -> None:
     """Start world i from row i of `start`."""
     env.grasps, env.in_order = start, True
     env.reset_all()
@@ -175,9 +175,14 @@ def _play(env: RotateEnv, seconds: float, towards: torch.Tensor | None = None) -
             target = torch.where(first[:, finger], env.q + press, target)
             touched |= first
             env.target.copy_(torch.maximum(torch.minimum(target, env.q_high), env.q_low))
-        env.servo.send(env.target)
-        env.engine.step(env.decimation, env.servo.before_each, env.touch.launch)
-        env.read_state()
+        step(env)
+
+
+def step(env: RotateEnv) -> None:
+    """Step physics and servo alone, for one control step: no episode ends."""
+    env.servo.send(env.target)
+    env.engine.step(env.decimation, env.servo.before_each, env.touch.launch)
+    env.read_state()
 
 
 def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:

@@ -6,41 +6,19 @@ Torch only, no branches on values, no allocation beyond its results: it can be p
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 
-FRAME = {
-    "joint_angle": "joint", "follower_angle": "joint", "joint_torque": "joint", "object_position": "palm",
-    "object_velocity": "palm",
-    "contact_force": "taxel, along the normal", "contact_centre": "palm", "fingertip_position": "palm",
-    "force_command": "none",
+ROWS = {
+    "joint_angle": ("rad", "joint", "joints"), "follower_angle": ("rad", "joint", "joints without a drive"),
+    "joint_torque": ("tau/tau_max", "joint", "joints"), "object_position": ("m", "palm", "x y z"),
+    "object_velocity": ("m/s", "palm", "x y z"), "contact_force": ("F/F_max", "taxel, along the normal", "fingers"),
+    "contact_centre": ("m", "palm", "fingers, x y z each"), "fingertip_position": ("m", "palm", "fingers, x y z each"),
+    "force_command": ("F/F_max", "none", "one"),
 }  # fmt: skip
-"""Frame of each of `rows`. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
-ORDER = {
-    "joint_angle": "joints", "follower_angle": "joints without a drive", "joint_torque": "joints",
-    "object_position": "x y z", "object_velocity": "x y z",
-    "contact_force": "fingers", "contact_centre": "fingers, x y z each", "fingertip_position": "fingers, x y z each",
-    "force_command": "one",
-}  # fmt: skip
-
-
-def rows(joints: int, fingers: int, pads: int, commands: int = 1, sensed: int = 0) -> list[tuple[str, int, str, str]]:
-    """(name, width, unit, what it is on hardware) of the observation, table (a) of the paper, for a hand of so many
-    joints, fingers and touch pads (without pads: without the rows of touch). commands: 2 where the thumb has its own,
-    after the others'; sensed: joints without a drive that are measured."""
-    table = (
-        ("joint_angle", joints, "rad", "measured"),
-        ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
-        ("joint_torque", joints, "tau/tau_max", "motor current, as calibrated"),
-        ("object_position", 3, "m", "x, y held at their first value; z from vision: noisy, delayed"),
-        ("object_velocity", 3, "m/s", "finite difference of the measured z; x, y zero"),
-        ("contact_force", pads, "F/F_max", "sum of a pad's normal forces"),
-        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
-        ("fingertip_position", 3 * fingers, "m", "palm frame, forward kinematics"),
-        ("force_command", commands, "F/F_max", "0..1"),
-    )
-    return [row for row in table if row[1]]
+"""Unit, frame and order of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 
 
 class Signals(NamedTuple):
@@ -62,20 +40,20 @@ class Signals(NamedTuple):
     follower: torch.Tensor | None = None
 
 
-def build(s: Signals, force_max: float) -> torch.Tensor:
-    """Return the actor's observation [N, D], rows of `rows`. force_max: F_max [N] of a fingertip at command 1."""
-    zero2 = torch.zeros_like(s.object_xy)
-    return torch.cat([
-        s.joint_position,
-        *([] if s.follower is None else [s.follower]),
-        s.joint_torque,
-        s.object_xy, s.object_z[:, None],
-        zero2, s.object_vz[:, None],
-        s.touch_force / force_max,
-        s.touch_centre.flatten(1),
-        s.fingertip.flatten(1),
-        s.command.reshape(len(s.command), -1),
-    ], 1)  # fmt: skip
+def build(s: Signals, names: Sequence[str], force_max: float) -> torch.Tensor:
+    """Return the rows of these names, one after another [N, D]. force_max: F_max [N] of a fingertip at command 1."""
+    rows = {
+        "joint_angle": s.joint_position,
+        "follower_angle": s.joint_position[:, :0] if s.follower is None else s.follower,
+        "joint_torque": s.joint_torque,
+        "object_position": torch.cat([s.object_xy, s.object_z[:, None]], 1),
+        "object_velocity": torch.cat([torch.zeros_like(s.object_xy), s.object_vz[:, None]], 1),
+        "contact_force": s.touch_force / force_max,
+        "contact_centre": s.touch_centre.flatten(1),
+        "fingertip_position": s.fingertip.flatten(1),
+        "force_command": s.command.reshape(len(s.command), -1),
+    }
+    return torch.cat([rows[name] for name in names], 1)
 
 
 def height_speed(z: torch.Tensor, before: torch.Tensor, period: float) -> torch.Tensor:
@@ -83,8 +61,8 @@ def height_speed(z: torch.Tensor, before: torch.Tensor, period: float) -> torch.
     return (z - before) / period
 
 
-def slices(table: list[tuple[str, int, str, str]]) -> dict[str, slice]:
-    """Return where each of `rows` lies."""
+def slices(table: Sequence[tuple[Any, ...]]) -> dict[str, slice]:
+    """Return where each row of a table (name, width, ...) lies."""
     out, at = {}, 0
     for name, width, *_ in table:
         out[name] = slice(at, at + width)

@@ -15,48 +15,15 @@ import torch
 from dexsim import rotation
 from dexsim.errors import UserError
 
-ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
-
-
-def actor(joints: int, fingers: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
-    """Return table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers, touch pads
-    and measured joints without a drive."""
-    return (
-        ("joint_angle", joints, "rad", "measured"),
-        ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
-        ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
-        ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
-        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
-        ("contact_force", pads, "N", "sum of a pad's normal forces"),
-        ("fingertip_position", 3 * fingers, "m", "palm frame, forward kinematics"),
-    )
-
-
-def proprioception(joints: int, pads: int, sensed: int = 0) -> tuple[tuple[str, int, str, str], ...]:
-    """Return the same without an object's pose; `history` of these, newest first."""
-    return (
-        ("joint_angle", joints, "rad", "measured"),
-        ("follower_angle", sensed, "rad", "measured, of joints without a drive"),
-        ("joint_velocity", joints, "rad/s", "measured"),
-        ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
-        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
-        ("contact_force", pads, "N", "sum of a pad's normal forces"),
-    )
-
-
-FRAME = {
-    "joint_angle": "joint", "follower_angle": "joint", "joint_velocity": "joint", "relative_orientation": "object",
-    "last_action": "joint",
-    "contact_centre": "palm", "contact_force": "taxel, along the normal", "fingertip_position": "palm",
+ROWS = {
+    "joint_angle": ("rad", "joint", "joints"), "follower_angle": ("rad", "joint", "joints without a drive"),
+    "joint_velocity": ("rad/s", "joint", "joints"), "last_action": ("1", "joint", "joints"),
+    "relative_orientation": (
+        "1", "object", "6d: the matrix's first two columns, one after the other; quaternion: w x y z"),
+    "contact_force": ("N", "taxel, along the normal", "fingers"),
+    "contact_centre": ("m", "palm", "fingers, x y z each"), "fingertip_position": ("m", "palm", "fingers, x y z each"),
 }  # fmt: skip
-"""Frame of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
-ORDER = {
-    "joint_angle": "joints", "follower_angle": "joints without a drive", "joint_velocity": "joints",
-    "last_action": "joints",
-    "contact_centre": "fingers, x y z each",
-    "contact_force": "fingers", "fingertip_position": "fingers, x y z each",
-    "relative_orientation": "6d: the matrix's first two columns, one after the other; quaternion: w x y z",
-}  # fmt: skip
+"""Unit, frame and order of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 
 
 class Signals(NamedTuple):
@@ -79,50 +46,22 @@ class Signals(NamedTuple):
     follower: torch.Tensor | None = None
 
 
-def rows(
-    task: Mapping[str, Any], joints: int, fingers: int, pads: int, sensed: int = 0, frames: int | None = None
-) -> list[tuple[str, int, str, str]]:
-    """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`, for a hand of so
-    many joints, fingers, touch pads and measured joints without a drive. frames: of how many control steps a row of the
-    history is taken (default: `history`)."""
-    o = task["observe"]
-    blind = task["perception"] == "proprioception"
-    out = []
-    for name, width, unit, text in (
-        proprioception(joints, pads, sensed) if blind else actor(joints, fingers, pads, sensed)
-    ):
-        if name == "relative_orientation":
-            width = ORIENTATION[o["orientation"]]
-            text = text if width != 4 else "quaternion, sign as it comes"
-        elif name == "last_action" and o.get("last_action", "step") == "step":
-            text = "as sent"
-        elif name == "contact_centre" and not o.get("force_weighted", True):
-            text = "mean position of the touched taxels, palm frame"
-        if width and o.get(name, True) is not False:
-            count = (frames or task["history"]) if blind else 1
-            out.append((name, width * count, unit, text))
-    return out
-
-
-def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
-    """Return the actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is
-    put before `past`, whose oldest is left out; a fresh episode's history is its first frame."""
-    n, joints = s.joint_position.shape
-    parts = {
+def build(s: Signals, names: Sequence[str], task: Mapping[str, Any]) -> torch.Tensor:
+    """Return the rows of these names, one after another [N, D], under a task's `observe` and `perception`. With
+    perception=proprioception the newest frame is put before `past`, whose oldest is left out; a fresh episode's history
+    is its first frame."""
+    rows = {
         "joint_angle": s.joint_position, "joint_velocity": s.joint_velocity, "last_action": s.sent,
         "contact_centre": s.touch_centre.flatten(1), "contact_force": s.touch_force,
         "fingertip_position": s.fingertip.flatten(1),
+        "follower_angle": s.joint_position[:, :0] if s.follower is None else s.follower,
+        "relative_orientation": relative(s.orientation, s.goal, task["observe"]["orientation"]),
     }  # fmt: skip
-    blind = task["perception"] == "proprioception"
-    if not blind:
-        parts["relative_orientation"] = relative(s.orientation, s.goal, task["observe"]["orientation"])
-    parts["follower_angle"] = s.joint_position[:, :0] if s.follower is None else s.follower
-    sizes = joints, parts["fingertip_position"].shape[1] // 3, s.touch_force.shape[1], parts["follower_angle"].shape[1]
-    frame = torch.cat([parts[row[0]] for row in rows(task, *sizes, frames=1)], 1)
-    if not blind:
+    frame = torch.cat([rows[name] for name in names], 1)
+    if task["perception"] != "proprioception":
         return frame
     moved = torch.cat([frame[:, None], s.past[:, :-1]], 1)
-    return torch.where(s.fresh[:, None, None], frame[:, None].expand_as(moved), moved).reshape(n, -1)
+    return torch.where(s.fresh[:, None, None], frame[:, None].expand_as(moved), moved).flatten(1)
 
 
 def sent(

@@ -16,7 +16,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +25,10 @@ from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
+    from dexsim.tasks.task import Task
 
 GROUP = "dexsim.tasks"
-_named: dict[str, type[HandEnv] | None] = {}
+_named: dict[str, type[Task] | None] = {}
 """Classes that the user named in this process: typed on the command line (None until it is loaded), or given as an
 object."""
 
@@ -54,25 +53,15 @@ def built_in(folder: Path = CONFIGS / "task") -> dict[str, str]:
     return found
 
 
-def installed() -> dict[str, EntryPoint]:
-    """Return the tasks of other installed packages by name: their entry points in the group `dexsim.tasks`."""
-    return door.installed(GROUP)
-
-
 def entries() -> Iterator[Entry]:
     """Yield all tasks that can be chosen by name."""
     for name, where in built_in().items():
         yield Entry(name, where, "dexsim")
-    for name, point in installed().items():
+    for name, point in door.installed(GROUP).items():
         yield Entry(name, point.value, point.dist.name if point.dist else "?")
 
 
-def is_class(choice: str) -> bool:
-    """Return whether a choice of task is spelled "module:Class"."""
-    return door.is_named(choice)
-
-
-def name_class(where: str, made: type[HandEnv] | None = None) -> str:
+def name_class(where: str, made: type[Task] | None = None) -> str:
     """Note that the user named this class, so that it may be imported; made: the class itself. Returns `where`."""
     _named[where] = made or _named.get(where)
     return where
@@ -89,7 +78,7 @@ def where_of(made: type) -> str:
 def find(choice: str) -> str:
     """Return the "module:Class" of a chosen task: a name, or a class, which is then named by the user. Raises
     UserError."""
-    if is_class(choice):
+    if door.is_named(choice):
         return name_class(choice)
     known = {entry.name: entry.where for entry in entries()}
     if choice not in known:
@@ -101,7 +90,7 @@ def find(choice: str) -> str:
     return known[choice]
 
 
-def load(where: str, source: str = "") -> type[HandEnv]:
+def load(where: str, source: str = "") -> type[Task]:
     """Return the class "module:Class". Raises UserError: nobody that may name it has, it cannot be imported, or it is
     no task.
 
@@ -123,7 +112,7 @@ def load(where: str, source: str = "") -> type[HandEnv]:
 
 def provided(where: str) -> bool:
     """Return whether dexsim or an installed package provides a class, so that whoever names it may have it imported."""
-    return where in built_in().values() or where in {point.value for point in installed().values()}
+    return where in built_in().values() or where in {point.value for point in door.installed(GROUP).values()}
 
 
 def typing(where: str) -> str:
@@ -131,9 +120,9 @@ def typing(where: str) -> str:
     return "" if provided(where) else f" task={where}"
 
 
-def _imported(where: str, about: str) -> type[HandEnv]:
+def _imported(where: str, about: str) -> type[Task]:
     made = door.load(where, about)
-    if not (isinstance(made, type) and hasattr(made, "check_deployed")):  # what every HandEnv has
+    if not (isinstance(made, type) and hasattr(made, "declared")):  # as every Task has
         raise UserError(f"{about}: {where.partition(':')[2]} is no task: derive it from dexsim.tasks.Task")
     return made
 
@@ -149,20 +138,6 @@ def of_config(cfg: dict[str, Any]) -> str:
     return str(where)
 
 
-def task_class(cfg: dict[str, Any], source: str = "") -> type[HandEnv]:
+def task_class(cfg: dict[str, Any], source: str = "") -> type[Task]:
     """Return the class of a resolved config's task. Raises UserError; source: the file that the config is from."""
     return load(of_config(cfg), source)
-
-
-TERMS = {"observations", "terminations", "commands", "events"}
-"""Parts of a task's settings that its declared terms have."""
-
-
-def terms(cfg: dict[str, Any]) -> dict[str, Any]:
-    """Return those parts, as the class of a resolved config's task declares them; empty of a class without terms."""
-    return task_class(cfg).declared()
-
-
-def about(made: type) -> str:
-    """Return the first line of a task's docstring."""
-    return ((made.__doc__ or "").strip().splitlines() or [""])[0]

@@ -1,9 +1,7 @@
-"""In-hand cube rotation: turn a cube, or a user's own objects, on a palm-up hand about one axis of the palm, 90 degrees
-at a time.
+"""In-hand rotation: turn a cube, or one's own objects, on a palm-up hand about an axis of the palm, 90 degrees a goal.
 
-Paper: "In-Hand Object Rotation" (setup), tables "Observation for in-hand object rotation" and "Reward for in-hand
-object rotation", and the ablation's settings. Constants the paper does not publish are marked `ours` in
-configs/task/rotate.yaml.
+Paper: "In-Hand Object Rotation" (setup), its tables of the observation and the reward, and the ablation's settings.
+Constants that it does not publish are marked `ours` in configs/task/rotate.yaml.
 
 Actions are relative (`action.mode`): a target moves by action * scale a step. Action zero then holds the grasp an
 episode starts with, and exploration begins from a held cube; absolute actions would throw it at once.
@@ -34,7 +32,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     holds = "palm", (0.045, 0.06)
     choices = {"perception": ("imu", "proprioception"), "critic": ("paper", "privileged"),
-               "observe.orientation": tuple(shared.ORIENTATION)}  # fmt: skip
+               "observe.orientation": ("6d", "quaternion", "none")}  # fmt: skip
 
     goal, home = memory(4, reset=False), memory(3, reset=False)
     successes, since = memory(dtype=torch.long), memory(dtype=torch.long)  # since: control steps, since the last one
@@ -45,7 +43,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
     # -- setting up
     @classmethod
     def needs_taxels(cls, task: dict) -> bool:
-        """Return whether the task needs taxels; the plain mean does, for one."""
+        """Tell whether it needs taxels, as the plain mean does."""
         return not task["observe"]["force_weighted"]
 
     @classmethod
@@ -128,8 +126,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.tipped = self._tilt_from_goal() > self.task["termination"]["tilt"]
 
     def _tilt_from_goal(self) -> torch.Tensor:
-        """Return angle between the palm axis as the goal's and as the present orientation have it in the object's
-        frame."""
+        """Return the angle between the palm axis as goal and present orientation have it in the object's frame."""
         a = rotation.rotate(rotation.conjugate(self.goal), self.axis.expand(self.num_envs, 3))
         b = rotation.rotate(rotation.conjugate(self.object_pose[:, 3:]), self.axis.expand(self.num_envs, 3))
         return torch.atan2(torch.linalg.cross(a, b).norm(dim=1), (a * b).sum(1))

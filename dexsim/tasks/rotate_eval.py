@@ -10,12 +10,13 @@ cap as its time, so the mean time to fall is a restricted mean. Intervals: boots
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 
 from dexsim import intervals
+from dexsim.tasks import evaluation
 from dexsim.tasks.stable_grasps import CUBE
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 Policy = Callable[..., torch.Tensor]  # a TensorDict of observations -> actions [N, J]
 Progress = Callable[[int, int, str], object]  # trials done, of how many, what is played
 
-SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
 HEADER = (
     "Contact center",
     "Contact force",
@@ -50,14 +50,18 @@ class Trials:
     """How a rotation is evaluated, for its environment to inherit."""
 
     evaluation = __name__
+    camera: ClassVar[dict[str, Any] | None] = {
+        "lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0}
+    objects: Any
+    reached: Any
 
     def trial_facts(self) -> dict[str, torch.Tensor]:
-        """Return what an evaluation keeps of each trial as it begins, [N] each."""
-        return {}
+        """Return what an evaluation keeps of each trial as it begins: its object, width m, mass kg."""
+        return {"object": self.objects.variant, "edge": 2 * self.objects.size[:, 0], "mass": self.objects.mass}
 
     def trial_counts(self) -> dict[str, torch.Tensor]:
-        """Return what an evaluation counts, step by step, while a trial lasts, bool [N] each."""
-        return {}
+        """Return what an evaluation counts, step by step, while a trial lasts: goals."""
+        return {"goals": self.reached}
 
     def of_trials(self, r: dict) -> dict:
         """Return further metrics of an evaluation, from the arrays [E] of its trials."""
@@ -67,21 +71,15 @@ class Trials:
 class TipTrials(Trials):
     """The same of a cube held by fingertips."""
 
-    objects: Any
     other_force: Any
     palm: Any
     dt: float
 
     def trial_facts(self) -> dict[str, torch.Tensor]:
-        return {
-            "palm": self.palm,
-            "edge": 2 * self.objects.size[:, 0],
-            "mass": self.objects.mass,
-            "friction": self.objects.friction,
-        }
+        return super().trial_facts() | {"palm": self.palm, "friction": self.objects.friction}
 
     def trial_counts(self) -> dict[str, torch.Tensor]:
-        return {"other_steps": self.other_force > TOUCH}
+        return super().trial_counts() | {"other_steps": self.other_force > TOUCH}
 
     def of_trials(self, r: dict) -> dict:
         """Share of the time in which anything but fingertips touched; and every trial: its successes, seconds, end,
@@ -98,23 +96,21 @@ class TipTrials(Trials):
         }
 
 
-@torch.inference_mode()
 def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress: Progress | None = None) -> dict:
     """Play `episodes` trials, `env.num_envs` at a time.
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
     """
     env.end_curriculum()
-    env.rng.manual_seed(seed)
-    torch.manual_seed(seed)
     cap = float(env.task["evaluation"]["cap_s"])
-    training_length, env.max_episode_length = env.max_episode_length, int(round(cap / env.dt)) + 2
-    try:
-        r, frames = _trials(env, policy, cap, episodes, True, progress)
-        others = env.task["objects"]["held_out"]
-        kept_out = _kept_out(env, policy, cap, max(episodes // 2, 1), progress) if others else None
-    finally:
-        env.max_episode_length = training_length
+    r, kept_out, frames = evaluation.play_all(env, policy, episodes, seed, cap, progress, recorded=True)
+    names = np.array([*env.end_names[:-1], "capped"])  # the last is the time that is over
+    for x in [r] if kept_out is None else [r, kept_out]:
+        x |= {"successes": x["goals"], "time": x["length_s"], "end": names[x["end"]]}
+    if frames is not None:
+        what = [f"{1000 * x:.0f} mm" if env.names[k] == CUBE else env.names[k]
+                for x, k in zip(r["edge"], r["object"], strict=True)]  # fmt: skip
+        frames["label"] = [f"{x}, {1000 * m:.0f} g" for x, m, _ in zip(what, r["mass"], frames["qpos"], strict=False)]
     resamples = env.task["evaluation"]["resamples"]
     metrics, *others = (
         summary(x["successes"], x["time"], x["end"] == "capped", cap, resamples, seed)
@@ -123,9 +119,9 @@ def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress:
     if others:
         metrics["kept_out"] = others[0]
     metrics |= _by_object(env, [r] if kept_out is None else [r, kept_out])
-    last = r["last"][r["successes"] > 0].sum()
+    last = r["last_goals"].sum() * env.dt
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
-    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.end_names[:-1], "capped")}
+    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in names.tolist()}
     metrics |= env.of_trials(r)
 
     def successes(ax: Axes) -> None:
@@ -135,29 +131,6 @@ def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress:
         _survival_plot(ax, r["time"], cap)
 
     return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": [successes, survival]}
-
-
-def _trials(
-    env: RotateEnv, policy: Policy, cap: float, episodes: int, keep_frames: bool, progress: Progress | None
-) -> tuple[dict, dict | None]:
-    """Return arrays [E] of so many trials; the frames of the first."""
-    parts: list[dict] = []
-    while len(parts) * env.num_envs < episodes:
-        done = len(parts) * env.num_envs
-        parts.append(_play(env, policy, cap, keep_frames and not parts, progress, done, episodes))
-    frames = parts[0].pop("frames")
-    return {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}, frames
-
-
-def _kept_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progress: Progress | None) -> dict:
-    """Return trials that begin with the objects kept out of the training."""
-    was, env.graphs = env.graphs, False  # a recorded step begins with those of the training
-    env.judge_kept_out(True)
-    try:
-        return _trials(env, policy, cap, episodes, False, progress)[0]
-    finally:
-        env.judge_kept_out(False)
-        env.graphs = was
 
 
 def _by_object(env: RotateEnv, parts: list[dict]) -> dict:
@@ -204,75 +177,6 @@ def _interval(x: np.ndarray) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in (low, high)]
 
 
-def _play(
-    env: RotateEnv, policy: Policy, cap: float, keep_frames: bool, progress: Progress | None, done: int, episodes: int
-) -> dict:
-    """Return one trial in every world."""
-    n, dev, dt = env.num_envs, env.device, env.dt
-    steps = int(round(cap / dt))
-    env.reset_all()
-    obs = env.get_observations()
-    alive = torch.ones(n, dtype=torch.bool, device=dev)
-    count, last_step = torch.zeros(n, dtype=torch.long, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
-    end_step = torch.full((n,), steps, dtype=torch.long, device=dev)
-    names = env.end_names[:-1]  # the last is the training's own cap
-    how = torch.full((n,), len(names), dtype=torch.long, device=dev)
-    facts = {k: v.clone().cpu().numpy() for k, v in env.trial_facts().items()}  # the next episode writes over them
-    sums: dict[str, torch.Tensor] = {}
-    filmed = list(range(min(SHOWN, n))) if keep_frames else []
-    models = [env.drawn_model(w) for w in filmed]
-    which = env.objects.variant.cpu().numpy().copy()
-    wide = [f"{2000 * float(x):.0f} mm" if env.names[v] == CUBE else env.names[v]
-            for x, v in zip(env.objects.size[:, 0], which, strict=True)]  # fmt: skip
-    mass = (1000 * env.objects.mass).cpu().numpy()
-    qpos, force, score = [], [], []
-    taxels: list[np.ndarray] = []
-    for k in range(steps):
-        obs, _, dones, _ = env.step(policy(obs))
-        hit = env.reached & alive
-        count += hit
-        last_step = torch.where(hit, k + 1, last_step)
-        ended = dones.bool() & alive
-        end_step = torch.where(ended, k + 1, end_step)
-        how = torch.where(ended, env.ended_by(), how)
-        for name, seen in env.trial_counts().items():
-            sums[name] = sums.get(name, torch.zeros_like(count)) + (seen & alive)
-        alive = alive & ~ended
-        if filmed and k * dt < SHOWN_S:
-            qpos.append(env.engine.t.qpos[filmed].double().cpu().numpy())
-            force.append(env.touch.force_clean[filmed][:, : env.fingers].cpu().numpy())
-            score.append(count[filmed].cpu().numpy())
-            if env.touch.raw is not None:
-                taxels.append(env.touch.raw[filmed].cpu().numpy())
-        if k % 40 == 39:
-            if progress is not None:
-                at = done + min(n, episodes - done) * (k + 1) // steps
-                progress(at, episodes, f"{(k + 1) * dt:.0f} s, {int(alive.sum())} still turning")
-            if not bool(alive.any()):
-                break
-    out = {
-        "successes": count.cpu().numpy(), "time": end_step.cpu().numpy() * dt, "last": last_step.cpu().numpy() * dt,
-        "end": np.array([*names, "capped"])[how.cpu().numpy()], "object": which, "frames": None,
-        **facts, **{name: total.cpu().numpy() for name, total in sums.items()},
-    }  # fmt: skip
-    if filmed:
-        stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in filmed]  # the end's own frame is the next trial's
-        out["frames"] = {
-            "model": models, "dt": dt, "names": env.hand.finger_names, "full": 5.0,
-            "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
-            "label": [f"{wide[w]}, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
-                      for i, (w, s) in enumerate(zip(filmed, stop, strict=True))],
-            "overlay": [
-                {"force": np.stack([f[i] for f in force[:s]]), "layout": env.touch.layout}
-                | ({"taxels": np.stack([x[i] for x in taxels[:s]])} if taxels else {})
-                for i, s in enumerate(stop)
-            ],
-            "colours": True,
-            "camera": {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0},
-        }  # fmt: skip
-    return out
-
-
 def row_of(env: RotateEnv) -> tuple[str, ...]:
     """Return the four settings of a row of the paper's table."""
     o = env.task["observe"]
@@ -298,7 +202,6 @@ def _tables(env: RotateEnv, m: dict, r: dict) -> list:
         ("seconds per success", seconds, _range(m["seconds_per_success_interval"])),
         ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
     ]  # fmt: skip
-    ends = [(name, count, f"{100 * count / m['episodes']:.1f}") for name, count in m["ends"].items()]
     kept_out = m.get("kept_out")
     if kept_out is not None:
         intervals.append(
@@ -311,7 +214,7 @@ def _tables(env: RotateEnv, m: dict, r: dict) -> list:
         ("In-hand rotation (the paper's columns)", HEADER, [line]),
         ("95 % intervals (bootstrap over trials)", ("quantity", "value", "interval"), intervals),
         *own,
-        (f"How {m['episodes']} trials ended (cap {m['cap_s']:g} s)", ("end", "trials", "%"), ends),
+        evaluation.ends_table("trials", m, f" (cap {m['cap_s']:g} s)"),
     ]
 
 

@@ -132,6 +132,7 @@ class Task(HandEnv):
     # -- setting up
     # --------------------------------------------------------------------------------------------------------------
     def setup(self) -> None:
+        """Allocate what declared terms need; called once, before the first reset."""
         n, dev, t = self.num_envs, self.device, self.task
         self._terms = terms_of(type(self))
         self._check_names()
@@ -498,15 +499,10 @@ class Task(HandEnv):
         """Return the ends that are switched on."""
         self.update()
         on = [x for x in self._terms["done"] if self.task["terminations"][x.name]]
-        out = {x.name: x.method(self, **self._params("termination", x)) for x in on}
-        for name, value in out.items():
-            if value.shape != (self.num_envs,) or value.dtype != torch.bool:
-                raise UserError(
-                    f"termination {name}: gives {value.dtype} {list(value.shape)}, must be bool [{self.num_envs}]"
-                )
-        return out
+        return {x.name: x.method(self, **self._params("termination", x)) for x in on}
 
     def reward_words(self) -> dict[str, str]:
+        """Describe each reward by its name, for the first screen."""
         return {x.name: x.text for x in terms_of(type(self))["reward"]}
 
     def rewards(self) -> dict[str, torch.Tensor]:
@@ -515,10 +511,7 @@ class Task(HandEnv):
         paid = [x for x in self._terms["reward"] if weights.get(x.name)]
         out = {x.name: weights[x.name] * x.method(self, **self._params("reward", x)) for x in paid}
         for x in self._terms["metric"]:
-            value = x.method(self, **self._params("metric", x))
-            if value.shape != (self.num_envs,):
-                raise UserError(f"metric {x.name}: has shape {list(value.shape)}, must be [{self.num_envs}]")
-            self.figures[x.name] = value.float()
+            self.figures[x.name] = x.method(self, **self._params("metric", x)).float()
         return out
 
     def _judge(self, ends: dict, terms: dict) -> tuple[torch.Tensor, torch.Tensor]:
@@ -528,16 +521,23 @@ class Task(HandEnv):
         return judged
 
     def figure_units(self) -> dict[str, str]:
+        """Return units of the figures in `last`, which an evaluation reports."""
         return {x.name: x.unit for x in self._terms["metric"] if x.name in self.last}
 
     def metrics(self) -> dict[str, torch.Tensor]:
+        """Return task metrics for the log, scalars on the device."""
         return {f"task/{name}": value.mean() for name, value in (self.figures | self.last).items()}
 
     # -- observations
     # ------------------------------------------------------------------------------------------------------------
+    def actor_rows(self) -> list[Sensing]:
+        """Return the rows that the actor sees."""
+        return [x for x in self._sensed if self._named(self.task["observations"][x.term.name]["actor"])]
+
     def mirror_signs(self) -> torch.Tensor | None:
-        """Gather them from the rows that say so (`observe(mirror=)`); None where none does."""
-        rows = [x for x in self._sensed if self._named(self.task["observations"][x.term.name]["actor"])]
+        """Return signs [A] by which the actor's observation changes where hand and world are mirrored, of the rows that
+        say so (`observe(mirror=)`); None where none does."""
+        rows = self.actor_rows()
         if not any(x.term.options["mirror"] for x in rows):
             return None
         signs: list[int] = []
@@ -618,7 +618,8 @@ class Task(HandEnv):
     # -- what is said of it
     # --------------------------------------------------------------------------------------------------------
     def describe(self) -> dict:
-        """Return tables for the first screen."""
+        """Return tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
+        "terminations", "randomization", "notes", and "headline", names of the log that the console shows."""
         t = self.task
         groups: dict[str, list] = {"actor": [], "critic": []}
         for row in self._sensed:

@@ -30,7 +30,7 @@ class Frames:
             model.vis.global_.offwidth, model.vis.global_.offheight = self.size
             model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
             model.vis.map.znear = 0.02
-            self._renderer, self._model = _renderer(model, *self.size), model
+            self._renderer, self._model = renderer(model, *self.size), model
             self._data, self._camera = mujoco.MjData(model), mujoco.MjvCamera()
             self._camera.lookat[:], self._camera.distance = self._view["lookat"], self._view["distance"]
             self._camera.azimuth, self._camera.elevation = self._view["azimuth"], self._view["elevation"]
@@ -47,7 +47,7 @@ class Frames:
         self._renderer = self._model = None
 
 
-def _renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
+def renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
     """Return MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is
     imported, and chooses a window where nothing is said, so the choice is made here."""
     contexts = importlib.import_module("mujoco.rendering.classic.gl_context")
@@ -62,5 +62,5 @@ def _renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
         except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
             reasons.append(f"{backend}: {(str(error).splitlines() or [type(error).__name__])[0]}")
     raise NoRenderer(
-        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {system.INSTALL}"
+        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); {system.no_renderer()}"
     )

@@ -1,23 +1,17 @@
-"""Pictures of models in poses, rendered in a process of their own (MuJoCo fixes its OpenGL backend at import).
-
-MUJOCO_GL=egl python -m dexsim.view.stills FOLDER
-"""
+"""Pictures of models in poses, without a display."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-import tempfile
+import copy
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from dexsim import system
+from dexsim.view.frames import renderer
+from dexsim.view.render import backdrop
 
 FIELD_OF_VIEW = 30.0  # degrees, from top to bottom
 
@@ -52,82 +46,29 @@ class Shot:
 
 def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
     """Return the pictures [H, W, 3] uint8. Raises `dexsim.view.video.NoRenderer` where no OpenGL backend works."""
-    import mujoco
-
-    from dexsim.view import video
-
-    with tempfile.TemporaryDirectory(prefix="dexsim_stills_") as name:
-        folder = Path(name)
-        for k, model in enumerate(models):
-            mujoco.mj_saveModel(model, str(folder / f"{k}.mjb"), None)
-        plain = [
-            asdict(s) | {"qpos": [float(x) for x in s.qpos], "lookat": [float(x) for x in s.lookat]} for s in shots
-        ]
-        (folder / "shots.json").write_text(json.dumps(plain), "utf-8")
-        reasons = []
-        for backend in system.renderers():
-            env = os.environ | system.renderer_environment(backend)
-            done = subprocess.run(
-                [sys.executable, "-m", "dexsim.view.stills", name],
-                env=env, capture_output=True, encoding="utf-8", errors="replace",
-            )  # fmt: skip
-            if done.returncode == 0:
-                return [np.load(folder / f"{k}.npy") for k in range(len(shots))]
-            said = (done.stdout + done.stderr).strip().splitlines()
-            reasons.append(f"{backend}: {said[-1] if said else f'status {done.returncode}'}")
-    raise video.NoRenderer(
-        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); {system.no_renderer()}"
-    )
-
-
-def main(folder: Path) -> int:
-    """Return the rendering process."""
-    import mujoco
-
-    from dexsim.view.render import NO_GL, backdrop, why
-
-    try:
-        context = mujoco.GLContext(64, 64)
-        context.make_current()
-        context.free()
-    except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
-        print(why(error))
-        return NO_GL
-    shots = [Shot(**s) for s in json.loads((folder / "shots.json").read_text("utf-8"))]
+    pictures: dict[int, np.ndarray] = {}
     for k in sorted({s.model for s in shots}):
-        model = mujoco.MjModel.from_binary_path(str(folder / f"{k}.mjb"))
         own = [(n, s) for n, s in enumerate(shots) if s.model == k]
+        model = copy.copy(models[k])
         model.vis.global_.fovy = FIELD_OF_VIEW
-        model.vis.global_.offwidth = max(s.size[0] for _, s in own)
-        model.vis.global_.offheight = max(s.size[1] for _, s in own)
+        model.vis.global_.offwidth, model.vis.global_.offheight = (max(s.size[i] for _, s in own) for i in (0, 1))
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 4, 2048
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:], model.vis.headlight.specular[:] = (
-            0.45,
-            0.55,
-            0.1,
-        )
+        light = model.vis.headlight
+        light.ambient[:], light.diffuse[:], light.specular[:] = 0.45, 0.55, 0.1
         model.vis.map.znear = 0.01
         data = mujoco.MjData(model)
-        renderers: dict[tuple[int, int], Any] = {}
-        for n, shot in own:
-            width, height = shot.size
-            size = width, height
-            if size not in renderers:
-                renderers[size] = mujoco.Renderer(model, size[1], size[0])
-            data.qpos[:] = shot.qpos
-            mujoco.mj_forward(model, data)
-            camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-            camera.lookat[:] = shot.lookat
-            camera.distance, camera.azimuth, camera.elevation = shot.distance, shot.azimuth, shot.elevation
-            option.geomgroup[:] = 0
-            option.geomgroup[list(shot.groups)] = 1
-            renderers[size].update_scene(data, camera, option)
-            image = renderers[size].render()
-            np.save(folder / f"{n}.npy", np.where(image.any(axis=2, keepdims=True), image, backdrop(size[1], size[0])))
-        for renderer in renderers.values():
-            renderer.close()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+        for size in {s.size for _, s in own}:
+            drawing = renderer(model, *size)
+            for n, shot in [(n, s) for n, s in own if s.size == size]:
+                data.qpos[:] = shot.qpos
+                mujoco.mj_forward(model, data)
+                camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+                camera.lookat[:] = shot.lookat
+                camera.distance, camera.azimuth, camera.elevation = shot.distance, shot.azimuth, shot.elevation
+                option.geomgroup[:] = 0
+                option.geomgroup[list(shot.groups)] = 1
+                drawing.update_scene(data, camera, option)
+                image = drawing.render()
+                pictures[n] = np.where(image.any(axis=2, keepdims=True), image, backdrop(size[1], size[0]))
+            drawing.close()
+    return [pictures[n] for n in range(len(shots))]
