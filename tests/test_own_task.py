@@ -281,7 +281,7 @@ def test_terms_are_switched_weighted_and_parametrized():
         ("+randomize.object.colour=[0,1]", "randomize.object.colour: nothing reads this setting"),
         ("+task.observations.depth={actor: true}", "task.observations.depth: there is no such term"),
         ("+task.rewards.glory=1", "task.rewards.glory=1: the task several has no reward of this name"),
-        ("task.observations.count.noise=-1", "task.observations.count.noise=-1: must be a number in"),
+        ("task.observations.count.noise=-1", "task.observations.count.noise=-1: must be a number"),
         ("task.history=0", "task.history=0: must be a whole number"),
     ],
 )
@@ -376,10 +376,9 @@ def test_what_provides_a_row_on_a_hand_stands_in_the_manifest():
         def away(self):
             return self.commands["aim"] - self.q[:, :2]
 
-    parts = of_terms.parts(made(Seen, worlds=1))
-    assert [row[:4] for row in parts["rows"]] == [
-        ("joint_position", 12, "rad", "encoders of the drives"), ("away", 2, "rad", ""),
-    ]  # fmt: skip
+    env = made(Seen, worlds=1)
+    parts = of_terms.parts(env)
+    assert of_terms.rows(env) == [("joint_position", 12, "rad", "encoders of the drives"), ("away", 2, "rad", "")]
     # a command that no column of its own shows
     assert parts["terms"]["commands"] == {"aim": [0.5, 0.5]} and "command aim" in parts["terms"]["signals"]
 

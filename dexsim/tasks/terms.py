@@ -20,6 +20,7 @@ from typing import Any, Literal, TypeVar, overload
 
 import torch
 
+from dexsim import typed
 from dexsim.errors import UserError
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -176,9 +177,9 @@ class Sensing:
 
     def __init__(self, term: Term, given: dict[str, Any], where: str):
         self.term, self.unit = term, term.unit
-        self.noise = _number(given["noise"], f"{where}.noise", 0.0, float("inf"))
-        self.dropout = _number(given["dropout"], f"{where}.dropout", 0.0, 1.0)
-        self.frames = int(_number(given["frames"], f"{where}.frames", 1, 64))
+        self.noise = typed.number(f"{where}.noise", given["noise"], 0.0)
+        self.dropout = typed.number(f"{where}.dropout", given["dropout"], 0.0, 1.0)
+        self.frames = int(typed.number(f"{where}.frames", given["frames"], 1, 64, exact=True))
         self.delay = span(given["delay"], f"{where}.delay")
         self.params = {k: given[k] for k in term.params}
         self.width = 0  # of the value, known once it was computed
@@ -245,12 +246,6 @@ def _lasting(value: torch.Tensor, count: int) -> torch.Tensor:
     """Return memory [N, count, D] that outlives the rollout that happens to come first."""
     with torch.inference_mode(False):
         return torch.zeros(len(value), count, value.shape[1], dtype=value.dtype, device=value.device)
-
-
-def _number(value: Any, where: str, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise UserError(f"{where}={value}: must be a number in [{low:g}, {high:g}]")
-    return float(value)
 
 
 Size = int | Callable[[Any], int]
