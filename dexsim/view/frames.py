@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from functools import cache
 from typing import Any
 
 import mujoco
@@ -49,18 +50,19 @@ class Frames:
 
 def renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
     """Return MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is
-    imported, and chooses a window where nothing is said, so the choice is made here."""
-    contexts = importlib.import_module("mujoco.rendering.classic.gl_context")
-    reasons = []
-    for backend in system.renderers():
-        os.environ |= {k: v for k, v in system.renderer_environment(backend).items() if k not in os.environ}
-        try:
-            if backend in system.RENDERERS["linux"]:
-                own: Any = importlib.import_module(f"mujoco.{backend}")
-                contexts.GLContext = own.GLContext  # type: ignore[attr-defined]
-            return mujoco.Renderer(model, height, width)
-        except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
-            reasons.append(f"{backend}: {(str(error).splitlines() or [type(error).__name__])[0]}")
-    raise NoRenderer(
-        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); {system.no_renderer()}"
-    )
+    imported, and chooses a window where nothing is said, so the choice is made here. Raises NoRenderer."""
+    backend = _backend()
+    if backend is None:
+        names = ", ".join(system.renderers())
+        raise NoRenderer(f"no picture: no OpenGL for offscreen rendering opens ({names}); {system.no_renderer()}")
+    os.environ |= system.renderer_environment(backend)
+    if backend in system.RENDERERS["linux"]:
+        contexts = importlib.import_module("mujoco.rendering.classic.gl_context")
+        contexts.GLContext = importlib.import_module(f"mujoco.{backend}").GLContext  # type: ignore[attr-defined]
+    return mujoco.Renderer(model, height, width)
+
+
+@cache
+def _backend() -> str | None:
+    """Return it; each is tried in a process of its own: a driver may crash, and a process keeps to the first."""
+    return system.renderer()
