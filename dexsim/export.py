@@ -386,7 +386,7 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
         return of.build(signals, b.manifest).numpy()
     from dexsim.calibration.file import Calibration
 
-    built = of.measure(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",
+    built = of.Measured(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",
                                                 b.manifest["normalization"]["tau_max"], b.hand))  # fmt: skip
     out = []
     for k, begins in enumerate(rows["begins"]):

@@ -50,11 +50,11 @@ def b(tmp_path_factory):
 def quick():
     """Yield one hand model for all loops here, and no collection of torch's whole heap before each: a run is then a
     tenth of a second."""
-    from dexsim.deploy import loop, of_grasp
+    from dexsim.deploy import loop, measure
 
     with pytest.MonkeyPatch.context() as patch:
-        model = of_grasp.HandKinematics()
-        patch.setattr(of_grasp, "HandKinematics", lambda hand: model)
+        model = measure.HandKinematics()
+        patch.setattr(measure, "HandKinematics", lambda hand: model)
         patch.setattr(loop.gc, "collect", lambda: 0)
         yield
 

@@ -22,7 +22,7 @@ from dexsim.deploy.driver import PASSIVE, HandState, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.measure import for_bundle
-from dexsim.deploy.of_rotate import TurnMeasure
+from dexsim.deploy.of_rotate import Measured
 from dexsim.deploy.recorder import GOAL, TURNED
 from dexsim.deploy.simulated_hand import SimulatedXHand
 from dexsim.errors import UserError
@@ -141,7 +141,7 @@ def test_a_recorded_episode_gives_the_same_observations_and_actions(made, episod
     assert np.abs(np.diff(observed, axis=0)).max() > 1e-3, "an episode in which nothing happens would pass"
 
 
-def turner(made) -> TurnMeasure:
+def turner(made) -> Measured:
     return for_bundle(bundle.load(made[0]), Calibration.default())
 
 

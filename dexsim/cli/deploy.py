@@ -285,7 +285,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
     if wrong:
         raise UserError(f"{wrong[0]}={given[wrong[0]]}: driver={kind} does not use it{' with port=fake' * fake}")
     if kind == "ros2" or (kind == "xhand" and not fake) or hand is not None:
-        needs = of(task).measure(b, calibration).needs
+        needs = of(task).Measured(b, calibration).needs
         if needs == PLACE and place is None:
             raise UserError(
                 f'driver={kind}: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with'

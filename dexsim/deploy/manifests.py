@@ -176,6 +176,16 @@ def floats(x: Any) -> list[float]:
     return [round(float(v), 9) for v in x]
 
 
+def grip(g: Any) -> dict[str, Any]:
+    """Return the held pose (`dexsim.tasks.stable_grasps.GraspSet`) that is most like all others: where fingers wait for
+    the object, and the targets they close to."""
+    middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
+    return {
+        "hand": floats(g.hand[middle]), "target": floats(g.target[middle]), "object_pose": floats(g.pose[middle]),
+        "object": g.names[int(g.shape[middle])], "object_edge_m": round(float(g.edge[middle]), 6),
+    }  # fmt: skip
+
+
 def hand_entry(raw: dict[str, Any], source: object) -> HandEntry:
     """Return which hand a manifest is of: bundles from before there was a choice are of the xHand."""
     return convert(raw.get("hand") or {"name": "xhand"}, HandEntry, f"{source}: hand", AGAIN)

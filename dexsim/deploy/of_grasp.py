@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
-from dexsim.deploy.kinematics import HandKinematics
 from dexsim.deploy.manifests import floats
-from dexsim.deploy.measure import PLACE, commanded, tensor
+from dexsim.deploy.measure import PLACE, Measure, commanded, tensor
 from dexsim.errors import UserError
 from dexsim.tasks import observations
 
@@ -29,11 +27,6 @@ def build(s: observations.Signals, m: dict[str, Any]) -> torch.Tensor:
     """Return the observation [N, D] that a manifest states."""
     names = [row["name"] for row in m["observation"]]
     return observations.build(s, names, float(m["normalization"]["force_max_N"]))
-
-
-def measure(bundle: Any, calibration: Calibration) -> Measure:
-    """Return what the loop calls."""
-    return Measure(calibration, bundle.manifest)
 
 
 def parts(env: Any) -> dict[str, Any]:
@@ -67,19 +60,10 @@ def signals_of(env: Any) -> observations.Signals:
         env.touch.centre[:, : env.pads], s.tip, env.force_command(), followers)  # fmt: skip
 
 
-class Measure:
-    """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last
-    height."""
+class Measured(Measure):
+    """The grasp: keeps the first x, y of the object and its last height."""
 
-    needs: str | None = PLACE
-
-    def __init__(self, calibration: Calibration, manifest: dict[str, Any]):
-        self.calibration, self.manifest = calibration, manifest
-        self.period = float(manifest["rates"]["policy_period_s"])
-        width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
-        self.commands = width.get("force_command", 1)  # 2: the thumb has one of its own, and is given the others'
-        self.hand = HandKinematics(calibration.hand)
-        self.reset()
+    needs = PLACE
 
     def reset(self) -> None:
         """Begin a new episode: the next object position is the first."""
@@ -102,16 +86,16 @@ class Measure:
 
     def signals(self, state: HandState, place: np.ndarray, command: list[float]) -> observations.Signals:
         """See `observe`; of touch, all that the hand feels."""
-        c = self.calibration
-        tips, position, rotation_ = self.hand(state.position, state.follower)
-        force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation_)
+        tips, force, centre = self.felt(state)
+        width = {row["name"]: row["stop"] - row["start"] for row in self.manifest["observation"]}
+        told = [*command] * width.get("force_command", 1)  # the thumb's own is the others'
         if self._xy is None:
             self._xy = np.array(place[:2], float)
         z = tensor([place[2]])[0]
         vz = torch.zeros_like(z) if self._z is None else observations.height_speed(z, self._z, self.period)
         self._z = z
         return observations.Signals(
-            tensor(state.position), tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
+            tensor(state.position), tensor(self.calibration.torque_norm(np.asarray(state.current, float) * 1e-3)),
             tensor(self._xy), z, vz,
             tensor(force), tensor(centre), tensor(tips),
-            tensor([*command] * self.commands), self.hand.followers(state))  # fmt: skip
+            tensor(told), self.hand.followers(state))  # fmt: skip

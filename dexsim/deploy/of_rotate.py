@@ -12,9 +12,8 @@ import torch
 from dexsim import rotation
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
-from dexsim.deploy.kinematics import HandKinematics
-from dexsim.deploy.manifests import Observe, floats
-from dexsim.deploy.measure import ORIENTATION, commanded, tensor
+from dexsim.deploy.manifests import Observe, grip
+from dexsim.deploy.measure import ORIENTATION, Measure, tensor
 from dexsim.errors import UserError
 from dexsim.tasks import observations_rotate
 from dexsim.typed import convert
@@ -37,30 +36,22 @@ def build(s: observations_rotate.Signals, m: dict[str, Any]) -> torch.Tensor:
     return observations_rotate.build(s, [row["name"] for row in m["observation"]], m["task_settings"])
 
 
-def measure(bundle: Any, calibration: Calibration) -> TurnMeasure:
-    """Return what the loop calls."""
-    return TurnMeasure(calibration, bundle.manifest)
-
-
 def parts(env: Any) -> dict[str, Any]:
     """Return the same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held
     pose that is most like all others: where the fingers wait for the cube, and the targets they close to."""
     task, g = env.task, env.grasps
     imu, targets = task["perception"] == "imu", task["observe"].get("last_action", "step") != "step"
-    middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
+    held = grip(g)
     settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
     settings["reward"] = {"delta_rot": task["reward"]["delta_rot"]}
     return {
         "scaling": {"last_action": "(target - middle) / half of action.low..high"} if targets else {},
-        "initial_pose": floats(g.hand[middle]),
+        "initial_pose": held["hand"],
         "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
         "normalization": {},
         "task_settings": settings,
-        "grip": {"hand": floats(g.hand[middle]), "target": floats(g.target[middle]),
-                 "object_pose": floats(g.pose[middle]),
-                 "object": env.names[int(g.shape[middle])],
-                 "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
-                 "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
+        "grip": held | {"pose_is": "x y z m, quaternion w x y z, palm frame",
+                        "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
         "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up;"
                                              " any heading" if imu else "none",
                        "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the"
@@ -85,23 +76,22 @@ def signals_of(env: Any) -> observations_rotate.Signals:
         row.get("follower_angle", env.q[:, :0]))  # fmt: skip
 
 
-class TurnMeasure:
-    """The rotation: turns readings into observations; keeps the goal, the history and the last angles.
+class Measured(Measure):
+    """The rotation: keeps the goal, the history and the last angles.
 
     goal [1, 4]: the orientation to reach, in the IMU's frame (None without one); goals: how many were reached. In
     training a goal is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
     """
 
-    def __init__(self, calibration: Calibration, manifest: dict[str, Any]):
-        self.calibration, self.manifest, self.task = calibration, manifest, manifest["task_settings"]
-        self.period = float(manifest["rates"]["policy_period_s"])
+    def __init__(self, bundle: Any, calibration: Calibration):
+        super().__init__(bundle, calibration)
+        manifest = self.manifest
+        self.task = manifest["task_settings"]
         self.needs = ORIENTATION if self.task["perception"] == "imu" else None
-        self.hand = HandKinematics(calibration.hand)
         self.axis, self.turn = observations_rotate.axis_and_turn(self.task["goal"], calibration.hand.mirror)
         low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
         self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
         self.frame = manifest["policy"]["observation_size"] // int(self.task["history"])
-        self.reset()
 
     def reset(self) -> None:
         """Begin a new episode: the next orientation gives the first goal."""
@@ -109,10 +99,6 @@ class TurnMeasure:
         self.goals = 0
         self._past: torch.Tensor | None = None
         self.hand.forget()
-
-    def commanded(self, given: Any) -> list[float]:
-        """Return nothing: this task has no command. Raises UserError where one is given."""
-        return commanded(given, [], "rotate")
 
     @torch.inference_mode()
     def observe(
@@ -135,9 +121,7 @@ class TurnMeasure:
         if imu:
             q = rotation.normalize(tensor(seen))
             self._aim(q)
-        normal = self.calibration.normal_force(state.tactile)
-        tips, position, turned = self.hand(state.position, state.follower)
-        force, centre = self.hand.touch(normal, position, turned, weighted=self.task["observe"]["force_weighted"])
+        tips, force, centre = self.felt(state, self.task["observe"]["force_weighted"])
         fresh = not imu and self._past is None
         past = (
             torch.zeros(1, 0, 0)

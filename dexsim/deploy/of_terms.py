@@ -16,8 +16,7 @@ import torch
 
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
-from dexsim.deploy.kinematics import HandKinematics
-from dexsim.deploy.measure import POSE, commanded
+from dexsim.deploy.measure import POSE, Measure, commanded
 from dexsim.errors import UserError
 from dexsim.tasks.task import STATE, Task
 from dexsim.tasks.terms import Memory
@@ -38,7 +37,7 @@ def signals(joints: int, fingers: int, pads: int) -> dict[str, tuple[int, ...]]:
     }  # fmt: skip
 
 
-class Measured:
+class Signals:
     """A task as its observations see it on a real hand: signals for what is measured, the task's own constants and
     methods for all else; whatever a hand does not tell is refused. asked: the signals that were used."""
 
@@ -73,7 +72,7 @@ class Measured:
 
 
 class _Commands:
-    def __init__(self, owner: Measured):
+    def __init__(self, owner: Signals):
         self._owner = owner
 
     def __getitem__(self, name: str) -> torch.Tensor:
@@ -97,20 +96,20 @@ class Observation(torch.nn.Module):
         zeros["object_pose"][:, 3] = 1.0
         used: dict[str, None] = {}
         for row in self.rows:
-            view = Measured(self.task, zeros, row.term.name)
+            view = Signals(self.task, zeros, row.term.name)
             self._value(row, view)
             used |= view.used
         commanded = [k for k, x in self.task.task["commands"].items() if x["actor"]]
         return [*used, *(f"command {k}" for k in commanded if f"command {k}" not in used)]
 
-    def _value(self, row: Any, view: Measured) -> torch.Tensor:
+    def _value(self, row: Any, view: Signals) -> torch.Tensor:
         value = row.term.method(view, **row.params)
         return (value[:, None] if value.dim() == 1 else value.flatten(1)).float()
 
     def forward(self, *given: torch.Tensor) -> torch.Tensor:
         """See the class."""
         by_name = dict(zip(self.names, given, strict=True))
-        out = [self._value(row, Measured(self.task, by_name, row.term.name)) for row in self.rows]
+        out = [self._value(row, Signals(self.task, by_name, row.term.name)) for row in self.rows]
         commanded = [k for k, x in self.task.task["commands"].items() if x["actor"]]
         return torch.cat([*out, *(by_name[f"command {k}"] for k in commanded)], 1)
 
@@ -143,7 +142,7 @@ def rows(env: Task) -> list[tuple[str, int, str, str]]:
 
 def parts(env: Task) -> dict[str, Any]:
     """Return the parts of a manifest that are a task's own, but for the network's digest."""
-    from dexsim.deploy.manifests import floats
+    from dexsim.deploy.manifests import floats, grip
 
     of = Observation(env)
     width = env.sampler.width.clone()
@@ -162,41 +161,27 @@ def parts(env: Task) -> dict[str, Any]:
                        if "object_pose" in of.names else "none", "critic": "not deployed"},
     }  # fmt: skip
     if env.grasps is not None:
-        g = env.grasps
-        middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
-        out["initial_pose"] = floats(g.hand[middle])
-        out["grip"] = {
-            "hand": floats(g.hand[middle]), "target": floats(g.target[middle]), "object_pose": floats(g.pose[middle]),
-            "object": g.names[int(g.shape[middle])], "object_edge_m": round(float(g.edge[middle]), 6),
-        }  # fmt: skip
+        out["grip"] = grip(env.grasps)
+        out["initial_pose"] = out["grip"]["hand"]
     return out
 
 
-def measure(bundle: Any, calibration: Calibration) -> TermsMeasure:
-    """Return what the loop calls."""
-    from dexsim.deploy import bundle as bundles
+class Measured(Measure):
+    """A task of declared terms: keeps the last readings of rows with several frames, and the last angles."""
 
-    terms = bundle.manifest["terms"]
-    session = bundles.network(bundle.path / bundles.TERMS, terms["sha256"])
-    return TermsMeasure(bundle.manifest, calibration, session)
+    def __init__(self, bundle: Any, calibration: Calibration):
+        super().__init__(bundle, calibration)
+        from dexsim.deploy import bundle as bundles
 
-
-class TermsMeasure:
-    """Turns readings into observations; keeps the last readings of rows with several frames, and the last angles."""
-
-    def __init__(self, manifest: dict[str, Any], calibration: Calibration, session: Any):
-        self.calibration, self.session, self.terms = calibration, session, manifest["terms"]
-        self.task = str(manifest["task"])
-        self.period = float(manifest["rates"]["policy_period_s"])
-        self.tau_max = np.array(manifest["normalization"]["tau_max"])
-        self.hand = HandKinematics(calibration.hand)
+        self.terms = self.manifest["terms"]
+        self.session = bundles.network(bundle.path / bundles.TERMS, self.terms["sha256"])
+        self.tau_max = np.array(self.manifest["normalization"]["tau_max"])
         hand = calibration.hand
         known = signals(len(hand.joints), len(hand.fingers), len(calibration.gain))
         self.names = list(self.terms["signals"])
         self.shapes = {name: known.get(name, (self.terms["signals"][name],)) for name in self.names}
         self.needs = POSE if "object_pose" in self.names else None
         self.commands = {k: np.array(v, np.float32) for k, v in self.terms["commands"].items()}
-        self.reset()
 
     def reset(self) -> None:
         """Begin a new episode, without a past."""
@@ -207,7 +192,8 @@ class TermsMeasure:
 
     def commanded(self, given: Any) -> list[float]:
         """Return the numbers of the declared commands in a row, by default the bundle's. Raises UserError."""
-        return commanded(given, [float(x) for v in self.commands.values() for x in v], self.task)
+        usual = [float(x) for v in self.commands.values() for x in v]
+        return commanded(given, usual, str(self.manifest["task"]))
 
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
@@ -215,8 +201,7 @@ class TermsMeasure:
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where
         the policy needs it."""
         c = self.calibration
-        tips, position, turned = self.hand(state.position, state.follower)
-        force, centre = self.hand.touch(c.normal_force(state.tactile), position, turned)
+        tips, force, centre = self.felt(state)
         numbers = iter(command)
         now = {
             "q": state.position, "qd": self.hand.velocity(state), "target": target,
@@ -262,4 +247,4 @@ def write(env: Task, path: Any, opset: int) -> Observation:
     return of
 
 
-__all__ = ["OPTIONS", "TermsMeasure", "check", "measure", "parts", "rows", "signals", "write"]
+__all__ = ["OPTIONS", "Measured", "check", "parts", "rows", "signals", "write"]
