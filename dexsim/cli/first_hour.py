@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -212,6 +212,16 @@ class Hour:
         self.most = float(given["excite_current"])
         self.middle = np.clip(0.35 * (self.hand.limits.sum(1)), *self.hand.limits.T)
         self.found: dict[str, Step] = {}
+
+    @contextlib.contextmanager
+    def recorded(self, name: str) -> Iterator[None]:
+        """Record into a file of its own."""
+        self.s.recorder, whole = self.given["recorder"](name), self.s.recorder
+        try:
+            yield
+        finally:
+            self.s.recorder.close(120.0)
+            self.s.recorder = whole
 
     def connection(self) -> Step:
         """See: the serial number is your hand's."""
@@ -417,12 +427,8 @@ class Hour:
         order = [m.joints.index(j) for j in self.hand.joints]
         value = p.value[:, order]
         self.s.move(_still(value[0]), 4.0, most)
-        self.s.recorder, whole = self.given["recorder"]("excite.mcap"), self.s.recorder
-        try:
+        with self.recorded("excite.mcap"):
             self.s.move(lambda t: value[min(int(t * 100), len(value) - 1)], float(p.t[-1]), most, speed=20.0)
-        finally:
-            self.s.recorder.close(120.0)
-            self.s.recorder = whole
         self.s.relax()
         audit = _dexsim("audit", str(self.out / "excite.mcap"))
         (self.out / "audit.txt").write_text(audit.stdout, "utf-8")
@@ -447,17 +453,13 @@ class Hour:
         if hand_layout(self.hand) is None:
             return Step("calibrate", step.title, "skipped", ["this hand feels nothing"])
         press = getattr(self.s.driver, "press", None)
-        self.s.recorder, whole = self.given["recorder"]("touch.mcap"), self.s.recorder
-        try:
+        with self.recorded("touch.mcap"):
             for f, name in enumerate(names):
                 self.say(f"  press the {name}'s pad all over")
                 for _ in range(PRESSES):
                     if press is not None:
                         press(f)
                     self.s.watch(PRESS_S)
-        finally:
-            self.s.recorder.close(120.0)
-            self.s.recorder = whole
         joints = [self.hand.joints[j] for j in self.joints if self.hand.finger_of_joint[j] >= 0]
         self._presses(joints)
         done = _dexsim("calibrate", f"touch={self.out / 'touch.mcap'}", f"real={self.out / 'press.mcap'}",
@@ -482,8 +484,7 @@ class Hour:
     def _presses(self, joints: Sequence[str]) -> None:
         """Record in press.mcap joints that press against what is held to their fingertip, at rising currents."""
         block = getattr(self.s.driver, "block", lambda joint: None)
-        self.s.recorder, whole = self.given["recorder"]("press.mcap"), self.s.recorder
-        try:
+        with self.recorded("press.mcap"):
             for name in joints:
                 j = self.hand.joints.index(name)
                 self.say(f"  hold something hard to the fingertip that {name} moves, so that it cannot close")
@@ -496,9 +497,6 @@ class Hour:
                     self.s.move(_still(goal), HOLD, self.most, speed=3.0)
                 block(-1)
                 self.s.move(_still(self.middle), 0.5, self.amps)
-        finally:
-            self.s.recorder.close(120.0)
-            self.s.recorder = whole
 
     def bundle(self) -> Step:
         """See: nothing moves."""

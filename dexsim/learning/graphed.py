@@ -23,7 +23,7 @@ LOWEST, HIGHEST, FACTOR = 1e-5, 1e-2, 1.5
 
 
 def unsupported(alg: Any) -> str | None:
-    """Return the why this algorithm's update cannot be recorded, or None if it can."""
+    """Return why this algorithm's update cannot be recorded, or None if it can."""
     if type(alg) is not PPO:
         return "the algorithm is not rsl-rl's PPO"
     if alg.is_multi_gpu:
