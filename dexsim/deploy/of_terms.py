@@ -161,8 +161,8 @@ def parts(env: Task) -> dict[str, Any]:
                        if "object_pose" in of.names else "none", "critic": "not deployed"},
     }  # fmt: skip
     if env.grasps is not None:
-        out["grip"] = grip(env.grasps)
-        out["initial_pose"] = out["grip"]["hand"]
+        held = grip(env.grasps)
+        out |= {"grip": held, "initial_pose": held["hand"]}
     return out
 
 
