@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -121,9 +120,3 @@ def _list(given: dict[str, str], key: str) -> list[str] | None:
 def _within(given: dict[str, str], key: str) -> float:
     default, low, high, whole = RANGES[key]
     return typed.number(key, given.get(key, default), low, high, exact=whole)
-
-
-if __name__ == "__main__":
-    from dexsim.console.ending import guard
-
-    sys.exit(guard(main, sys.argv[1:]))

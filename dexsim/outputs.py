@@ -51,6 +51,19 @@ def new(path: Path, setting: str) -> Path:
     return path
 
 
+def recording(text: str | Path, setting: str = "record=") -> Path:
+    """Return the path of a new MCAP file, its folder made. Raises UserError."""
+    path = mcap(text)
+    make(path.parent, setting)
+    return new(path, setting)
+
+
+def mcap(text: str | Path) -> Path:
+    """Return a path with the ending of a recording."""
+    path = files.place(text)
+    return path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
+
+
 def ours(folder: Path, name: str) -> bool:
     """Return whether a file is there as we wrote it."""
     return _is(folder, folder / name, _known(folder).get(name, ""))

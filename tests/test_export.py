@@ -137,7 +137,8 @@ def test_command_line_errors_are_one_line(made, tmp_path):
 
 @pytest.mark.slow
 def test_module_checks_in_its_own_process(made):
-    done = subprocess.run([sys.executable, "-m", "dexsim.export", f"check={made[1]}"], capture_output=True, text=True)
+    command = [sys.executable, "-m", "dexsim", "export", f"check={made[1]}"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.count("ok") == 4
 
 

@@ -545,14 +545,15 @@ def test_an_impossible_object_is_named(arguments, says):
 
 
 def test_settings_of_a_recorded_play():
+    from dexsim import outputs
     from dexsim.recording.tap import PlayRecorder
 
     class Env:
         engine = servo = touch = objects = target = None
         num_envs = 4
 
-    with pytest.raises(UserError, match="cannot be written"):
-        PlayRecorder.place("/proc/nowhere/x")
+    with pytest.raises(UserError, match="cannot write into"):
+        outputs.recording("/proc/nowhere/x")
     for worlds in (9, 0, [1, 4], [1, 1], [], "some", [0, "x"]):
         with pytest.raises(UserError, match="record_worlds="):
             PlayRecorder(Env(), worlds, {})

@@ -458,17 +458,6 @@ def test_a_loop_that_is_killed_or_stopped_leaves_a_hand_that_is_let_go(tmp_path,
         p.wait()
 
 
-def test_an_object_of_this_process_can_stand_for_the_package():
-    clock = Clock()
-    fake = FakeXHand(clock, faults=Faults(outlier=0.0))
-    d = VendorXHand("auto", package=fake, hang=1.0)
-    d.open()
-    drive(d, 0.2)
-    assert fake.trips[-1][1][0] == POSITION and d.read().sequence > 5
-    d.close()
-    assert fake.trips[-1][1][0] == PASSIVE
-
-
 # -- two hands on a bus
 # --------------------------------------------------------------------------------------------------------------------
 def two(clock=None, sides=("right", "left"), serials=(None, None), hang=0.15, **faults):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -119,14 +120,9 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
     `frames` samples, and followed by a rest."""
     import torch
 
-    from dexsim.assets.objects import library
-    from dexsim.tactile.posed import PosedEngine
-    from dexsim.tactile.shapes import ShapeSet
-    from dexsim.tactile.tactile import Tactile
-
     rng = np.random.default_rng(seed)
     rest = 6
-    layout, F, pairs = pads_of(hand), len(hand.fingers), [f"tip_{x}" for x in hand.finger_names]
+    layout, F = pads_of(hand), len(hand.fingers)
     n = F * presses * (frames + rest)
     centre, force = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, F))
     row = 0
@@ -138,24 +134,17 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
             force[row : row + frames, f] = size
             centre[row : row + frames] = point + np.outer(RADIUS - size / STIFFNESS, layout.normal[f, k])
             row += frames + rest
-    posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
-    touch = Tactile(
-        posed, layout, ShapeSet([library()["sphere"]], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
-        tips=tip_skins(hand),
-    )  # fmt: skip
-    posed.t.xpos[:, :F] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(F)])  # the pads, far apart
-    posed.t.xmat[:] = torch.eye(3)
     active = force.argmax(1)
     away = 10.0 * (active[:, None] + 1) * [[1.0, 0, 0]]
     at = centre + np.where(force.max(1, keepdims=True) > 0, away, 0)
-    posed.t.xpos[:, F] = torch.as_tensor(at, dtype=torch.float32)
-    posed.t.pair_normal[:, :F] = torch.as_tensor(force, dtype=torch.float32)
-    touch.shape_id.fill_(0)
-    touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
-    touch.launch()
-    assert touch.raw is not None  # asked for above
-    forces = np.zeros((n, F, layout.taxels, 3))
-    forces[..., 2] = touch.raw.numpy()
+
+    def pose_pads(posed: Any) -> None:
+        posed.t.xpos[:, :F] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(F)])  # the pads, far apart
+        posed.t.xmat[:] = torch.eye(3)
+        posed.t.xpos[:, F] = torch.as_tensor(at, dtype=torch.float32)
+        posed.t.pair_normal[:, :F] = torch.as_tensor(force, dtype=torch.float32)
+
+    forces = _touched(hand, n, pose_pads)
     t = np.arange(n) * 2 / RATE
     load = np.zeros((n, 6))
     load[:, 2] = forces[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
@@ -180,9 +169,7 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
 
     dense, out = recording.external_force, realistic(recording, seed)
     assert dense is not None and out.tactile is not None  # our own recording has both
-    t = out.tactile.t
-    held = dense.value[np.clip(np.searchsorted(dense.t, t, side="right") - 1, 0, None)]
-    out.external_force = Series(t, held, dense.topic, t.copy(), dense.frame)
+    out.external_force = dense.latest(out.tactile.t)
     return out
 
 
@@ -275,31 +262,41 @@ def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> n
     """Return the taxel forces [T, F, K, 3] N of each frame: the physics' contact force, spread by the touch model."""
     import torch
 
+    def pose_hand(posed: Any) -> None:
+        F, data = len(hand.fingers), mujoco.MjData(run.model)
+        ids = [run.model.body(b).id for b in hand.tip_bodies]
+        for w, qpos in enumerate(run.qpos):
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(run.model, data)
+            posed.t.xpos[w, :F] = torch.as_tensor(data.xpos[ids], dtype=torch.float32)
+            posed.t.xmat[w, :F] = torch.as_tensor(data.xmat[ids].reshape(F, 3, 3), dtype=torch.float32)
+        posed.t.xpos[:, F] = torch.as_tensor(place, dtype=torch.float32)
+        posed.t.pair_normal[:, finger] = torch.as_tensor(run.pair_normal[:, 0], dtype=torch.float32)
+
+    return _touched(hand, len(run.qpos), pose_hand)
+
+
+def _touched(hand: Hand, n: int, place: Callable[[Any], None]) -> np.ndarray:
+    """Return the taxel forces [n, F, K, 3] N of poses in which `place` puts fingertips, the ball behind them, and the
+    normal force of each tip (`PosedEngine`)."""
+    import torch
+
     from dexsim.assets.objects import library
     from dexsim.tactile.posed import PosedEngine
     from dexsim.tactile.shapes import ShapeSet
     from dexsim.tactile.tactile import Tactile
 
-    n, F, layout, pairs = len(run.qpos), len(hand.fingers), pads_of(hand), [f"tip_{x}" for x in hand.finger_names]
+    layout, pairs = pads_of(hand), [f"tip_{x}" for x in hand.finger_names]
     posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
-    shape = library()["sphere"]
     touch = Tactile(
-        posed, layout, ShapeSet([shape], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
+        posed, layout, ShapeSet([library()["sphere"]], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
         tips=tip_skins(hand),
     )  # fmt: skip
-    data = mujoco.MjData(run.model)
-    ids = [run.model.body(b).id for b in hand.tip_bodies]
-    for w in range(n):
-        data.qpos[:] = run.qpos[w]
-        mujoco.mj_kinematics(run.model, data)
-        posed.t.xpos[w, :F] = torch.as_tensor(data.xpos[ids], dtype=torch.float32)
-        posed.t.xmat[w, :F] = torch.as_tensor(data.xmat[ids].reshape(F, 3, 3), dtype=torch.float32)
-    posed.t.xpos[:, F] = torch.as_tensor(place, dtype=torch.float32)
-    posed.t.pair_normal[:, finger] = torch.as_tensor(run.pair_normal[:, 0], dtype=torch.float32)
+    place(posed)
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
     assert touch.raw is not None  # asked for above
-    out = np.zeros((n, F, layout.taxels, 3))
+    out = np.zeros((n, len(hand.fingers), layout.taxels, 3))
     out[..., 2] = touch.raw.numpy()
     return out

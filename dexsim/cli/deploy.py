@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import signal
 import threading
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 from dexsim import door, system, typed
+from dexsim.console.stop import Stop
 from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
@@ -214,23 +214,22 @@ def _each(works: Sequence[Any]) -> None:
             stack.callback(work)
 
 
-class _Stop:
+class _Stop(Stop):
     """Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and all others that a process can handle: the first ends the run, which
-    relaxes the hand; those after it change nothing."""
+    relaxes the hand; those after it change nothing. ending: the hand is relaxed, what remains is done to its end."""
 
     def __init__(self) -> None:
-        self.status, self.ending = 0, False  # ending: the hand is relaxed, and what is left to do is done to its end
-        self._before: dict[int, Any] = {}
+        super().__init__()
+        self.status, self.ending, self._names = 0, False, system.hand_signals()
 
-    def __enter__(self) -> _Stop:
-        self._names = system.hand_signals()
-        for number in self._names:
-            self._before[number] = signal.signal(number, self._handle)
+    def signals(self) -> dict[int, str]:
+        return self._names
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        if not self._before:
+            raise RuntimeError("only a program's main thread is told of signals, which a hand must be let go at")
         return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
     def _handle(self, number: int, _frame: Any) -> None:
         if not self.status and not self.ending:
@@ -300,25 +299,19 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
             side = b.hand.handedness
             driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
         return driver, _imu(given, b) if needs == ORIENTATION else place
-    vision = given.get("vision", "truth")
-    if vision not in ("truth", "camera"):
-        raise UserError(f"vision={vision}: must be truth or camera")
+    vision = typed.one_of("vision", given.get("vision", "truth"), ("truth", "camera"))
     config = b.config
     shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
     if given.get("shape") not in (None, *shapes):
         raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
     seed, grip = typed.whole("seed", given.get("seed", "0")), b.manifest.get("grip")
-    simulated: Any = None
-    if fake:
-        from dexsim.deploy.simulated_hand import faked
+    from dexsim.deploy.simulated_hand import SimulatedXHand, faked
 
-        simulated = faked(config, calibration, given["port"].partition(":")[2], seed, vision == "camera",
-                          given.get("shape"), grip, hang, given.get("serial"))  # fmt: skip
-    else:
-        from dexsim.deploy.simulated_hand import SimulatedXHand
-
-        simulated = SimulatedXHand(config, calibration, seed=seed, camera=vision == "camera",
-                                   shape=given.get("shape"), grip=grip, hang=hang)  # fmt: skip
+    how: dict[str, Any] = dict(seed=seed, camera=vision == "camera", shape=given.get("shape"), grip=grip, hang=hang)
+    simulated: Any = (
+        faked(config, calibration, given["port"].partition(":")[2], serial=given.get("serial"), **how)
+        if fake else SimulatedXHand(config, calibration, **how)
+    )  # fmt: skip
     return simulated, place or simulated
 
 
@@ -341,9 +334,8 @@ def _ros2(given: dict[str, str], hand: Any) -> Any:
     from dexsim.deploy.ros2 import COMMAND, MESSAGES, STATE, Ros2Hand
 
     state, _, command = given.get("ros2", "").partition(",")
-    message, effort = given.get("ros2_message", MESSAGES[0]), typed.real(given.get("ros2_effort", "1"))
-    if message not in MESSAGES:
-        raise UserError(f"ros2_message={message}: must be one of {', '.join(MESSAGES)}")
+    message = typed.one_of("ros2_message", given.get("ros2_message", MESSAGES[0]), MESSAGES)
+    effort = typed.real(given.get("ros2_effort", "1"))
     if not 0 < abs(effort) < 1e6:
         raise UserError(f"ros2_effort={given['ros2_effort']}: must be a number of mA, within 1e6 and not 0")
     return Ros2Hand(hand, state or STATE, command or COMMAND, message=message, effort=effort)
@@ -378,18 +370,13 @@ def _recording() -> str:
 def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) -> Any:
     import yaml
 
-    from dexsim import files
-    from dexsim.console import folders
+    from dexsim import outputs
     from dexsim.deploy.recorder import Recorder
-    from dexsim.outputs import new
 
     where = given.get("record") or _recording()
     if where == "none":
         return None
-    path = files.place(where)
-    path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
-    folders.make(path.parent, "record=")
-    new(path, "record=")
+    path = outputs.recording(where)
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
     simulated = given.get("driver", "sim") == "sim" or given.get("port", "")[:4] == "fake"
     meta = {

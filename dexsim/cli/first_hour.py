@@ -655,8 +655,7 @@ def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) ->
     from dexsim.deploy.vendor import VendorXHand
 
     kind, faults = given["port"].partition(":")[::2]
-    if given["driver"] not in ("xhand", "sim"):
-        raise UserError(f"driver={given['driver']}: must be xhand or sim")
+    typed.one_of("driver", given["driver"], ("xhand", "sim"))
     if given["driver"] == "xhand" and kind != "fake":
         return VendorXHand(given["port"], clock, serial=given["serial"] or None, side=hand.handedness)
     Faults.parse(faults)

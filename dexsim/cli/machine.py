@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
 from dexsim import system
 from dexsim.errors import UserError
-from dexsim.version import VERSION
+from dexsim.version import VERSION, installed
 
 PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 
@@ -51,13 +50,7 @@ def set_threads(where: str) -> None:
 
 def versions() -> dict[str, str]:
     """Return versions of dexsim, Python and what it stands on, for the printout and for checkpoints."""
-    found = {"dexsim": VERSION, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return {"dexsim": VERSION, "python": platform.python_version()} | installed(*PACKAGES)
 
 
 def memory(where: str) -> str:

@@ -44,15 +44,11 @@ def main(argv: Sequence[str]) -> int:
     seconds = typed.real(given["seconds"])
     if not seconds > 0:
         raise UserError(f"seconds={given['seconds']}: must be a number above 0")
-    from dexsim import files, outputs
-    from dexsim.console import folders
+    from dexsim import outputs
     from dexsim.deploy.recorder import Recorder
     from dexsim.deploy.ros2 import transport
 
-    path = files.place(given["out"])
-    path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
-    folders.make(path.parent, "out=")
-    outputs.new(path, "out=")
+    path = outputs.recording(given["out"], "out=")
     state, _, command = given["ros2"].partition(",")
     by = transport()
     recorder: Recorder | None = None

@@ -189,11 +189,8 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
             for s in (c.finger_force, c.finger_force_simulated)
         ]
     if len(state):
-        seen = result.qpos.copy()
-        for a, column in zip(address, state.value.T, strict=True):
-            ok = np.isfinite(column)
-            if ok.any():
-                seen[:, a] = np.interp(frames, state.t[ok], column[ok])
+        seen, read = result.qpos.copy(), state.at(frames)
+        seen[:, address] = np.where(np.isnan(read), seen[:, address], read)
         clips.append(Clip(model, seen, "recorded", force[0]))
     clips.append(Clip(model, result.qpos, "simulated", force[1]))
     camera = None

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from types import FrameType
-from typing import Any
+from typing import Any, Self
 
 from dexsim import system
 
@@ -27,9 +27,9 @@ class Stop:
         self._requested, self._several, self._last = False, several, -math.inf
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> Stop:
+    def __enter__(self) -> Self:
         try:
-            for number in system.stop_signals():
+            for number in self.signals():
                 self._before[number] = signal.signal(number, self._handle)
         except ValueError:  # not in the main thread: whoever runs us handles signals
             pass
@@ -50,6 +50,10 @@ class Stop:
             raise KeyboardInterrupt
         self._requested = True
         print("\nstopping and saving (Ctrl-C again: stop at once, without saving)", flush=True)
+
+    def signals(self) -> dict[int, str]:
+        """Return the signals that are handled, with their names."""
+        return system.stop_signals()
 
     def requested(self) -> bool:
         """Return whether someone asked to stop."""

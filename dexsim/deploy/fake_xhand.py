@@ -95,12 +95,14 @@ class LaggingHand:
     """Twelve joints that follow their targets with a lag [s], where their current limit is over `least` mA, and draw
     current as they do; nothing is touched. start: rad; push: rad that somebody holds them away from their targets."""
 
-    def __init__(self, start: float = 0.05, lag: float = 0.04, push: float = 0.0, least: float = 0.0):
+    lag = 0.04
+
+    def __init__(self, start: float = 0.05, push: float = 0.0, least: float = 0.0):
         self.q, self.time = np.full(JOINTS, start), 0.0
         self.q[3] = min(start, 0.15)  # the index's abduction has no more
         self.target = self.q.copy()
         self.stiff, self.limit, self.least = 0.0, np.zeros(JOINTS), least
-        self.lag, self.push = lag, np.full(JOINTS, push)
+        self.push = np.full(JOINTS, push)
 
     def command(self, c: HandCommand) -> None:
         """Takes effect now."""
@@ -289,11 +291,6 @@ class _Control:
     def get_sdk_version(self) -> str:
         """Return text alone."""
         return self._fake.faults.sdk
-
-    def reset_sensor(self, hand: int, sensor: int) -> SimpleNamespace:
-        """Zero a board, 0x11 to 0x15."""
-        dead = self._fake.faults.board == sensor - 0x11
-        return _error() if 0x11 <= sensor <= 0x15 and not dead else _error(NO_TAXELS, f"sensor {sensor:#x}")
 
     def send_command(self, hand: int, command: _HandCommand) -> SimpleNamespace:
         """Return one round trip; error object."""

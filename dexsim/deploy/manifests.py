@@ -71,7 +71,7 @@ class Normalization(msgspec.Struct):
 
 
 class Golden(msgspec.Struct):
-    """Of python -m dexsim.export check=DIR."""
+    """Of dexsim export check=DIR."""
 
     rows: Count
     tolerance: Annotated[float, msgspec.Meta(gt=0, le=1.0)]

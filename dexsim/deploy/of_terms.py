@@ -82,13 +82,13 @@ class _Commands:
 class Observation(torch.nn.Module):
     """The values of all rows that the actor sees [1, D], from signals in the order of `names`."""
 
-    def __init__(self, task: Task, names: list[str] | None = None):
+    def __init__(self, task: Task):
         super().__init__()
         self.task = task
         self.rows = task.actor_rows()
         shapes = signals(len(task.hand.joints), task.fingers, task.pads)
         self.shapes = shapes | {f"command {k}": (v.shape[1],) for k, v in task.commands.items()}
-        self.names = names or self._used()
+        self.names = self._used()
 
     def _used(self) -> list[str]:
         """Return signals that the rows use, found by computing them once."""
@@ -113,12 +113,12 @@ class Observation(torch.nn.Module):
         commanded = [k for k, x in self.task.task["commands"].items() if x["actor"]]
         return torch.cat([*out, *(by_name[f"command {k}"] for k in commanded)], 1)
 
-    def of_env(self, world: int = 0) -> dict[str, torch.Tensor]:
-        """Return the signals as the simulation has them, without noise."""
+    def of_env(self) -> dict[str, torch.Tensor]:
+        """Return the signals as the simulation has them, of its first world, without noise."""
         env = self.task
         now = {name: getattr(env, name) for name in self.shapes if not name.startswith("command ")}
         now |= {f"command {k}": v for k, v in env.commands.items()}
-        return {name: now[name][world : world + 1].clone().float() for name in self.names}
+        return {name: now[name][:1].clone().float() for name in self.names}
 
 
 def check(m: Any, source: object, again: str) -> None:

@@ -73,20 +73,19 @@ class BusDriver:
     """The driver of a hand whose `Body` lives in a child process; see the module.
 
     make: gives the body, in the child, from the clock that it runs by; joints, taxels: sizes of a state. hang [s]: see
-    `HANG`. start [s] that opening may take. clock: a `VirtualClock` keeps the body in this process, in step. inside: in
-    a thread of this process, of a package that is an object of it: nothing outlives an abort or a kill then.
+    `HANG`. start [s] that opening may take. clock: a `VirtualClock` keeps the body in this process, in step.
     """
 
     name = "hand"
 
     def __init__(
         self, make: Callable[[Clock], Body], joints: int, taxels: tuple[int, int], clock: Clock | None = None,
-        hang: float = HANG, start: float = 60.0, inside: bool = False,
+        hang: float = HANG, start: float = 60.0,
     ):  # fmt: skip
         self.clock, self.joints, self.taxels, self.hang = clock or Clock(), joints, taxels, hang
-        self._make, self.start, self._inside = make, start, inside
+        self._make, self.start = make, start
         self.body: Body | None = None
-        self._process: multiprocessing.context.SpawnProcess | _Thread | None = None
+        self._process: multiprocessing.context.SpawnProcess | None = None
         self._lock = threading.Lock()
         self._ended = ""
         self.rescued = ""  # by what a hand was let go whose process had died
@@ -114,10 +113,8 @@ class BusDriver:
         os.close(handle)
         self._output = Path(path)
         v["beat"].value = time.monotonic()
-        self._process = (
-            _Thread(lambda: _serve(self._make, v, self.joints, self.hang, lambda: False))
-            if self._inside
-            else context.Process(target=_child, args=(self._make, shared, self.joints, self.hang, path), daemon=True)
+        self._process = context.Process(
+            target=_child, args=(self._make, shared, self.joints, self.hang, path), daemon=True
         )
         self._process.start()
         limit = time.monotonic() + self.start
@@ -325,27 +322,6 @@ class BusDriver:
                 p.join(1.0)
         with contextlib.suppress(OSError):
             self._output.unlink()
-
-
-class _Thread(threading.Thread):
-    """What a process is asked, of a thread."""
-
-    def __init__(self, work: Callable[[], int]):
-        super().__init__(daemon=True, name="bus")
-        self.exitcode: int | None = None
-        self._work = work
-
-    def run(self) -> None:
-        code = 1
-        try:
-            code = self._work()
-        finally:
-            self.exitcode = code
-
-    def terminate(self) -> None:
-        """Do nothing: there is no process to end."""
-
-    kill = terminate
 
 
 # -- the child

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,15 +18,7 @@ FASTEST = 100.0
 """rad/s that a joint may be read to turn; the fastest of the hand's turns at about a tenth."""
 
 
-@dataclass(frozen=True)
-class _Bounds:
-    name: str
-    unit: str
-    low: Any
-    high: Any
-
-
-_JOINT = (_Bounds("current", "mA", -32768.0, 32767.0), _Bounds("temperature", "degC", -60.0, 250.0))
+_JOINT = (("current", "mA", -32768.0, 32767.0), ("temperature", "degC", -60.0, 250.0))
 _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded or cut
 
 
@@ -36,19 +27,19 @@ def implausible(
 ) -> str | None:
     """Return why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies
     ahead, an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not
-    judged here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`); felt: whether readings
-    before had taxels, which a hand does not lose."""
+    judged here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`); has_touch: readings before
+    had taxels, which a hand does not lose."""
     J, (low, high) = len(hand.joints), hand.limits.T
     if (wrong := bad_stamp(state.time, now)) is not None:
         return wrong
-    for b in (_Bounds("position", "rad", low - BEYOND, high + BEYOND), *_JOINT):
-        x = _array(getattr(state, b.name))
+    for name, unit, least, most in (("position", "rad", low - BEYOND, high + BEYOND), *_JOINT):
+        x = _array(getattr(state, name))
         if x is None or x.shape != (J,):
-            return f"{b.name} is not {J} numbers"
-        bad = ~((x >= b.low) & (x <= b.high))  # NaN too
+            return f"{name} is not {J} numbers"
+        bad = ~((x >= least) & (x <= most))  # NaN too
         if bad.any():
             j = int(np.argmax(bad))
-            return f"{b.name} of {hand.joints[j]} is {x[j]:.4g} {b.unit}"
+            return f"{name} of {hand.joints[j]} is {x[j]:.4g} {unit}"
     error = _array(state.error)
     if error is None or error.shape != (J,):
         return f"error is not {J} codes"

@@ -31,6 +31,8 @@ KP_NOMINAL = 100.0
 """The firmware's kp that the servo table stands for: what most users send."""
 BUS_PERIOD = 0.010
 """s of a bus cycle: a command goes out and a state comes back (RS485: 9.6 ms measured by users)."""
+LATENCY = 0.002
+"""s from a state's measurement until `read` gives it, on top of the bus period."""
 SPEED_LSB = 1e-3
 """rad/s a count of the speed that newer firmware reports."""
 TIMESTEP = 0.0035  # s of physics, about
@@ -99,9 +101,7 @@ class SimulatedHand:
         self._away = torch.zeros(7, dtype=torch.float64)
         self._away[2] = AWAY if grip is not None else 0.0
         self.target = env.q[0].double().numpy().copy()
-        self.camera = None
-        if camera:
-            self.camera = SimulatedCamera(self.env)
+        self.camera = SimulatedCamera(self.env) if camera else None
         self._seen: tuple[np.ndarray, float] | None = None
         self._look_at = 0.0
         self.lie_flat()
@@ -178,7 +178,6 @@ class SimulatedHand:
             self._look()
 
     def _look(self) -> None:
-        place = None
         if self.camera is not None:
             place = self.camera.see(self.time)
         else:
@@ -206,14 +205,13 @@ class SimulatedHand:
             np.round(1e3 * self.calibration.current(env.torque[0].double().numpy())), -32768, 32767
         ).astype(np.int16)
         tactile = np.zeros((*self.taxels, 3), np.int16)
-        if not tactile.size:
-            pass
-        elif env.touch.raw3 is not None:
-            counts = env.touch.raw3[0].double().numpy() / (self.calibration.lsb * self.calibration.axis_sign)
+        sheared, normal = env.touch.raw3, env.touch.raw
+        if tactile.size and sheared is not None:
+            counts = sheared[0].double().numpy() / (self.calibration.lsb * self.calibration.axis_sign)
             tactile[:] = np.clip(np.round(counts), [-128, -128, 0], [127, 127, 255])
-        else:
-            assert env.touch.raw is not None  # a hand that touches
-            tactile[..., 2] = np.clip(np.round(env.touch.raw[0].double().numpy() / self.calibration.lsb), 0, 255)
+        elif tactile.size:
+            assert normal is not None  # a hand that touches
+            tactile[..., 2] = np.clip(np.round(normal[0].double().numpy() / self.calibration.lsb), 0, 255)
         speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
         return HandState(now, self.sequence, position.astype(np.float32), current, np.full(len(position), 30.0),
                          np.zeros(len(position), np.int64), tactile,
@@ -347,10 +345,10 @@ def choose_gl() -> str:
 # -- the driver
 # -----------------------------------------------------------------------------------------------------------------
 class SimulatedBody:
-    """The hand's side of `SimulatedXHand`: a bus cycle every `BUS_PERIOD`, whose state is there `latency` [s] later."""
+    """The hand's side of `SimulatedXHand`: a bus cycle every `BUS_PERIOD`, whose state is there `LATENCY` later."""
 
-    def __init__(self, clock: Clock, args: tuple, latency: float):
-        self.clock, self.latency, self.hand = clock, latency, _physics(args)
+    def __init__(self, clock: Clock, args: tuple):
+        self.clock, self.hand = clock, _physics(args)
         self._last: HandCommand | None = None
 
     def open(self) -> dict[str, str]:
@@ -360,13 +358,13 @@ class SimulatedBody:
         self._zero = self.clock.now() - self.hand.time
         self._cycle = round(self.hand.time / BUS_PERIOD)
         return {
-            "driver": "simulated", "serial": "sim", "bus": f"{1 / BUS_PERIOD:g} Hz", "latency_s": f"{self.latency:g}",
+            "driver": "simulated", "serial": "sim", "bus": f"{1 / BUS_PERIOD:g} Hz", "latency_s": f"{LATENCY:g}",
         }  # fmt: skip
 
     @property
     def due(self) -> float:
         """When the next state is there [s]."""
-        return self._zero + self._cycle * BUS_PERIOD + self.latency
+        return self._zero + self._cycle * BUS_PERIOD + LATENCY
 
     def cycle(self, command: HandCommand | None) -> HandState:
         """Return the command acts, the hand is simulated to the next cycle's time; its state, when it is there."""
@@ -405,21 +403,17 @@ class SimulatedBody:
 
 
 class SimulatedXHand(BusDriver):
-    """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step.
-
-    latency [s]: from a state's measurement until `read` gives it, on top of the bus period.
-    """
+    """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step."""
 
     name = "simulated hand"
 
     def __init__(
         self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, seed: int = 0,
-        camera: bool = False, shape: str | None = None, latency: float = 0.002, grip: dict[str, Any] | None = None,
-        hang: float = HANG,
+        camera: bool = False, shape: str | None = None, grip: dict[str, Any] | None = None, hang: float = HANG,
     ):  # fmt: skip
         registry.task_class(config)  # refused here where nobody that may has named it
         self._camera, hand = camera, hand_of(config)
-        make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip), latency=latency)
+        make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip))
         super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
 
     @property

@@ -594,13 +594,11 @@ class VendorXHand(BusDriver):
     name = "xHand"
 
     def __init__(
-        self, port: str = "auto", clock: Clock | None = None, package: Any = None, serial: str | None = None,
-        side: str | None = None, hang: float = HANG,
+        self, port: str = "auto", clock: Clock | None = None, package: Callable[[Clock], Any] | None = None,
+        serial: str | None = None, side: str | None = None, hang: float = HANG,
     ):  # fmt: skip
-        inside = hasattr(package, "XHandControl")  # the module itself, of this process
-        give = (lambda clock: package) if inside else package
-        make = partial(XHandBus, port=port, serial=serial, side=side, package=give)
-        super().__init__(make, JOINTS, TAXELS[:2], clock, hang, inside=inside)
+        make = partial(XHandBus, port=port, serial=serial, side=side, package=package)
+        super().__init__(make, JOINTS, TAXELS[:2], clock, hang)
 
 
 def _import() -> Any:

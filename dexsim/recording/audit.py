@@ -5,13 +5,12 @@ A finding names topic, time and count; nothing is repaired. Kinds and severities
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 import numpy as np
 
 from dexsim.recording import audit_time, audit_values, reach
-from dexsim.recording.schema import SEVERITIES, Finding, Recording, Series
+from dexsim.recording.schema import COMMANDS, SEVERITIES, STATES, Finding, Recording
 
 KINDS: dict[str, str] = {
     "damage": "bytes, chunks or channels of the file that are lost",
@@ -40,8 +39,7 @@ KINDS: dict[str, str] = {
 def audit(recording: Recording) -> list[Finding]:
     """Return findings about the signals of a recording, in order of topic and time; [] for a clean one."""
     r = recording
-    others = (r.temperature, r.duty, r.enabled, r.supply_voltage, r.tactile, r.external_force, r.object_pose, r.imu)
-    series: list[Series] = [s for s in others if s is not None]
+    series = [s for s in r.series().values() if s.topic not in (COMMANDS, STATES)]
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         for s in series:
@@ -87,21 +85,9 @@ def summary(r: Recording) -> str:
         f"{r.path}: {r.meta['source']}, {r.meta['robot']}, {len(r.joints)} joints, {r.duration:.2f} s,"
         f" effort {r.effort_is}"
     ]
-    parts = (
-        ("commands", r.commands), ("states", r.states.position), ("  velocity", r.states.velocity),
-        ("  effort", r.states.effort), ("temperature", r.temperature), ("duty", r.duty), ("enabled", r.enabled),
-        ("supply voltage", r.supply_voltage), ("tactile", r.tactile), ("external force", r.external_force),
-        ("object pose", r.object_pose), ("imu", r.imu),
-    )  # fmt: skip
-    for name, s in parts:
-        if s is not None and len(s):
-            rate = (len(s) - 1) / (s.t[-1] - s.t[0]) if len(s) > 1 and s.t[-1] > s.t[0] else float("nan")
-            lines.append(f"  {name:<15} {len(s):>7} samples  {rate:7.1f} Hz  {s.t[0]:8.3f} .. {s.t[-1]:.3f} s")
+    called = {"command": "commands", "position": "states", "velocity": "  velocity", "effort": "  effort"}
+    for name, s in r.series().items():
+        rate = (len(s) - 1) / (s.t[-1] - s.t[0]) if len(s) > 1 and s.t[-1] > s.t[0] else float("nan")
+        span = f"{s.t[0]:8.3f} .. {s.t[-1]:.3f} s"
+        lines.append(f"  {called.get(name, name):<15} {len(s):>7} samples  {rate:7.1f} Hz  {span}")
     return "\n".join(lines)
-
-
-if __name__ == "__main__":  # python -m dexsim.recording.audit FILE
-    from dexsim.console.ending import guard
-    from dexsim.gap.audit import main
-
-    sys.exit(guard(main, sys.argv[1:]))

@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.recording import timeline
 from dexsim.recording.schema import COMMANDS, Finding, Recording, Series
+from dexsim.recording.smooth import at
 
 GAP = 3.5  # periods without a sample
 SKEW_S = 0.010  # s between header.stamp and host time that a transport does not explain
@@ -140,12 +141,10 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
         return None
     grid = np.arange(start, end, step)
     for j in range(len(r.joints)):
-        command, position = (
-            _held_at(grid, r.commands.t, r.commands.value[:, j]),
-            _line(grid, state.t, state.value[:, j]),
-        )
-        if command is None or position is None:
+        sides = (r.commands.t, r.commands.value[:, j], True), (state.t, state.value[:, j], False)
+        if any(np.isfinite(x).sum() < 5 for _, x, _ in sides):
             continue
+        command, position = (at(grid, *side) for side in sides)
         half = len(grid) // 2
         found: list[int] = []
         for part in (slice(None), slice(0, half), slice(half, None)):
@@ -174,19 +173,6 @@ def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5,
     if alone and best < reach and size[peaks[peaks >= reach]].max(initial=0.0) > corr[best] - ALIKE:
         return None
     return reach - best if corr[best] > 0.8 else None
-
-
-def _held_at(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray | None:
-    ok = np.isfinite(x)
-    if ok.sum() < 5:
-        return None
-    t, x = t[ok], x[ok]
-    return x[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, None)]
-
-
-def _line(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray | None:
-    ok = np.isfinite(x)
-    return np.interp(grid, t[ok], x[ok]) if ok.sum() >= 5 else None
 
 
 def _slope(t: np.ndarray, y: np.ndarray) -> float:

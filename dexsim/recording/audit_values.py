@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, Finding, Recording, Series
+from dexsim.recording import smooth
+from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, Finding, Recording, Series, note
 from dexsim.recording.spikes import of_effort, spiked
 
-NAN = float("nan")
 MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 16384.0, 65536.0, 65.536, 2.0**32)
 """Angles, 8, 12, 14, 16 (also in thousandths) and 32 bit."""
 RATIOS = {
@@ -48,12 +48,8 @@ def is_integer(x: np.ndarray) -> bool:
 
 def channels(r: Recording) -> Iterator[tuple[Series, str, str, np.ndarray]]:
     """Yield (series, quantity, joint, values [T]) of every per-joint signal."""
-    s = r.states
-    for series, name in (
-        (r.commands, "command"), (s.position, "position"), (s.velocity, "velocity"), (s.effort, "effort"),
-        (r.temperature, "temperature"), (r.duty, "duty"), (r.enabled, "enabled"),
-    ):  # fmt: skip
-        if series is not None and len(series):
+    for name, series in r.series().items():
+        if name in ("command", "position", "velocity", "effort", "temperature", "duty", "enabled"):
             for j, joint in enumerate(r.joints):
                 yield series, name, joint, series.value[:, j]
 
@@ -66,16 +62,16 @@ def commanded(r: Recording) -> Iterator[Finding]:
         use = "calibrate touch can use this recording, diagnose and replay cannot" if has_touch else (
             "diagnose and replay cannot use this recording")  # fmt: skip
         text = f"no commands: {use}; {COMMANDS_FIX}"
-        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if has_touch else "error")
+        yield note("missing_topic", text, "warning" if has_touch else "error", COMMANDS, len(r.commands))
     have = [np.isfinite(x.value).any(0) if len(x) else np.zeros(len(r.joints), bool) for x in (
         r.commands, r.states.position)]  # fmt: skip
     if have[0].any() and have[1].any() and not (have[0] & have[1]).any():
         sent, seen = (", ".join(np.array(r.joints)[x][:4]) for x in have)
         text = f"no joint has both a command ({sent}) and a position ({seen}): say which is which, remap.OURS=THEIRS"
-        yield Finding("joint_names", STATES, NAN, len(r.joints), text, "error")
+        yield note("joint_names", text, "error", STATES, len(r.joints))
     if len(r.commands) and not have[1].any():
         text = "no positions: nothing says where the joints went; name their columns with remap.position.JOINT=COLUMN"
-        yield Finding("missing_topic", STATES, NAN, 0, f"{text}, or their topic with remap.{STATES}=TOPIC", "error")
+        yield note("missing_topic", f"{text}, or their topic with remap.{STATES}=TOPIC", "error", STATES, 0)
 
 
 def order(r: Recording) -> Iterator[Finding]:
@@ -120,15 +116,8 @@ def _together(r: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return none[:, 0], none, none
     first = max(c.t[0], s.t[0])
     grid = np.arange(first, min(c.t[-1], s.t[-1], first + 300.0), 0.01)
-    out = [np.zeros((len(grid), len(r.joints))) for _ in range(2)]
-    for j in range(len(r.joints)):
-        for x, series, kind in zip(out, (c, s), ("previous", "line"), strict=True):
-            ok = np.isfinite(series.value[:, j])
-            if ok.sum() > 5:
-                t, v = series.t[ok], series.value[ok, j]
-                held = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, None)]
-                x[:, j] = held if kind == "previous" else np.interp(grid, t, v)
-    return grid, out[0], out[1]
+    there = [np.isfinite(x.value).sum(0) > 5 for x in (c, s)]
+    return grid, np.where(there[0], c.at(grid, held=True), 0.0), np.where(there[1], s.at(grid), 0.0)
 
 
 def _follows(command: np.ndarray, position: np.ndarray) -> float:
@@ -149,8 +138,8 @@ def finite(r: Recording) -> Iterator[Finding]:
         elif np.isinf(x).any() or name not in ("command", "enabled"):
             text = f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples"
             yield series.finding("nan", text, "warning", joint, at)
-    for whole in (r.tactile, r.supply_voltage, r.external_force, r.object_pose, r.imu):
-        if whole is not None:
+    for name, whole in r.series().items():
+        if name in ("tactile", "supply voltage", "external force", "object pose", "imu"):
             bad = np.flatnonzero(~np.isfinite(whole.value.reshape(len(whole), -1)).all(1))
             if len(bad):
                 text = f"{len(bad)} of {len(whole)} samples hold values that are not finite"
@@ -380,15 +369,12 @@ def signs(r: Recording) -> Iterator[Finding]:
 def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
     """Return what an effort should follow [T]: target minus position; where nothing is commanded, the speed."""
     s = r.states.position
-    ok = np.isfinite(s.value[:, j])
-    if ok.sum() < 5:
+    if np.isfinite(s.value[:, j]).sum() < 5:
         return np.full(len(t), np.nan)
-    q = np.interp(t, s.t[ok], s.value[ok, j])
+    q = smooth.at(t, s.t, s.value[:, j])
     c = r.commands
-    if len(c) and np.isfinite(c.value[:, j]).sum() > 5:
-        keep = np.isfinite(c.value[:, j])
-        at = np.searchsorted(c.t[keep], t, side="right") - 1
-        return np.where(at >= 0, c.value[keep, j][np.clip(at, 0, None)] - q, np.nan)
+    if len(c) and (there := np.isfinite(c.value[:, j])).sum() > 5:
+        return np.where(t >= c.t[there][0], smooth.at(t, c.t, c.value[:, j], held=True) - q, np.nan)
     return np.gradient(q, t) if len(np.unique(t)) == len(t) else np.full(len(t), np.nan)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from dexsim import files
 from dexsim.errors import UserError
 from dexsim.recording import schema, units
-from dexsim.recording.schema import Finding
+from dexsim.recording.schema import Finding, note
 from dexsim.recording.units import ALONG, UNITS
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".npz", ".json", ".jsonl")
@@ -120,12 +120,10 @@ class Table:
     def samples(self, quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (t [T] s, value [T, J]) of one quantity, rows without any number left out."""
         t, columns = self.time[quantity], self.value.get(quantity, {})
-        rows = (
-            np.stack([columns.get(j, np.full(len(t), np.nan)) for j in self.joints], 1)
-            if columns
-            else np.zeros((len(t), 0))
-        )
-        keep = self._any(quantity) if columns else np.zeros(len(t), bool)
+        if not columns:
+            return t[:0], np.zeros((0, 0))
+        rows = np.stack([columns.get(j, np.full(len(t), np.nan)) for j in self.joints], 1)
+        keep = self._any(quantity)
         return t[keep], rows[keep]
 
 
@@ -177,19 +175,14 @@ def of_columns(
                 f"remap.{quantity}{'.' + joint if joint else ''}=COLUMN"
             )
         if quantity == "effort":
-            effort.add(
-                "current_A"
-                if word in _CURRENT or unit in ("a", "ma")
-                else "torque_Nm"
-                if word != "effort" or unit
-                else ""
-            )
+            torque = "torque_Nm" if word != "effort" or unit else ""
+            effort.add("current_A" if word in _CURRENT or unit in ("a", "ma") else torque)
         scale = 1.0
         if quantity == "time" and not unit and not time_unit:
             unit = _epoch(raw[column])
             if unit:
                 text = f"'{column}' counts {unit} since 1970, by its values (say otherwise with units.time=)"
-                findings.append(Finding("unit", "", np.nan, 1, text, "warning"))
+                findings.append(note("unit", text))
                 roles[column] = (quantity, joint, unit, word)
         if quantity in ("command", "position") and unit in ALONG:
             along.setdefault(joint, {})[quantity] = ALONG[unit]
@@ -219,9 +212,7 @@ def of_columns(
         )
     unused = [c for c in raw if c not in roles]
     if unused:
-        findings.append(
-            Finding("topic", "", np.nan, len(unused), f"columns that are not read: {_list(unused)}", "info")
-        )
+        findings.append(note("topic", f"columns that are not read: {_list(unused)}", "info", count=len(unused)))
     stated = {"effort_is": effort.pop()} if len(effort) == 1 and "" not in effort else {}
     if len(effort) > 1:
         raise UserError(
@@ -283,9 +274,8 @@ def _lines_of_joints(raw: Mapping[str, Any]) -> dict[str, Any]:
             out[column] = cells
         else:
             unit = f" [{role[2]}]" if role[2] else ""
-            out |= {
-                f"{role[3]}.{j}{unit}": [x if n == j else "" for x, n in zip(cells, names, strict=True)] for j in joints
-            }
+            for j in joints:
+                out[f"{role[3]}.{j}{unit}"] = [x if n == j else "" for x, n in zip(cells, names, strict=True)]
     return out
 
 
@@ -328,7 +318,7 @@ def _numbers(
                 reported[column] = ~empty
     if words:
         text = f"{words} entries are not numbers ('{example[:20]}'; a number is like 1.5e-3); taken as missing"
-        findings.append(Finding("unreadable", "", np.nan, words, text, "error"))
+        findings.append(note("unreadable", text, "error", count=words))
     return out, reported
 
 
@@ -343,7 +333,7 @@ def _some_clock(
             continue
         if (np.diff(x) >= 0).all() and x[-1] > x[0]:
             text = f"time is read from column '{column}' (say otherwise with remap.time=COLUMN)"
-            findings.append(Finding("topic", "", np.nan, 1, text, "info"))
+            findings.append(note("topic", text, "info"))
             return {column: ("time", "", unit, "time")}
     return {}
 
@@ -564,18 +554,13 @@ def _csv(path: Path) -> tuple[dict[str, list[str]], list[Finding]]:
     rows = rows[:1] + [r for r in rows[1:] if [x.strip() for x in r] != names]
     bad = sum(len(r) != len(names) for r in rows[1:])
     rows = [r for r in rows[1:] if len(r) == len(names)]
-    text = f"{len(again)} lines name the columns once more: the logger was started again"
-    more = [Finding("malformed", "", np.nan, len(again), text, "warning")] if again else []
-    findings = more + (
-        [
-            Finding(
-                "malformed", "", np.nan, bad, f"{bad} lines have not as many values as there are names; left out",
-                "error",
-            )
-        ]
-        if bad
-        else []
-    )
+    findings = []
+    if again:
+        text = f"{len(again)} lines name the columns once more: the logger was started again"
+        findings.append(note("malformed", text, count=len(again)))
+    if bad:
+        text = f"{bad} lines have not as many values as there are names; left out"
+        findings.append(note("malformed", text, "error", count=bad))
     return {name: [r[k] for r in rows] for k, name in enumerate(names) if name}, findings
 
 
@@ -638,10 +623,8 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         fix = ": cut it into several files" if "unpacks" in str(error) else ""
         fix = "; names as text: np.array(names, dtype=str)" if "no objects" in str(error) else fix
         raise UserError(f"recording {path}: is not an NPZ file that can be read: {error}{fix}") from None
-    names = next(
-        (arrays.pop(k) for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"),
-        None,
-    )
+    named = [k for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"]
+    names = arrays.pop(named[0]) if named else None
     out: dict[str, np.ndarray] = {}
     fields = {f"{k}.{n}": x[n] for k, x in arrays.items() for n in x.dtype.names or ()}  # of arrays of records
     if fields and len({k.split(".")[0] for k in fields}) == 1:
@@ -661,9 +644,7 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         if x.ndim == 1 and x.size:
             out[key] = x.astype(float)
         elif x.ndim == 2 and x.shape[1] and x.shape[0]:
-            labels = (
-                [str(n) for n in np.ravel(names)] if names is not None else [f"joint{j}" for j in range(x.shape[1])]
-            )
+            labels = [f"joint{j}" for j in range(x.shape[1])] if names is None else [str(n) for n in np.ravel(names)]
             if len(labels) != x.shape[1]:
                 raise UserError(
                     f"recording {path}: '{key}' has {x.shape[1]} columns, but joint_names has {len(labels)}"

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dexsim import typed
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
@@ -120,14 +120,7 @@ def _framed(r: Recording, s: Any, fps: float) -> np.ndarray:
     """Return [n, J] values of a series at the frames from the first state on: what was read, or the target in force."""
     start, end = float(r.states.position.t[0]), float(r.states.position.t[-1])
     t = start + np.arange(int((end - start) * fps + 1e-6) + 1) / fps
-    out = np.full((len(t), s.value.shape[1]), np.nan)
-    for j, x in enumerate(s.value.T):
-        ok = np.isfinite(x)
-        if ok.any() and s.topic == r.commands.topic:
-            out[:, j] = x[ok][np.clip(np.searchsorted(s.t[ok], t + 1e-9, side="right") - 1, 0, None)]
-        elif ok.any():
-            out[:, j] = np.interp(t, s.t[ok], x[ok])
-    return out
+    return s.at(t + 1e-9, held=True) if s.topic == r.commands.topic else s.at(t)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -139,26 +132,13 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
         return 0 if argv else 2
-    own: dict[str, str] = {}
-    rest = []
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if equals and key in ("out", "format", "fps"):
-            own[key] = value
-        else:
-            rest.append(argument)
+    taken = [a for a in argv if a.startswith(("out=", "format=", "fps="))]
+    own = typed.settings(taken, ("out", "format", "fps"))
     if not own.get("out"):
         raise UserError("say where to: out=FILE.mcap, or out=FOLDER")
-    kind = own.get("format", "mcap")
-    if kind not in ("mcap", "lerobot"):
-        raise UserError(f"format={kind}: must be mcap or lerobot")
-    try:
-        fps = float(own["fps"]) if "fps" in own else None
-    except ValueError:
-        fps = 0.0
-    if fps is not None and not FPS[0] <= fps <= FPS[1]:
-        raise UserError(f"fps={own['fps']}: must be a number from {FPS[0]:g} to {FPS[1]:g}")
-    given, remap, meta = read_arguments(rest)
+    kind = typed.one_of("format", own.get("format", "mcap"), ("mcap", "lerobot"))
+    fps = typed.number("fps", own["fps"], *FPS) if "fps" in own else None
+    given, remap, meta = read_arguments([a for a in argv if a not in taken])
     paths = [q for p in given for q in readers.expanded(Path(p).expanduser())]
     out = Path(own["out"]).expanduser()
     if kind == "lerobot":
@@ -177,9 +157,3 @@ def main(argv: Sequence[str]) -> int:
             print(line)
         print(to)
     return 0
-
-
-if __name__ == "__main__":
-    from dexsim.console.ending import guard
-
-    sys.exit(guard(main, sys.argv[1:]))

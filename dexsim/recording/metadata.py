@@ -23,6 +23,7 @@ from dexsim.recording.schema import (
     UNIT_KEYS,
     Finding,
     brief,
+    note,
     numbers,
 )
 from dexsim.recording.units import split
@@ -34,7 +35,6 @@ Stated = msgspec.defstruct("Stated", [(key, Literal[WORDS[key]] if key in WORDS 
 """What is stated about a recording, as text by key."""
 Written = dict[str, str | bool | float | dict[str, Any] | list[Any] | None]
 """A file of metadata beside a recording: plain values, lists of such, and a servo.yaml under `servo`."""
-NAN = float("nan")
 
 
 def collect(
@@ -50,11 +50,8 @@ def collect(
     beside = _read(beside_path) if os.path.isfile(beside_path) else {}
     beside, beside_units = split(beside)
     stated = {k: str(v) for k, v in own.items() if k in VALID}
-    findings = [
-        Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
-        for k in own
-        if k not in VALID
-    ]
+    unknown = [f"metadata key '{k}' is not one of this format's; ignored" for k in own if k not in VALID]
+    findings = [note("metadata_unknown", text, "info") for text in unknown]
     for source, values in ((str(beside_path), beside), ("meta.*", given)):
         for key, value in values.items():
             if key not in VALID:
@@ -64,13 +61,8 @@ def collect(
                 )
             text = _text(value)
             if stated.get(key, text) != text:
-                findings.append(
-                    Finding(
-                        "metadata_override", "", NAN, 1,
-                        f"{key}: '{brief(stated[key])}' as recorded, '{brief(text)}' by {source}; the latter is used",
-                        "info",
-                    )
-                )
+                said = f"{key}: '{brief(stated[key])}' as recorded, '{brief(text)}' by {source}; the latter is used"
+                findings.append(note("metadata_override", said, "info"))
             stated[key] = text
     _check(path, stated)
     old = {key.removesuffix("_unit"): stated.pop(key) for key in UNIT_KEYS if key in stated}
@@ -79,29 +71,16 @@ def collect(
 
 def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> list[Finding]:
     """Fill in the defaults (in place); one finding for each key that matters and was not stated."""
-    missing: list[tuple[str, str, str]] = []
-
-    def default(key: str, value: str, severity: str) -> None:
-        if key not in stated:
-            stated[key] = value
-            missing.append((key, value, severity))
-
-    default("effort_is", "torque_Nm" if has_effort else "none", "warning" if has_effort else "info")
-    for key, value in DEFAULTS.items():
-        important = (
-            (key == "effort_sign" and has_effort)
-            or (key in ("tactile_unit", "tactile_lsb", "tactile_axis_sign") and has_tactile)
-            or key == "gravity"
-        )
-        default(key, value, "warning" if important else "info")
+    usual = {"effort_is": "torque_Nm" if has_effort else "none"} | DEFAULTS
+    missing = {key: value for key, value in usual.items() if key not in stated}
+    stated |= missing
+    matter = ["gravity", *("effort_is", "effort_sign") * has_effort]
+    matter += ["tactile_unit", "tactile_lsb", "tactile_axis_sign"] * has_tactile
     return [
-        Finding(
-            "missing_metadata", "", NAN, 1, f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)",
-            severity,
-        )
-        for key, value, severity in missing
-        if key not in ("servo", "notes")
-    ]
+        note("missing_metadata", f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)",
+             "warning" if key in matter else "info")
+        for key, value in missing.items() if key not in ("servo", "notes")
+    ]  # fmt: skip
 
 
 def own_record(records: list[Any]) -> dict[str, str]:

@@ -18,6 +18,7 @@ from dexsim.recording import attached, columns, decode, metadata, names, readers
 from dexsim.recording.container import BAGS, Container, open_container
 from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
+from dexsim.recording.smooth import at
 from dexsim.recording.units import Unit, Units, split
 
 NAN = float("nan")
@@ -35,6 +36,7 @@ PARTS = {schema.COMMANDS: "reference|desired", schema.STATES: "feedback|actual"}
 """What a controller's state (`control_msgs/JointTrajectoryControllerState`, new and old) says of each topic."""
 SENT = {"a trajectory": "trajectory_msgs/msg/JointTrajectory", "values": "std_msgs/msg/Float64MultiArray"}
 """Types of topics that are the commands where no other can be, by what they hold."""
+JOINT_ARRAYS = {schema.TEMPERATURES: "temperature", schema.DUTY: "duty", schema.ENABLED: "enabled"}
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
@@ -151,14 +153,8 @@ class _Reading:
             for channel_id, channel in c.channels.items():
                 stream = _Stream(channel, c.schemas.get(channel.schema_id), by_channel.get(channel_id, []))
                 self.streams.setdefault(channel.topic, []).append(stream)
-        self.config = next(
-            (
-                c.attachments[schema.ATTACHMENT].decode("utf-8", "replace")
-                for c in containers
-                if schema.ATTACHMENT in c.attachments
-            ),
-            None,
-        )
+        attached = [c.attachments[schema.ATTACHMENT] for c in containers if schema.ATTACHMENT in c.attachments]
+        self.config = attached[0].decode("utf-8", "replace") if attached else None
         self.sources = self._topics({_slash(k): v for k, v in remap.items() if _is_topic(k)})
         self.joint_remap = {k: v for k, v in remap.items() if not _is_topic(k)}
         if not any(s.messages for theirs, _ in self.sources.values() for s in self.streams[theirs]):
@@ -169,9 +165,9 @@ class _Reading:
             self._first(s.messages) for theirs, _ in self.sources.values() for s in self.streams[theirs] if s.messages
         )
 
-    def _note(self, kind: str, text: str, severity: str = "warning", topic: str = "", count: int = 1) -> None:
-        """Add a finding of no time of its own."""
-        self.findings.append(Finding(kind, topic, NAN, count, text, severity))
+    def _note(self, *about: Any, **more: Any) -> None:
+        """Add a `schema.note`."""
+        self.findings.append(schema.note(*about, **more))
 
     def _damage(self, c: Container) -> None:
         where = f"{c.path.name}: " if c.path != self.path else ""
@@ -270,10 +266,8 @@ class _Reading:
         )
 
     def _describe_topics(self) -> str:
-        rows = [
-            f"{t} ({s[0].schema.name if s[0].schema else '?'}, {s[0].channel.message_encoding})"
-            for t, s in sorted(self.streams.items())
-        ]
+        name = lambda s: s.schema.name if s.schema else "?"  # noqa: E731
+        rows = (f"{t} ({name(s)}, {s.channel.message_encoding})" for t, (s, *_) in sorted(self.streams.items()))
         return ", ".join(rows) or "none"
 
     def _decode(
@@ -308,11 +302,8 @@ class _Reading:
                 try:
                     value = reader(m.data)
                 except Exception as error:  # a damaged message may fail anywhere in a decoder
-                    bad, why, when = (
-                        bad + 1,
-                        why or " ".join(str(error).split())[:200] or type(error).__name__,
-                        min(when, t) if bad else t,
-                    )
+                    when, bad = min(when, t) if bad else t, bad + 1
+                    why = why or " ".join(str(error).split())[:200] or type(error).__name__
                     continue
                 times.append(t)
                 values.append(value)
@@ -405,17 +396,11 @@ class _Reading:
             config=self.config,
             hand=self.hand if ours and set(ours) <= set(self.hand.joints) else None,
         )
-        for topic, name in ((schema.TEMPERATURES, "temperature"), (schema.DUTY, "duty"), (schema.ENABLED, "enabled")):
-            setattr(out, name, self._joint_array(topic, place))
+        out.temperature, out.duty, out.enabled = (self._joint_array(topic, place) for topic in JOINT_ARRAYS)
         self._convert(out, units, {ours[c]: theirs[i] for i, c in enumerate(column) if c >= 0})
         out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
         out.tactile = self._array(schema.TACTILE, self._tactile_shape)
-        for topic, name in (
-            (schema.EXTERNAL_FORCE, "external_force"),
-            (schema.OBJECT_POSE, "object_pose"),
-            (schema.IMU, "imu"),
-        ):
-            setattr(out, name, self._vectors(topic))
+        out.external_force, out.object_pose, out.imu = (self._vectors(topic) for topic in _VECTORS)
         if reason := attached.fault(self.config, f"the attached {schema.ATTACHMENT}"):
             out.config = None
             self._note("damage", f"{reason}; it is not used", "error")
@@ -451,14 +436,8 @@ class _Reading:
                     f"{len(listed or seen)}; state them all with meta.joint_names=a,b,..."
                 )
             return list(seen)
-        if joints is not None and unnamed == len(joints):
-            names_ = list(joints)
-        else:
-            names_ = (
-                list(self.hand.joints)
-                if unnamed == len(self.hand.joints) and joints is None
-                else [f"joint{i}" for i in range(unnamed)]
-            )
+        known = self.hand.joints if joints is None else joints
+        names_ = list(known) if unnamed == len(known) else [f"joint{i}" for i in range(unnamed)]
         self._note("missing_metadata", "neither the messages nor joint_names name the joints; assumed:"
                                        f" {', '.join(names_)} (state meta.joint_names=...)", "warning")  # fmt: skip
         return names_
@@ -687,7 +666,7 @@ class _TableReading(_Reading):
             for q in have[1:]:
                 own, value = table.samples(q)
                 same = len(own) == len(t) and np.array_equal(own, t)
-                rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
+                rest[q] = value if same else np.stack([at(t, own, x) for x in value.T], 1)
             out: Sequence[Any] = JointRows(
                 table.joints, rows, rest.get("velocity", absent), rest.get("effort", absent),
                 np.zeros(len(t), np.int64), table.carried("position"),
@@ -699,12 +678,7 @@ class _TableReading(_Reading):
             absent = np.zeros((len(rows), 0))
             out = JointRows(table.joints, rows, absent, absent, np.zeros(len(t), np.int64), table.carried("command"))
         else:
-            quantity = {
-                schema.TEMPERATURES: "temperature",
-                schema.DUTY: "duty",
-                schema.ENABLED: "enabled",
-                schema.SUPPLY: "supply_voltage",
-            }.get(ours, "")
+            quantity = (JOINT_ARRAYS | {schema.SUPPLY: "supply_voltage"}).get(ours, "")
             if quantity not in table.value:
                 return empty, []
             if quantity == "supply_voltage":
@@ -737,11 +711,6 @@ def _between(a: tuple[float, Any, Any], b: tuple[float, Any, Any], t: float) -> 
         return np.asarray(a[1] + u * (b[1] - a[1]))
     slope = (u**3 - 2 * u**2 + u) * size * a[2] + (u**3 - u**2) * size * b[2]
     return np.asarray((2 * u**3 - 3 * u**2 + 1) * a[1] + (3 * u**2 - 2 * u**3) * b[1] + slope)
-
-
-def _line(t: np.ndarray, own: np.ndarray, x: np.ndarray) -> np.ndarray:
-    ok = np.isfinite(x) & np.isfinite(own)
-    return np.interp(t, own[ok], x[ok]) if ok.any() else np.full(len(t), np.nan)
 
 
 def _taken(samples: Sequence[Any], which: np.ndarray) -> Sequence[Any]:

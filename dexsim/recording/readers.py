@@ -27,7 +27,7 @@ import numpy as np
 
 from dexsim import door, files, guard
 from dexsim.errors import UserError
-from dexsim.recording.schema import TACTILE, Finding, brief
+from dexsim.recording.schema import TACTILE, Finding, brief, note
 
 GROUP = "dexsim.readers"
 MAX_EPISODES = 100_000
@@ -194,7 +194,7 @@ def of_arrays(arrays: Mapping[str, np.ndarray], names: Mapping[str, Sequence[str
         if x.ndim in (2, 3, 4):
             full = x[..., None] * np.array([0.0, 0.0, 1.0]) if x.shape[-1] != 3 or x.ndim == 2 else x
             out.arrays[TACTILE] = full.reshape(len(x), -1, full.shape[-2], 3).astype(float)
-            out.findings.append(_info(f"touch is read from '{name}' {list(x.shape[1:])}"))
+            out.findings.append(note("topic", f"touch is read from '{name}' {list(x.shape[1:])}", "info"))
     labels: dict[str, list[str]] = {}
     for kind in ("position", "command", "velocity", "effort"):
         for name, stem, x in groups.get(kind, []):
@@ -206,19 +206,15 @@ def of_arrays(arrays: Mapping[str, np.ndarray], names: Mapping[str, Sequence[str
             if kind == "position":
                 labels[stem] = own
             elif labels and not set(own) <= {j for v in labels.values() for j in v}:
-                out.findings.append(_info(f"'{name}' has {x.shape[1]} values, of other joints than the positions: not "
-                                          "joint targets, left out", "warning"))  # fmt: skip
+                what = f"'{name}' has {x.shape[1]} values, of other joints than the positions"
+                out.findings.append(note("topic", f"{what}: not joint targets, left out"))
                 continue
             out.columns |= {f"{kind}.{j}": x[:, k] for k, j in enumerate(own)}
     if not any(k.startswith("time") for k in out.columns) and rate:
         length = max((len(x) for x in out.columns.values()), default=0)
         out.columns["time"] = np.arange(length) / rate
-        out.findings.append(_info(f"{NOMINAL} ({rate:g} Hz)"))
+        out.findings.append(note("topic", f"{NOMINAL} ({rate:g} Hz)", "info"))
     return out
-
-
-def _info(text: str, severity: str = "info") -> Finding:
-    return Finding("topic", "", float("nan"), 1, text, severity)
 
 
 # -- the readers ------------------------------------------------------------------------------------------------------
@@ -261,7 +257,7 @@ class LeRobot:
         nominal = np.abs(stamps - stamps[0] - (frames - frames[0]) / fps).max() < 0.01 / fps
         out.columns["time"] = frames / fps if nominal else stamps  # stored as float32
         if nominal:
-            out.findings.append(_info(f"{NOMINAL} ({fps:g} Hz)"))
+            out.findings.append(note("topic", f"{NOMINAL} ({fps:g} Hz)", "info"))
         if info.get("robot_type"):
             out.meta["robot"] = str(info["robot_type"])
         return out

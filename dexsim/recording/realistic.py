@@ -60,11 +60,11 @@ def realistic(
     q = recording.states.position
     t = sample_times(float(q.t[0]), float(q.t[-1]), rng, hardware)
     meta, notes = dict(recording.meta), [recording.meta.get("notes", "")]
-    position = _at(q, t)
+    position = Series(t, q.at(t), q.topic, t.copy())
     position.value = np.round(position.value / hardware.position_lsb) * hardware.position_lsb
     effort = None
-    if recording.states.effort is not None:
-        effort = _at(recording.states.effort, t)
+    if (dense := recording.states.effort) is not None:
+        effort = Series(t, dense.at(t), dense.topic, t.copy())
         value = effort.value * recording.effort_sign
         if recording.effort_is == "torque_Nm":
             scale = np.asarray(np.nan if current_per_torque is None else current_per_torque, float)
@@ -79,7 +79,7 @@ def realistic(
     out = replace(recording, states=States(position, None, effort), meta=meta)
     newtons = recording.tactile_newtons()
     if newtons is not None:
-        held = _latest(newtons, t)
+        held = newtons.latest(t)
         counts = np.round(held.value * np.array(hardware.axis_sign) / hardware.taxel_lsb)
         held.value = np.clip(counts, [-128, -128, 0], [127, 127, 255])
         out.tactile = held
@@ -92,17 +92,5 @@ def realistic(
     meta["notes"] = "; ".join(n for n in notes if n)
     for name in ("temperature", "duty", "enabled", "supply_voltage"):
         if (series := getattr(recording, name)) is not None:
-            setattr(out, name, _latest(series, t))
+            setattr(out, name, series.latest(t))
     return out
-
-
-def _at(series: Series, t: np.ndarray) -> Series:
-    """Interpolate linearly between samples."""
-    value = np.stack([np.interp(t, series.t, column) for column in series.value.T], 1)
-    return Series(t, value, series.topic, t.copy())
-
-
-def _latest(series: Series, t: np.ndarray) -> Series:
-    """Return the last sample at each time."""
-    i = np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, None)
-    return Series(t, series.value[i].copy(), series.topic)

@@ -15,6 +15,7 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.hand import Hand
+from dexsim.recording import smooth
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 TEMPERATURES, DUTY, ENABLED = "/joint_temperatures", "/joint_duty", "/joint_enabled"
@@ -82,6 +83,11 @@ class Finding:
     end: float = float("nan")
 
 
+def note(kind: str, text: str, severity: str = "warning", topic: str = "", count: int = 1) -> Finding:
+    """Return a finding of no time of its own."""
+    return Finding(kind, topic, float("nan"), count, text, severity)
+
+
 COMMANDS_FIX = (
     f"log what each joint is asked for in {COMMANDS} (in a CSV: a column command.JOINT); where it has another name say "
     f"remap.{COMMANDS}=TOPIC (in a CSV: remap.command.JOINT=COLUMN)"
@@ -119,6 +125,15 @@ class Series:
         return replace(
             self, t=self.t[which], value=self.value[which], stamp=part(self.stamp), carried=part(self.carried)
         )
+
+    def at(self, t: np.ndarray, held: bool = False) -> np.ndarray:
+        """Return the values [n, J] at times t [n] s: see `smooth.at`."""
+        return np.stack([smooth.at(t, self.t, x, held) for x in self.value.T], 1)
+
+    def latest(self, t: np.ndarray) -> Series:
+        """Return the last sample, whatever it holds, at each of the times t [n] s."""
+        last = self.value[np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, None)]
+        return Series(t, last, self.topic, t.copy(), self.frame)
 
     def finding(
         self, kind: str, text: str, severity: str = "warning", joint: str = "", at: Any = None, count: int | None = None
@@ -178,6 +193,15 @@ class Recording:
     hand: Hand | None = None
     guessed: dict[str, str] = field(default_factory=dict)
 
+    def series(self) -> dict[str, Series]:
+        """Return what was recorded, by name."""
+        s = self.states
+        found = {"command": self.commands, "position": s.position, "velocity": s.velocity, "effort": s.effort,
+                 "temperature": self.temperature, "duty": self.duty, "enabled": self.enabled,
+                 "supply voltage": self.supply_voltage, "tactile": self.tactile, "external force": self.external_force,
+                 "object pose": self.object_pose, "imu": self.imu}  # fmt: skip
+        return {name: x for name, x in found.items() if x is not None and len(x)}
+
     @property
     def duration(self) -> float:
         """Time of the last command or state [s]."""
@@ -192,12 +216,8 @@ class Recording:
         counts = np.maximum(np.ceil(np.diff(c.t) / step - 1e-6).astype(int), 1)
         t = np.r_[np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in zip(c.t, c.t[1:], counts,
                                                                                           strict=False)]), c.t[-1]]
-        value = np.full((len(t), c.value.shape[1]), np.nan)
-        for j, x in enumerate(c.value.T):
-            ok = np.isfinite(x)
-            if ok.any():
-                value[:, j] = np.where(t >= c.t[ok][0] - 1e-9, np.interp(t, c.t[ok], x[ok]), np.nan)
-        return Series(t, value, c.topic)
+        first = c.t[np.isfinite(c.value).argmax(0)]
+        return Series(t, np.where(t[:, None] >= first - 1e-9, c.at(t), np.nan), c.topic)
 
     def parts(self) -> list[Recording]:
         """Return the recording as one for each group of joints that are told of in the same messages, without the

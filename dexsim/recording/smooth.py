@@ -5,6 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 
+def at(t: np.ndarray, times: np.ndarray, x: np.ndarray, held: bool = False) -> np.ndarray:
+    """Return a signal x [T] of `times` [T] s at t [n] s: on straight lines between its numbers, or (`held`) the last
+    one; the first before it; NaN where it has none."""
+    ok = np.isfinite(x) & np.isfinite(times)
+    if not ok.any():
+        return np.full(len(t), np.nan)
+    times, x = times[ok], x[ok]
+    return x[np.clip(np.searchsorted(times, t, side="right") - 1, 0, None)] if held else np.interp(t, times, x)
+
+
 class LocalPolynomial:
     """Value and first two time derivatives of signals at t [S] s by weighted least squares in a window of +- width s.
 

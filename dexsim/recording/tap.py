@@ -19,6 +19,7 @@ from dexsim.actuator.kernel import EXTENDED, FRESH
 from dexsim.actuator.laws import encoder_error, encoder_line
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
+from dexsim.console.folders import make
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
 from dexsim.recording.schema import COMMANDS, DEFAULTS, IMU, OBJECT_POSE, STATES, TACTILE, Recording, Series, States
@@ -226,37 +227,23 @@ class PlayRecorder:
             track.finish()
         return [self._recording(track) for track in self.tracks if track.episode.times]
 
-    @staticmethod
-    def place(path: str | Path) -> Path:
-        """Return `path` as a file that can be written, its folder made. Raises UserError: before a long play, rather
-        than after it."""
-        path = Path(path).expanduser()
-        path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
-        there = path.exists()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with open(path, "ab"):
-                pass
-            if not there:
-                path.unlink()
-        except OSError as error:
-            raise UserError(f"record={path}: cannot be written: {error.strerror}; choose another place") from None
-        return path
-
     def claim(self, path: str | Path) -> None:
-        """Check that what `save` would write can be written, and is not there yet. Raises UserError."""
-        for to in self._paths(self.place(path)).values():
+        """Check that what `save` would write can be written, and is not there yet. Raises UserError: before a long
+        play, rather than after it."""
+        make(outputs.mcap(path).parent, "record=")
+        for to in self._paths(path).values():
             outputs.new(to, "record=")
 
-    def _paths(self, path: Path) -> dict[int, Path]:
+    def _paths(self, path: str | Path) -> dict[int, Path]:
         """Return world -> its file."""
+        path = outputs.mcap(path)
         if len(self.tracks) == 1:
             return {self.tracks[0].world: path}
         return {t.world: path.with_name(f"{path.stem}_w{t.world}.mcap") for t in self.tracks}
 
     def save(self, path: str | Path, realistic: bool = False, seed: int = 0) -> list[Path]:
         """Write `path` (several worlds: NAME_w0.mcap, ...), like the hardware would have seen it if `realistic`."""
-        path = self.place(path)
+        make(outputs.mcap(path).parent, "record=")
         out = []
         for k, recording in enumerate(self.recordings()):
             if realistic:
