@@ -25,7 +25,7 @@ settings (key=default):
   kinds=all         comma-separated: triangles, ladder, chirp, steps, holds, random
   model=            MuJoCo or URDF file of another mechanism, or a hand's folder (default: hand=)
   hand=xhand        a hand that comes with dexsim, or a folder
-  hand_mirror=false its mirror image: a left hand of a right one
+  hand_mirror=false   its mirror image: a left hand of a right one
   servo=            servo.yaml believed of its drives (default: the hand's)
   seed=0            of the order and the random motion
   rate=100          commands a second
@@ -37,6 +37,7 @@ settings (key=default):
   clearance=0.002   m between bodies that are not neighbours
   gravity=          in the model's frame, e.g. gravity="0 0 -9.81": how the hand is mounted (default: the model's)
 """
+KEYS = typed.defaults(USAGE) | {"out": ""}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -44,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
-    given = typed.settings(argv, KEYS)
+    given = KEYS | typed.settings(argv, KEYS)
 
     from dexsim import files, outputs
     from dexsim.recording.excitation import FILES, Limits, plan, write_plan
@@ -52,24 +53,25 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.recording.schema import numbers
     from dexsim.sim.quiet import quiet_warp
 
-    if not given.get("out"):
+    if not given["out"]:
         raise UserError("say where to write: out=DIR")
     quiet_warp("cpu")
-    gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
-    hand = stated_hand(given.get("hand"), typed.truth("hand_mirror", given.get("hand_mirror", "false")))
-    if hand is not None and given.get("model"):
+    gravity = numbers(given["gravity"], 3, "gravity", "excite") if given["gravity"] else None
+    named = any(a.startswith("hand=") for a in argv)
+    hand = stated_hand(given["hand"] if named else None, typed.truth("hand_mirror", given["hand_mirror"]))
+    if hand is not None and given["model"]:
         raise UserError(f"model={given['model']}: is not moved beside hand=; say one of them")
-    m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity, hand=hand)
+    m = mechanism(given["model"] or None, given["servo"] or None, gravity=gravity, hand=hand)
     limits = Limits(
-        **{k: typed.number(k, given[k]) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
+        **{k: typed.number(k, given[k]) for k in ("speed", "torque", "margin", "clearance", "current") if given[k]}
     )
-    seed, rate, repeats = (_within(given, k) for k in RANGES)
+    seed, repeats = typed.whole("seed", given["seed"]), typed.whole("repeats", given["repeats"], 0, 20)
     out = files.place(given["out"])
     outputs.claim(out, "out=", FILES)
     start = time.perf_counter()
     p = plan(
-        m, _list(given, "joints"), _list(given, "kinds"), int(seed), rate, limits, int(repeats),
-        say=lambda text: print(f"  {text}", flush=True),
+        m, _list(given["joints"]), _list(given["kinds"]), seed, typed.number("rate", given["rate"], 20, 5000), limits,
+        repeats, say=lambda text: print(f"  {text}", flush=True),
     )  # fmt: skip
     print(f"\n{'start s':>9}{'end s':>9}  {'kind':<11}{'scale':>6}  joints")
     for s in p.segments:
@@ -100,23 +102,5 @@ def _current(m: Any, peaks: Any) -> str:
     return f" ({most:.2f} A{'' if known else ', with current_per_torque assumed'})" if np.isfinite(most) else ""
 
 
-KEYS = (
-    "out", "joints", "kinds", "model", "hand", "hand_mirror", "servo", "seed", "rate", "repeats", "speed", "torque",
-    "current", "margin", "clearance", "gravity",
-)  # fmt: skip
-
-
-RANGES: dict[str, tuple[float, float, float, bool]] = {
-    "seed": (0, 0, 2**63, True), "rate": (100.0, 20.0, 5000.0, False), "repeats": (1, 0, 20, True)
-}  # fmt: skip
-"""Of numbers that are no limit of the motion: what they are where nothing is said, lowest, highest, whether whole."""
-
-
-def _list(given: dict[str, str], key: str) -> list[str] | None:
-    value = given.get(key, "all")
+def _list(value: str) -> list[str] | None:
     return None if value in ("all", "") else [v.strip() for v in value.split(",") if v.strip()]
-
-
-def _within(given: dict[str, str], key: str) -> float:
-    default, low, high, whole = RANGES[key]
-    return typed.number(key, given.get(key, default), low, high, exact=whole)

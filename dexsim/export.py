@@ -10,7 +10,7 @@ from typing import Any
 
 from dexsim import files
 from dexsim.errors import UserError
-from dexsim.typed import settings, truth, whole
+from dexsim.typed import defaults, settings, truth, whole
 
 USAGE = """usage: dexsim export checkpoint=FILE out=DIR [key=value ...]
        dexsim export check=DIR
@@ -34,7 +34,7 @@ settings (key=default):
   agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class);
                       typed here, its code runs
 """
-KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed", "mirror", "task")
+KEYS = defaults(USAGE)
 TOLERANCE = 1e-5
 OPSET = 17
 
@@ -53,14 +53,14 @@ def main(argv: Sequence[str]) -> int:
         if len(given) > 1:
             raise UserError("check=DIR goes alone")
         return 0 if check(given["check"]) else 1
+    typed = frozenset((k, v) for k, v in given.items() if k.startswith("agent."))
+    given = KEYS | given
     for key in ("checkpoint", "out"):
-        if not given.get(key):
+        if not given[key]:
             raise UserError(f"say {key}=... (dexsim export --help)")
     out = export(
-        given["checkpoint"], given["out"], given.get("calibration"),
-        whole("steps", given.get("steps", "64"), 2, 100_000), whole("seed", given.get("seed", "0")),
-        frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
-        truth("mirror", given.get("mirror", "false")),
+        given["checkpoint"], given["out"], given["calibration"] or None, whole("steps", given["steps"], 2, 100_000),
+        whole("seed", given["seed"]), typed, truth("mirror", given["mirror"]),
     )  # fmt: skip
     return 0 if check(out) else 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Collection, Iterable
 from typing import Annotated, Any, TypeVar
 
@@ -51,6 +52,11 @@ def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:
     if value is None or not low <= value <= high:
         raise UserError(f"{key}={text}: must be a whole number from {low} to {high}")
     return value
+
+
+def defaults(page: str) -> dict[str, str]:
+    """Return the settings that a help page lists, each with its default: lines such as `  seed=0   of the order`."""
+    return dict(re.findall(r"^  (\w+)=(\S*)(?=  |$)", page, re.M))
 
 
 def settings(argv: Iterable[str], keys: Collection[str], also: tuple[str, ...] = ()) -> dict[str, str]:

@@ -100,6 +100,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path, name):
         "/hand/commands/data[0]": ("command", "0", ""), "field.position2": ("position", "2", ""),
         "obs.q.a": ("position", "a", ""), "position.s": ("position", "s", ""),
         "time_s": ("time", "", "s"), "Soll a [°]": ("command", "a", "°"), "duty [1]": ("duty", "", "1"),
+        "Moment a [Nm]": ("effort", "a", "nm"),
         "position.a [%]": ("position", "a", "%"), "a_pos_pct": ("position", "a", "pct"),
         "current_position_elbow": ("position", "elbow", ""), "observation.velocity.a": ("velocity", "a", ""),
     }.items(),

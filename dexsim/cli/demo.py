@@ -22,7 +22,7 @@ settings (key=default):
   browser=true      open both pages; false: only say where they are
   seconds=          end by itself after this many
 """
-KEYS = {"policy": "grasp", "out": "out/demo", "port": "", "browser": "true", "seconds": ""}
+KEYS = typed.defaults(USAGE)
 
 
 def main(argv: list[str]) -> int:

@@ -62,8 +62,7 @@ safety (key=default):
   recover=false       home again when readings are good again, instead of ending
 """
 SECOND = ("second", "second_serial", "second_place", "second_calibration")
-OWN = (*SECOND, "bundle", "driver", "port", "serial", "ros2", "ros2_message", "ros2_effort", "calibration", "record",
-       "vision", "place", "imu", "shape", "seed", "task")  # fmt: skip
+OWN = (*SECOND, *typed.defaults(USAGE), "task")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -395,7 +394,7 @@ def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
     from dexsim.deploy.loop import LoopSettings
 
     fields = {f.name: str(f.type) for f in dataclasses.fields(LoopSettings) if f.name != "home"}
-    given = typed.settings(argv, (*OWN, *fields))
+    given = typed.settings(argv, dict.fromkeys((*OWN, *fields)))
     changes: dict[str, Any] = {}
     for key in [k for k in given if k in fields]:
         value, kind = given.pop(key), fields[key]

@@ -54,9 +54,7 @@ examples:
   dexsim deploy check port=fake:press=11 excite_current=1500 yes=true out=out/rehearsal
   dexsim deploy check bundle=out/bundle
 """
-KEYS = {"driver": "xhand", "port": "auto", "serial": "", "hand_mirror": "false", "bundle": "", "current": "100",
-        "excite_current": "300", "joints": "", "steps": "", "kinds": "steps,chirp", "limit": "300", "yes": "false",
-        "out": "out/check", "seed": "0"}  # fmt: skip
+KEYS = typed.defaults(USAGE)
 PERIOD, STALE = 0.01, 0.12
 DRIVE = {"kp": "N.m/rad", "kd": "N.m.s/rad", "torque_limit": "N.m", "no_load_speed": "rad/s", "delay": "s",
          "coulomb_friction": "N.m"}  # fmt: skip

@@ -28,7 +28,7 @@ settings (key=default):
 example:
   dexsim record ros2=/joint_states,/joint_commands out=a.mcap seconds=60
 """
-KEYS = ("ros2", "out", "seconds", "effort", "robot", "gravity")
+KEYS = typed.defaults(USAGE)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -36,12 +36,12 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
-    given = {"effort": "torque_Nm", "seconds": "inf"} | typed.settings(argv, KEYS)
+    given = KEYS | typed.settings(argv, KEYS)
     for key in ("ros2", "out"):
         if not given.get(key):
             raise UserError(f"say {key}= (dexsim record --help)")
     typed.one_of("effort", given["effort"], ("torque_Nm", "current_A", "none"))
-    seconds = typed.real(given["seconds"])
+    seconds = typed.real(given["seconds"] or "inf")
     if not seconds > 0:
         raise UserError(f"seconds={given['seconds']}: must be a number above 0")
     from dexsim import outputs
@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
                 return
             joints[:] = names
             meta = {"source": "real", "effort_is": given["effort"], "effort_sign": "1"}
-            meta |= {k: given[k] for k in ("robot", "gravity") if k in given}
+            meta |= {k: given[k] for k in ("robot", "gravity") if given[k]}
             recorder = Recorder(path, joints, meta, None, now)
         q = array(position, names)
         if q is not None:

@@ -47,7 +47,8 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
     "position": ("measured", "measured_value", "actual", "present", "feedback", "encoder", "qpos", "observation", "ist",
                  *_PLACES, *_both(_SEEN)),
     "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq", "qvel", "dof_vel"),
-    "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
+    "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque", "moment",
+               "drehmoment", "strom"),
     "temperature": ("temperature", "temp", "present_temperature"),
     "duty": ("duty", "pwm", "duty_cycle", "present_pwm"),
     "enabled": ("enabled", "enable", "torque_enable", "torque_enabled"),
@@ -68,7 +69,7 @@ def _patterns(word: str) -> tuple[re.Pattern[str], ...]:
 
 _PATTERNS = {(w, q): _patterns(w) for w, q in _WORDS}
 _TIME_FIRST = dict(sorted(_PATTERNS.items(), key=lambda x: x[0][1] != "time"))
-_CURRENT = ("current", "present_current", "motor_current")
+_CURRENT = ("current", "present_current", "motor_current", "strom")
 _CLOCKS = ("elapsed", "epoch", "timestamp", "time", "stamp", "datetime", "date")
 """Words in the name of a column that may be a time where none is called so."""
 _NAMED = ("joint", "joint_name", "name", "motor", "motor_name", "servo", "joint_id", "motor_id", "servo_id")

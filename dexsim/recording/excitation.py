@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.recording import safety
 from dexsim.recording.mechanism import Mechanism, Run, drive, recorded
@@ -277,10 +278,8 @@ def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Li
         ("speed", 0.01, 1.0), ("torque", 0.01, 1.0), ("margin", 0.0, 0.4), ("clearance", 0.0, 0.05),
         ("current", 1e-3, 1e3),
     ):  # fmt: skip
-        if getattr(limits, name) is None:
-            continue
-        if not low <= getattr(limits, name) <= high:
-            raise UserError(f"{name}={getattr(limits, name)}: must lie in [{low}, {high}]")
+        if (value := getattr(limits, name)) is not None:
+            typed.number(name, value, low, high)
 
 
 def _range(m: Mechanism, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
