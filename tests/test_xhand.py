@@ -587,8 +587,8 @@ def with_another(b, monkeypatch, posture=0.3, seconds=1.5, **faults):
     monkeypatch.setattr(package, "posture", posture)
     package.log.clear()
     settings = LoopSettings(seconds=seconds, tor_max=300.0, home_speed=3.0)
-    loop = Watched(b, VendorXHand("auto", clock, package, side="right"), FixedPlace([0.055, 0.0, 0.04]),
-                   Calibration.default(), settings, clock)  # fmt: skip
+    driver = VendorXHand("auto", clock, lambda _: package, side="right")
+    loop = Watched(b, driver, FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings, clock)
     return loop.run(), package, loop
 
 
