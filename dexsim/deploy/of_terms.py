@@ -149,7 +149,7 @@ def parts(env: Task) -> dict[str, Any]:
     env.sampler.width.fill_(0.0)  # the middle of every range
     env.reset_all()
     env.sampler.width.copy_(width)
-    out = {
+    out: dict[str, Any] = {
         "initial_pose": floats(env.q[0]), "rates": {}, "normalization": {},
         "terms": {
             "signals": {name: int(np.prod(of.shapes[name], dtype=int)) for name in of.names},
