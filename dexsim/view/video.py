@@ -63,7 +63,7 @@ def clips_of(frames: dict[str, Any]) -> list[Clip]:
         labels = frames.get("label")
         clips.append(Clip(model, np.asarray(qpos, np.float64), labels[k] if labels else "",
                           _array(overlay.get("force")), _array(overlay.get("command")),
-                          tuple(overlay.get("text") or ()), _array(overlay.get("push")), _array(overlay.get("taxels")),
+                          tuple(overlay.get("text", ())), _array(overlay.get("push")), _array(overlay.get("taxels")),
                           overlay.get("layout"), _array(overlay.get("gravity")), bool(frames.get("colours")), True))
     return clips
 
