@@ -36,7 +36,7 @@ def answer(radius: float, half: float, corners: np.ndarray) -> tuple[float, np.n
     halfway between their nearest points in m), in the cylinder's frame: axis z, radius and half length in m, corners
     [n, 3] of the polytope."""
     edges, triangles = features(corners)
-    dist, u, x = _apart(radius, half, corners, edges, triangles)
+    dist, u, x = _separate(radius, half, corners, edges, triangles)
     if dist > 1e-12 and not _crosses(radius, half, u, corners):
         return dist, u, x - 0.5 * dist * u
     dist, u = _overlapping(radius, half, corners, edges, triangles)
@@ -76,7 +76,7 @@ def _crosses(radius: float, half: float, u: np.ndarray, corners: np.ndarray) -> 
     return bool((corners @ u).min() < (_furthest(radius, half, u) @ u) - 1e-9)
 
 
-def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray, np.ndarray]:
+def _separate(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the distance, direction, and the polytope's nearest point."""
     found = [corners]
     if len(edges):

@@ -33,9 +33,9 @@ def _joint(name: str, parent: str, child: str, at: str, axis: str, low: float, h
     )
 
 
-def urdf(mesh: str = "meshes/tip.stl", left: bool = False) -> str:
+def urdf(mesh: str = "meshes/tip.stl", mirrored: bool = False) -> str:
     """Return the text: x along the fingers, z out of the palm, the thumb at negative y (a right hand) or mirrored."""
-    s = -1 if left else 1
+    s = -1 if mirrored else 1
     out = ['<robot name="claw">']
     out.append(
         '<link name="base">' + _inertial(0.3, (0.09, 0.09, 0.024), (0, 0, 0))
@@ -83,12 +83,12 @@ def tip(path: Path, hole: bool = False, scale: float = 1.0) -> None:
     mesh.export(path)
 
 
-def write(folder: Path, left: bool = False, mesh: str = "meshes/tip.stl") -> Path:
+def write(folder: Path, mirrored: bool = False, mesh: str = "meshes/tip.stl") -> Path:
     """Return the hand's file with its mesh; returns the URDF's path."""
     folder.mkdir(parents=True, exist_ok=True)
     tip(folder / mesh.removeprefix("package://claw/"))
     path = folder / "claw.urdf"
-    path.write_text(urdf(mesh, left))
+    path.write_text(urdf(mesh, mirrored))
     return path
 
 

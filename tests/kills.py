@@ -109,15 +109,15 @@ class Train:
         self.k += 1
         out = self.folder / f"run{self.k}"
         begun = self.iteration
-        told = int(killed(lambda shared: self._train(out, shared), after, rng.random() < 0.7).read()[1])
+        noted = int(killed(lambda shared: self._train(out, shared), after, rng.random() < 0.7).read()[1])
         last = out / "last.pt"
         if not last.exists():
-            assert not told, f"saved after iteration {told}, and nothing is there"
+            assert not noted, f"saved after iteration {noted}, and nothing is there"
             return "before the first save"
         for path in sorted(out.glob("*.pt")):
             data = checkpoint.load(path)
         data = checkpoint.load(last)
-        assert data["iteration"] >= max(told, begun), f"{last}: iteration {data['iteration']}, {told} was saved"
+        assert data["iteration"] >= max(noted, begun), f"{last}: iteration {data['iteration']}, {noted} was saved"
         assert data["steps"] == data["iteration"] * 24 * 4, "steps do not fit the iterations"
         rows = [int(r["iteration"]) for r in csv.DictReader(open(out / "progress.csv"))]
         assert rows[: data["iteration"]] == list(range(1, data["iteration"] + 1)), (
@@ -168,16 +168,16 @@ class Record:
 
         self.k += 1
         path = self.folder / f"{self.k}.mcap"
-        told = killed(lambda shared: self._loop(path, shared), after, True).times()
+        noted = killed(lambda shared: self._loop(path, shared), after, True).times()
         try:
             t = read(path, audit=False).states.position.t
         except UserError as error:
-            assert (not len(told) or told[-1] < CHUNK) and "\n" not in str(error), f"{told[-1]:.2f} s recorded: {error}"
+            assert (not len(noted) or noted[-1] < CHUNK) and "\n" not in str(error), f"{noted[-1]:.2f} s: {error}"
             return "before the first chunk"
-        both = min(len(t), len(told))  # it may be killed between a sample and the word of it
-        assert np.allclose(t[:both], told[:both], rtol=0, atol=1e-6) and len(t) <= both + 1, "samples are gone"
-        lost = told[both:]
-        assert not len(lost) or lost[-1] - lost[0] < CHUNK, f"of {told[-1]:.2f} s all from {lost[0]:.2f} s on is gone"
+        both = min(len(t), len(noted))  # it may be killed between a sample and the word of it
+        assert np.allclose(t[:both], noted[:both], rtol=0, atol=1e-6) and len(t) <= both + 1, "samples are gone"
+        lost = noted[both:]
+        assert not len(lost) or lost[-1] - lost[0] < CHUNK, f"of {noted[-1]:.2f} s all from {lost[0]:.2f} s on is gone"
         path.unlink()
         return "kept"
 
@@ -194,14 +194,14 @@ class Record:
         clock, made = Clock(), bundle.load(self.bundle)
         message, first = Writer._message, []
 
-        def told(self, topic, t, data):
+        def noted(self, topic, t, data):
             message(self, topic, t, data)
             first.append(t)
             if topic == schema.STATES:
                 shared.add(t - first[0])  # readers count from the first sample
             shared.tell(1.0)
 
-        Writer._message = told
+        Writer._message = noted
         recorder = Recorder(path, made.manifest["joints"], {"effort_is": "current_A"}, None, clock.now())
         # this machine is shared: a loop that is late is another test's
         settings = loop.LoopSettings(seconds=1000.0, tor_max=300.0, late=10.0, stale=10.0, hang=10.0, overruns=1000000)

@@ -24,8 +24,8 @@ class Added:
     """An effect that dexsim does not have. column: the rest of its line; law: its functions, before the line `above`;
     terms, reference: (the line before which, what is added) in `laws.py` and `reference.py`; family: the file of its
     entry; entry: of its class, what no other has; hidden: its size in the demo; torque, friction: that it adds [N.m] at
-    rest at 1 rad, the target 0.1 rad off and 1 remembered; left: share of the torque left over that may stay; believed:
-    of the demo's drive, where its own would hardly show the effect; alone: a demo of one joint can show it."""
+    rest at 1 rad, the target 0.1 rad off and 1 remembered; remaining: share of the torque that may stay; believed: of
+    the demo's drive, where its own would hardly show the effect; alone: a demo of one joint can show it."""
 
     effect: str
     words: str
@@ -42,7 +42,7 @@ class Added:
     hidden: float
     torque: float = 0.0
     friction: float = 0.0
-    left: float = 0.5
+    remaining: float = 0.5
     high: float = 1.0
     more: str = ""
     believed: dict[str, float] = field(default_factory=dict)
@@ -188,7 +188,7 @@ def tilted(size: Any, q: Any):
 '''),),
     "signals", "((0.03,), (0.1,))", 'np.abs(np.sin(2 * case.regimes["position"]))', 0.12,
     # the loop's own torque holds against it: what gravity and friction are at the true pose is little
-    torque=-2.0 * 0.12 * np.sin(2.0), left=1.0, high=0.3, more="misreads = True",
+    torque=-2.0 * 0.12 * np.sin(2.0), remaining=1.0, high=0.3, more="misreads = True",
 )  # fmt: skip
 LOOP = Added(  # of its error
     "soft_dead_zone", "hardly acts on small errors", "dead_zone", "rad", '0.05, "of errors", feature="dead_zone"',
@@ -297,7 +297,7 @@ def weary(share: Any, worked: Any):
         efficiency = efficiency / (1.0 + p["weary"] * step.memory["worked"])
 '''),),
     "drive", "((0.3,), (1.0,), (3.0,))", CHANGES, 4.0,
-    torque=2.0 * 0.1 * (1.0 / 5.0 - 1.0), high=10.0, left=0.8,
+    torque=2.0 * 0.1 * (1.0 / 5.0 - 1.0), high=10.0, remaining=0.8,
 )  # fmt: skip
 TENDON = Added(  # by another joint
     "soft_tendon", "is dragged by a tendon that gives", "tendon", "1/rad", '0.3, "drag", feature="rare"',
@@ -416,7 +416,7 @@ def grown(tmp_path_factory) -> Path:
     return folder
 
 
-def told(folder: Path, *command: str) -> str:
+def printed(folder: Path, *command: str) -> str:
     """Return what a Python command prints with the copy."""
     env = os.environ | {"PYTHONPATH": str(folder)}
     done = subprocess.run([sys.executable, *command], cwd=folder, env=env, capture_output=True, text=True)
@@ -439,7 +439,7 @@ def test_every_kind_of_law_is_added_in_the_places_that_the_docs_name():
 
 @pytest.mark.slow
 def test_kernel_and_reference_agree_on_what_was_added(grown):
-    compared = told(grown, "-m", "pytest", "-q", "-p", "no:xdist", "test_servo.py", "-k", "agrees and all_features")
+    compared = printed(grown, "-m", "pytest", "-q", "-p", "no:xdist", "test_servo.py", "-k", "agrees and all_features")
     assert "4 passed" in compared  # both drives, in either precision
 
 
@@ -448,7 +448,7 @@ def test_kernel_and_reference_agree_on_what_was_added(grown):
 def test_an_effect_is_added_by_its_column_its_law_and_its_entry(grown, added):
     """Drawn for training, planted by the engine that trains, found, sized, taken for explained, written to servo.yaml
     and shown on the page."""
-    answer = told(grown, "tried.py", added.effect, added.name, json.dumps(added.believed))
+    answer = printed(grown, "tried.py", added.effect, added.name, json.dumps(added.believed))
     (said,) = (json.loads(x) for x in answer.splitlines() if x.startswith("{"))
     out = grown / added.effect
     first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]
@@ -457,7 +457,7 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(grown, added):
     assert said["torque"] == pytest.approx(added.torque, rel=1e-3, abs=1e-9)
     assert said["friction"] == pytest.approx(added.friction, rel=1e-3, abs=1e-9)
     assert first["effect"] == added.effect and found == pytest.approx(added.hidden, rel=0.1)
-    assert said["left"][1] < added.left * said["left"][0]  # what it explains is not left to a stand-in
+    assert said["left"][1] < added.remaining * said["left"][0]  # what it explains is not left to a stand-in
     assert said["drawn"] == [pytest.approx(0.02, abs=1e-3), pytest.approx(0.06, abs=1e-3)]
     assert said["row"] == pytest.approx(found, rel=1e-3)
     assert added.words in (out / "report.html").read_text(encoding="utf-8")

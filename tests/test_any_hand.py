@@ -181,12 +181,12 @@ def test_held_poses_hold(hands):
 
 
 def test_held_poses_are_looked_for_where_there_are_none(tmp_path, monkeypatch):
-    folder, asked = made_hand(tmp_path / "made", pads=False), []
+    folder, wanted = made_hand(tmp_path / "made", pads=False), []
     from dexsim.tasks import make_grasps
     from dexsim.tasks.stable_grasps import GraspSet
 
     def instead(cfg, count, worlds, seed, sizes, report=print):
-        asked.append((count, sizes))
+        wanted.append((count, sizes))
         row = torch.zeros(count, 9)
         pose = torch.tensor([0.03, 0.0, 0.08, 1.0, 0, 0, 0]).repeat(count, 1)
         return GraspSet(torch.full((count,), 0.04), row, row, pose)
@@ -194,7 +194,7 @@ def test_held_poses_are_looked_for_where_there_are_none(tmp_path, monkeypatch):
     monkeypatch.setattr(make_grasps, "generate", instead)
     for _ in range(2):
         make_env(config(folder, "rotate"), 4, "cpu", 1, "mujoco")
-    assert len(asked) == 1 and asked[0][1] == pytest.approx((0.036, 0.048)) and (folder / "held_cubes.npz").is_file()
+    assert len(wanted) == 1 and wanted[0][1] == pytest.approx((0.036, 0.048)) and (folder / "held_cubes.npz").is_file()
 
 
 @pytest.mark.slow

@@ -194,15 +194,15 @@ def test_the_predicted_precision_holds_over_repeats():
         for r in runs:
             r.smooth()
         case = build(test_gap.model(), runs)[0]
-        told = [x for x in information.informed(case) if x.possible and x.figure.column != "backlash"]
-        plant, x = case.plant, np.zeros(len(told))
+        stated = [x for x in information.informed(case) if x.possible and x.figure.column != "backlash"]
+        plant, x = case.plant, np.zeros(len(stated))
         base, windows = plant.base(), plant.windows(information.WINDOW)
         change = [t.figure.step * base[..., INDEX[t.figure.column]] if t.figure.relative
-                  else information.own_step(t.figure, case) for t in told]  # fmt: skip
+                  else information.own_step(t.figure, case) for t in stated]  # fmt: skip
 
-        def row(x, told=told, base=base, change=change):
+        def row(x, stated=stated, base=base, change=change):
             out = base.copy()
-            for t, by, share in zip(told, change, x, strict=True):
+            for t, by, share in zip(stated, change, x, strict=True):
                 out[..., INDEX[t.figure.column]] += share * by
             return out
 
@@ -211,8 +211,8 @@ def test_the_predicted_precision_holds_over_repeats():
             J, miss = (q[1:] - q[0]).T / 0.2, plant.q[windows.sample_row] - q[0]
             x = x + np.linalg.lstsq(J - J.mean(0), miss - miss.mean(), rcond=None)[0]
         fits.append(x)
-    spread, predicted = np.std(fits, 0, ddof=1), np.array([t.steps for t in told])
-    names = {t.figure.words for t in told}
+    spread, predicted = np.std(fits, 0, ddof=1), np.array([t.steps for t in stated])
+    names = {t.figure.words for t in stated}
     assert {"stiffness", "inertia", "dry friction", "delay"} <= names and "viscous friction" not in names
     assert (spread < predicted).all() and (spread > 0.1 * predicted).all(), (names, predicted / spread)
 

@@ -65,13 +65,13 @@ class Spoiled(FakeHand):
 
     def __init__(self, clock, spoil=None, at=0.3):
         super().__init__(clock, start=0.05)
-        self.spoil, self.at, self.since, self.kept = spoil, at, None, []
+        self.spoil, self.at, self.since, self.held = spoil, at, None, []
 
     def read(self):
         state, now = super().read(), self.clock.now()
         if self.spoil and (self.at is None or (self.begun and now >= self.begun + self.at)):
             self.since = now if self.since is None else self.since
-            state = self.spoil(state, now, self.kept) or state
+            state = self.spoil(state, now, self.held) or state
         return state
 
 
@@ -118,7 +118,7 @@ def check_sent(hand, guard):
 def change(**fields):
     """Return a spoiler that sets these fields of a reading; a function gets (old value, now)."""
 
-    def spoil(state, now, kept=None):
+    def spoil(state, now, held=None):
         for name, value in fields.items():
             setattr(state, name, value(getattr(state, name), now) if callable(value) else value)
 
@@ -132,9 +132,9 @@ def one(value, joint=4):
 def frozen(**fields):
     """Return the same reading again and again, with these fields changed."""
 
-    def spoil(state, now, kept):
-        kept.append(dataclasses.replace(state))
-        again = dataclasses.replace(kept[0])
+    def spoil(state, now, held):
+        held.append(dataclasses.replace(state))
+        again = dataclasses.replace(held[0])
         change(**fields)(again, now)
         return again
 
@@ -222,7 +222,7 @@ def test_taxels_that_are_gone_relax_the_hand(b):
 def test_one_bad_reading_in_ten_is_left_out_and_counted(b):
     hand = Spoiled(
         VirtualClock(100.0),
-        lambda state, now, kept: change(position=one(1e9))(state, now) if state.sequence % 10 == 0 else None,
+        lambda state, now, held: change(position=one(1e9))(state, now) if state.sequence % 10 == 0 else None,
         at=None,
     )
     report = run(b, hand)
@@ -640,19 +640,19 @@ def test_a_flood_of_the_sender_itself_is_read_young():
 # -- what a driver may not do, and signals of every kind
 # ----------------------------------------------------------------------------------------------------------------
 def every_second(spoil):
-    return lambda state, now, kept: spoil(state, now, kept) if state.sequence % 2 else None
+    return lambda state, now, held: spoil(state, now, held) if state.sequence % 2 else None
 
 
-def still(state, now, kept):
+def still(state, now, held):
     """Counts on and says the same to the last bit; the time of it is its own."""
-    kept.append(dataclasses.replace(state))
-    return dataclasses.replace(kept[0], time=now, sequence=state.sequence)
+    held.append(dataclasses.replace(state))
+    return dataclasses.replace(held[0], time=now, sequence=state.sequence)
 
 
 WRONG = {
     "an error code in every second reading": (every_second(change(error=one(7))), "reports error code 7", 0.15),
     "a count that goes back": (
-        lambda state, now, kept: (kept.append(1), change(sequence=3)(state, now) if len(kept) > 5 else None)[1],
+        lambda state, now, held: (held.append(1), change(sequence=3)(state, now) if len(held) > 5 else None)[1],
         "the count of its readings went back from", 0.15),
     "a count of NaN": (change(sequence=NAN), "count of its readings is nan", 0.15),
     "readings that never change": (still, "no bit of the readings has changed", 0.45),
@@ -681,15 +681,15 @@ def test_what_a_driver_may_not_do_ends_the_run_with_its_reason(b, fault, at):
 
 
 def test_one_error_code_in_ten_readings_is_counted_and_no_more(b):
-    rare = lambda s, now, kept: change(error=one(7))(s, now) if s.sequence % 10 == 0 else None  # noqa: E731
+    rare = lambda s, now, held: change(error=one(7))(s, now) if s.sequence % 10 == 0 else None  # noqa: E731
     hand = Spoiled(VirtualClock(100.0), rare)
     report = run(b, hand)
     assert report.ended == "done" and report.counts["error_codes"] > 3
 
 
 def test_readings_that_never_change_under_load_may_be_those_of_a_blocked_hand(b):
-    def spoil(state, now, kept):
-        state = still(state, now, kept)
+    def spoil(state, now, held):
+        state = still(state, now, held)
         state.current = np.full(12, -200.0)
         return state
 
@@ -727,12 +727,12 @@ def test_a_driver_that_changes_a_reading_it_gave_ends_the_run(b, name):
         if hand.begun and hand.clock.now() > hand.begun + 0.3:
             since.append(hand.clock.now())
             if len(since) > 1:
-                buffer = getattr(kept[0], name)
+                buffer = getattr(held[0], name)
                 buffer += 1
-            kept[:] = [state]
+            held[:] = [state]
         return state
 
-    kept = []
+    held = []
     hand.current = np.zeros(12)
     hand.read = reusing
     report = run(b, hand)

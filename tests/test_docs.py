@@ -205,8 +205,8 @@ def test_settings_are_listed_with_their_comments(tmp_path):
 
 
 def test_generated_tables_that_pages_ask_for_exist():
-    asked = [name for p in PAGES for name in re.findall(r"<!-- GENERATED: (\w+) -->", p.read_text(encoding="utf-8"))]
-    assert sorted(asked) == sorted(REFERENCE.PAGES)
+    wanted = [name for p in PAGES for name in re.findall(r"<!-- GENERATED: (\w+) -->", p.read_text(encoding="utf-8"))]
+    assert sorted(wanted) == sorted(REFERENCE.PAGES)
 
 
 def test_list_of_pages_for_assistants_is_that_of_the_menu():

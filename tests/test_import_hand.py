@@ -91,7 +91,7 @@ def test_a_gripper_with_slides_looks_along_its_fingers(one_start, tmp_path):
 
 
 def test_mirrored_it_is_a_left_hand(one_start, tmp_path):
-    result = import_hand(hands.write(tmp_path / "robot", left=True), tmp_path / "hand", picture=False)
+    result = import_hand(hands.write(tmp_path / "robot", mirrored=True), tmp_path / "hand", picture=False)
     assert result.hand["handedness"] == "left"
 
 
@@ -175,8 +175,8 @@ def test_fingertips_alone_take_hold_of_opposite_faces(claw, tmp_path, monkeypatc
     monkeypatch.setattr(make_fingertip_grasps, "FIRM", 0.05)
     for name in ("WEIGHTLESS", "HOLD"):
         monkeypatch.setattr(make_fingertip_grasps, name, 0.05)
-    asked = ["hold=fingertips", f"hand={claw}", "count=2", "worlds=3", "sim.threads=1", f"out={tmp_path / 'held.npz'}"]
-    assert stable_grasps.main(asked) == 0
+    wanted = ["hold=fingertips", f"hand={claw}", "count=2", "worlds=3", "sim.threads=1", f"out={tmp_path / 'held.npz'}"]
+    assert stable_grasps.main(wanted) == 0
     assert GraspSet.load(tmp_path / "held.npz").hand.shape == (2, len(hand.joints))
 
 

@@ -20,7 +20,7 @@ MAIN = rank_main.__file__
 QUICK = ("task=dummy", "device=cpu", "worlds=4", "final_episodes=0", "save_interval=1")
 
 
-def apart() -> bool:
+def split() -> bool:
     """Return whether network namespaces can be made here."""
     try:
         made = sh("ip", "netns", "add", "dexsim_probe", check=False).returncode == 0
@@ -30,7 +30,7 @@ def apart() -> bool:
     return made
 
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not apart(), reason="no network namespaces here (root, iproute2)")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not split(), reason="no network namespaces here (root, iproute2)")]
 
 
 @pytest.fixture(scope="module")

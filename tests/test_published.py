@@ -109,7 +109,7 @@ class Hub(http.server.BaseHTTPRequestHandler):
         self._answer(True)
 
     def _answer(self, body: bool) -> None:
-        Hub.asked.append(f"{self.command} {self.path}")
+        Hub.requests.append(f"{self.command} {self.path}")
         found = re.fullmatch(r"/anna/hands/resolve/(main|v1|1{40})/(policy\.pt|more/rotate\.pt)", self.path)
         self.send_response(200 if found else 404)
         if found:
@@ -139,7 +139,7 @@ def hub(tmp_path, monkeypatch):
     monkeypatch.setattr(constants, "ENDPOINT", address)
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address + "/{repo_id}/resolve/{revision}/{filename}")
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-    Hub.CONTENT, Hub.asked = (ROOT / "checkpoints/grasp.pt").read_bytes(), []
+    Hub.CONTENT, Hub.requests = (ROOT / "checkpoints/grasp.pt").read_bytes(), []
     yield server
     server.shutdown()
     server.server_close()
@@ -147,9 +147,9 @@ def hub(tmp_path, monkeypatch):
 
 def test_a_policy_of_the_hub_is_fetched_once(hub):
     data = checkpoint.load("hub:anna/hands")
-    assert data["kind"] == "policy" and sum(x.startswith("GET /anna") for x in Hub.asked) == 1, Hub.asked
+    assert data["kind"] == "policy" and sum(x.startswith("GET /anna") for x in Hub.requests) == 1, Hub.requests
     assert checkpoint.load("hub:anna/hands@v1")["steps"] == data["steps"]
-    assert sum(x.startswith("GET /anna") for x in Hub.asked) == 1  # the same commit
+    assert sum(x.startswith("GET /anna") for x in Hub.requests) == 1  # the same commit
     checkpoint.load("hub:anna/hands/more/rotate.pt")
     hub.shutdown()
     hub.server_close()  # without a network: from the cache

@@ -76,17 +76,17 @@ def follow(t, joint, delay=0.03):
     return 0.5 * np.sin(2 * np.pi * (0.4 + 0.27 * joint) * (t - delay) + joint)
 
 
-def states(names, seconds=6.0, rate=100.0, noise=0.0, apart=None):
+def states(names, seconds=6.0, rate=100.0, noise=0.0, separate=None):
     """Return joint states, all in a message, or each in one of its own, `apart` s after the other."""
     rng = np.random.default_rng(0)
     out = []
     for t in np.arange(0.001, seconds, 1 / rate):
-        if apart is None:
+        if separate is None:
             q = [follow(t, k) + noise * rng.standard_normal() for k in range(len(names))]
             out.append(("/joint_states", t, state(START + t, names, q)))
             continue
         for k, name in enumerate(names):
-            own = t + k * apart
+            own = t + k * separate
             q = follow(own, k) + noise * rng.standard_normal()
             out.append(("/joint_states", own, state(START + own, [name], [q])))
     return out
@@ -251,8 +251,8 @@ def test_a_joint_has_a_time_axis_of_its_own(tmp_path, joints):
     goals = [(t, [follow(t, k, 0.0) for k in number]) for t in np.arange(0, 6, 0.01)]
     sent = [("/joint_commands", t, state(START + t, joints, q)) for t, q in goals]
     sigma = {}
-    for kind, apart in (("all", None), ("each", 2e-4), ("spread", 3e-3)):
-        r = read(bag(tmp_path / kind, [*states(joints, noise=noise, apart=apart), *sent]), joints=joints)
+    for kind, separate in (("all", None), ("each", 2e-4), ("spread", 3e-3)):
+        r = read(bag(tmp_path / kind, [*states(joints, noise=noise, separate=separate), *sent]), joints=joints)
         assert {f.kind for f in r.findings} <= {"missing_metadata"}, [f.text for f in r.findings]
         run = inputs.to_run(r, m, notes := [])
         assert run.joints == joints and not notes and run.period == pytest.approx(0.01)

@@ -113,10 +113,10 @@ def test_stiffness_holds_over_mass_load_and_posture(kind, seed, twin):
     assert not env.touch.force_clean[:, lit].any()
 
 
-_kept: dict = {}
+_held: dict = {}
 
 
 def _warp():
-    if "warp" not in _kept:
-        _kept["warp"] = grasp_env(worlds=N, engine="warp")
-    return _kept["warp"]
+    if "warp" not in _held:
+        _held["warp"] = grasp_env(worlds=N, engine="warp")
+    return _held["warp"]

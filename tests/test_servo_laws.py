@@ -167,14 +167,14 @@ def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5
         if now >= until - 1e-9:
             rate, bend = 0.0, 0.0
         e = r - q
-        asked = (
+        requested = (
             c["kp"] * e - c["kd"] * v + c["speed_feedforward"] * rate + c["acceleration_feedforward"] * bend + integral
         )
         limit = c["torque_limit"] * max(0.0, 1.0 - abs(v) / c["no_load_speed"])
-        if abs(asked) <= limit or asked * e < 0:
+        if abs(requested) <= limit or requested * e < 0:
             integral += fine * c["integral_gain"] * e
         out.append(q)
-        v += fine * (min(max(asked, -limit), limit) - c["viscous_friction"] * v) / INERTIA
+        v += fine * (min(max(requested, -limit), limit) - c["viscous_friction"] * v) / INERTIA
         q += fine * v
     return np.array(out)
 
@@ -428,25 +428,25 @@ def test_what_the_encoder_is_off_by_is_marked_as_the_encoders():
 
 
 @wp.kernel
-def limited(slope: float, asked: wp.array(dtype=float), v: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+def limited(slope: float, requested: wp.array(dtype=float), v: wp.array(dtype=float), out: wp.array2d(dtype=float)):
     i = wp.tid()
     ends = laws.torque_limits(0.4, wp.abs(v[i]) / 10.0, v[i], slope)
-    out[i, 0] = wp.clamp(asked[i], -ends[0], ends[1])
-    out[i, 1] = laws.voltage_torque(asked[i], 0.4, 1.2, 0.4 / 10.0, v[i])
+    out[i, 0] = wp.clamp(requested[i], -ends[0], ends[1])
+    out[i, 1] = laws.voltage_torque(requested[i], 0.4, 1.2, 0.4 / 10.0, v[i])
 
 
 @pytest.mark.parametrize("slope", [1.0, 0.3, 0.0, -0.8])
 def test_the_torque_along_a_measured_motion_follows_the_kernels_laws(slope):
     rng = np.random.default_rng(0)
-    asked, v = rng.uniform(-1.5, 1.5, 200), rng.uniform(-12.0, 12.0, 200)
+    requested, v = rng.uniform(-1.5, 1.5, 200), rng.uniform(-12.0, 12.0, 200)
     out = wp.zeros((200, 2), dtype=float, device="cpu")
-    inputs = [wp.array(x, dtype=float, device="cpu") for x in (asked, v)]
+    inputs = [wp.array(x, dtype=float, device="cpu") for x in (requested, v)]
     wp.launch(limited, 200, inputs=[slope, *inputs, out], device="cpu")
-    torque = torque_along(asked, v, 0.4, 10.0, False, braking_slope=slope)
-    duty = torque_along(asked, v, 0.4, 10.0, True, 1.2)
+    torque = torque_along(requested, v, 0.4, 10.0, False, braking_slope=slope)
+    duty = torque_along(requested, v, 0.4, 10.0, True, 1.2)
     assert np.allclose(out.numpy(), np.stack([torque, duty], 1), atol=1e-6) and np.abs(torque).max() > 0.35
-    assert np.array_equal(torque_along(asked, v, np.inf, np.inf, False), asked)
-    assert np.array_equal(torque_along(asked, v, 0.4, 10.0, False, limited=False), asked)
+    assert np.array_equal(torque_along(requested, v, np.inf, np.inf, False), requested)
+    assert np.array_equal(torque_along(requested, v, 0.4, 10.0, False, limited=False), requested)
 
 
 @wp.kernel
@@ -492,10 +492,10 @@ def test_laws_that_only_the_search_has():
     out = wp.zeros((200, 4), dtype=wp.float64, device="cpu")
     inputs = [wp.array(x, dtype=wp.float64, device="cpu") for x in (torque, v)]
     wp.launch(searched, 200, inputs=[*inputs, out], device="cpu")
-    left, friction, linear, duty = out.numpy().T
+    rest, friction, linear, duty = out.numpy().T
     size = np.abs(torque)
     share = np.where(torque * v < 0, 0.4, 0.1)
-    assert np.allclose(left, np.maximum(0.7 - 0.2 * size, 0.2)) and (left == 0.2).any() and (left > 0.2).any()
+    assert np.allclose(rest, np.maximum(0.7 - 0.2 * size, 0.2)) and (rest == 0.2).any() and (rest > 0.2).any()
     assert np.allclose(friction, share * 2.0 * (size / 2.0) ** 1.5)
     assert np.allclose(linear, share * size)
     assert np.allclose(friction, gear_load_friction(torque, v, 0.1, 0.4, 1.5, 2.0), rtol=1e-12)

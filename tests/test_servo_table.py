@@ -104,7 +104,7 @@ def test_shipped_servos(name):
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, said",
     [
         ("joints: {j: {kp: -1}}", ["joints.j.kp", "-1", "0 .. 100000", "N.m/rad"]),
         ("joints: {j: {kpp: 1}}", ["joints.j.kpp", "Did you mean 'kp'", "coulomb_friction"]),
@@ -129,14 +129,14 @@ def test_shipped_servos(name):
         ("", ["expected a mapping"]),
     ],
 )
-def test_mistakes_are_answered_in_one_line(text, told, tmp_path):
+def test_mistakes_are_answered_in_one_line(text, said, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
         ServoTable.load(path)
     message = str(error.value)
     assert "mine.yaml" in message and "\n" not in message
-    for part in told:
+    for part in said:
         assert part in message, message
 
 

@@ -68,10 +68,10 @@ def test_not_installed_is_one_line_before_anything_is_built(configs, capfd):
 
 def test_a_run_is_told_to_wandb(configs, stand_in, capfd):
     assert shell.call("train", configs, *QUICK, "agent.wandb_project=hands") == 0, capfd.readouterr().err
-    told = [json.loads(line) for line in Path("told.jsonl").read_text().splitlines()]
-    assert told[0] == ["init", "hands", "first", "runs/dummy/first"] and ["config", {"env_cfg": "dummy"}] in told
-    assert told[-1] == ["finish"]
-    rewards = [(row, step) for what, row, step in (t for t in told if t[0] == "log") if "Train/step_reward" in row]
+    stated = [json.loads(line) for line in Path("told.jsonl").read_text().splitlines()]
+    assert stated[0] == ["init", "hands", "first", "runs/dummy/first"] and ["config", {"env_cfg": "dummy"}] in stated
+    assert stated[-1] == ["finish"]
+    rewards = [(row, step) for what, row, step in (t for t in stated if t[0] == "log") if "Train/step_reward" in row]
     assert [step for _, step in rewards] == [1, 2]
     assert list(Path("runs/dummy/first").glob("events.out.tfevents.*")), "TensorBoard is written as well"
     assert checkpoint.load("runs/dummy/first/policy.pt")["config"]["agent"]["logger"] == "tensorboard"

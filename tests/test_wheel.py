@@ -137,8 +137,8 @@ def test_uvx_runs_the_wheel(wheel, tmp_path):
     the release of torch that these tests run on, since its newest brings gigabytes of CUDA along, and where pip, too,
     would look for it."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    asked = [sys.executable, "-m", "pip", "config", "get", "global.find-links"]
-    folders = os.environ.get("PIP_FIND_LINKS") or subprocess.run(asked, capture_output=True, text=True).stdout.strip()
+    wanted = [sys.executable, "-m", "pip", "config", "get", "global.find-links"]
+    folders = os.environ.get("PIP_FIND_LINKS") or subprocess.run(wanted, capture_output=True, text=True).stdout.strip()
     torch = importlib.metadata.version("torch")
     if folders:
         clean["UV_FIND_LINKS"] = ",".join(folders.split())

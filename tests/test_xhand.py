@@ -540,7 +540,7 @@ def test_two_hands_are_let_go_by_their_process_where_the_loop_is_silent(tmp_path
 
 
 @pytest.fixture(scope="module")
-def left(b, tmp_path_factory):
+def other(b, tmp_path_factory):
     """The same bundle, for a left hand."""
     folder = tmp_path_factory.mktemp("xhand") / "left"
     shutil.copytree(b.path, folder)
@@ -550,12 +550,12 @@ def left(b, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_command_runs_two_policies_on_two_hands_of_a_bus(b, left, tmp_path, monkeypatch, capsys):
+def test_the_command_runs_two_policies_on_two_hands_of_a_bus(b, other, tmp_path, monkeypatch, capsys):
     """In real time, each in a thread."""
     fake = lambda config, calibration, text, *_: partial(FakeXHand, faults=Faults.parse(text))  # noqa: E731
     monkeypatch.setattr(simulated_hand, "fake_package", fake)
     patient = ["late=2", "stale=1", "overruns=1000", "hang=3", "home_speed=3", "tor_max=300", "seconds=1"]
-    settings = [f"bundle={b.path}", f"second={left}", "driver=xhand", "port=fake", f"record={tmp_path / 'a.mcap'}"]
+    settings = [f"bundle={b.path}", f"second={other}", "driver=xhand", "port=fake", f"record={tmp_path / 'a.mcap'}"]
     with pytest.raises(UserError, match="nothing sees the object"):
         command([*settings, "place=0.055 0 0.04"])
     places = ["place=0.055 0 0.04", "second_place=0.055 0 0.04"]

@@ -51,7 +51,7 @@ class Measure:
         of `commanded`; target [J] rad: the last ones sent; action [J]: the last."""
         raise NotImplementedError
 
-    def felt(self, state: HandState, weighted: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def touched(self, state: HandState, weighted: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return tips [F, 3] m, force [P] N and centre [P, 3] m of each pad, palm frame."""
         tips, position, turned = self.hand(state.position, state.follower)
         force, centre = self.hand.touch(self.calibration.normal_force(state.tactile), position, turned, weighted)

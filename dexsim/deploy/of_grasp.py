@@ -86,9 +86,9 @@ class Measured(Measure):
 
     def signals(self, state: HandState, place: np.ndarray, command: list[float]) -> observations.Signals:
         """See `observe`; of touch, all that the hand feels."""
-        tips, force, centre = self.felt(state)
+        tips, force, centre = self.touched(state)
         width = {row["name"]: row["stop"] - row["start"] for row in self.manifest["observation"]}
-        told = [*command] * width.get("force_command", 1)  # the thumb's own is the others'
+        said = [*command] * width.get("force_command", 1)  # the thumb's own is the others'
         if self._xy is None:
             self._xy = np.array(place[:2], float)
         z = tensor([place[2]])[0]
@@ -98,4 +98,4 @@ class Measured(Measure):
             tensor(state.position), tensor(self.calibration.torque_norm(np.asarray(state.current, float) * 1e-3)),
             tensor(self._xy), z, vz,
             tensor(force), tensor(centre), tensor(tips),
-            tensor(told), self.hand.followers(state))  # fmt: skip
+            tensor(said), self.hand.followers(state))  # fmt: skip

@@ -121,7 +121,7 @@ class Measured(Measure):
         if imu:
             q = rotation.normalize(tensor(seen))
             self._aim(q)
-        tips, force, centre = self.felt(state, self.task["observe"]["force_weighted"])
+        tips, force, centre = self.touched(state, self.task["observe"]["force_weighted"])
         fresh = not imu and self._past is None
         past = (
             torch.zeros(1, 0, 0)

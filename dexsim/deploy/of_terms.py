@@ -201,7 +201,7 @@ class Measured(Measure):
         """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where
         the policy needs it."""
         c = self.calibration
-        tips, force, centre = self.felt(state)
+        tips, force, centre = self.touched(state)
         numbers = iter(command)
         now = {
             "q": state.position, "qd": self.hand.velocity(state), "target": target,

@@ -33,14 +33,14 @@ class Film:
         self.qpos: list[np.ndarray] = []
         self.rows: dict[str, list[Any]] = {}
 
-    def add(self, **shown: torch.Tensor) -> None:
+    def add(self, **more: torch.Tensor) -> None:
         """Keep the state, taxels and the task's first figures where there are any, and what else is shown of it,
         [N, ...] each."""
         if not self.worlds or len(self.qpos) >= self.most:
             return
         self.qpos.append(self.env.engine.t.qpos[self.worlds].double().cpu().numpy())
         raw = self.env.touch.raw
-        for name, value in (shown if raw is None else shown | {"taxels": raw}).items():
+        for name, value in (more if raw is None else more | {"taxels": raw}).items():
             self.rows.setdefault(name, []).append(value[self.worlds].cpu().numpy())
         now = [(name, self.env.figures[name].tolist()) for name in [*self.env.last][:2] if name in self.env.figures]
         if now:
