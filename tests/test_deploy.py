@@ -400,7 +400,7 @@ def test_what_is_seen_and_sent_is_recorded(made, tmp_path):
 def test_a_slow_disk_costs_samples_not_time(tmp_path, monkeypatch):
     from dexsim.recording.writer import Writer
 
-    monkeypatch.setattr(Writer, "add_tactile", lambda *a: time.sleep(0.05))  # before the recorder's thread looks it up
+    monkeypatch.setattr(Writer, "add", lambda *a: time.sleep(0.05))  # before the recorder's thread looks it up
     rec = recorder_at(tmp_path / "slow.mcap", most=10)
     start = time.perf_counter()
     for k in range(300):

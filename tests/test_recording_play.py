@@ -524,7 +524,7 @@ def test_the_object_of_a_real_recording_is_placed(played, tmp_path, monkeypatch)
 def test_sizes_of_a_stated_object(stated, half):
     from dexsim.recording.led_object import Stated
 
-    np.testing.assert_allclose(Stated(*stated).about()["size"], half, atol=1e-6)
+    np.testing.assert_allclose(Stated(*stated).about().size, half, atol=1e-6)
 
 
 @pytest.mark.parametrize(

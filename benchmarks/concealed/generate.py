@@ -503,7 +503,7 @@ def _record(
                 elif which == 1:
                     w.add_state(x, angle[:, i], None, torque[:, i] if effort else None)
                 else:
-                    w.add_temperature(x, np.round(heat[:, i]))
+                    w.add("temperature", x, np.round(heat[:, i]))
 
 
 def stub(root: Path, number: int) -> Path:

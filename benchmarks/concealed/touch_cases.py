@@ -229,7 +229,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
                 out = np.zeros((5, len(pad.areas), 3))
                 value = z[at] * (1 - part) + z[at + 1] * part + NOISE * rng.normal(size=len(pad.areas))
                 out[pad_number, :, 2] = np.clip(np.round(value / LSB), 0, 255)
-                w.add_tactile(x, out)
+                w.add("tactile", x, out)
                 w.add_external_force(x, np.r_[np.interp(x, grid, f) + 0.02 * rng.normal(), np.zeros(5)], "indenter")
         if kind and k < len(RECORDINGS) - HELD:
             strength = kind.own(f, p)

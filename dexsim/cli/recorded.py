@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim import outputs, typed, yaml_text
+from dexsim import outputs, typed
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
@@ -84,7 +84,7 @@ def run(play: dict[str, Any]) -> int:
     """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and
     video.mp4."""
     from dexsim.gap.read.channels import own_readings
-    from dexsim.recording import audit, compare, led_object, mechanism
+    from dexsim.recording import attached, audit, compare, led_object, mechanism
     from dexsim.recording.reader import read
     from dexsim.recording.writer import write
     from dexsim.sim.quiet import quiet_warp
@@ -101,8 +101,8 @@ def run(play: dict[str, Any]) -> int:
         print(audit.table(recording.findings))
     m = mechanism.for_recording(recording, model, play["servo"], hand)
     recording = mechanism.driven(recording, m)
-    config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else {}
-    timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", mechanism.STEP))
+    sim = attached.config(recording.config, recording.path).sim
+    timestep = play["timestep"] or (sim and sim.timestep) or mechanism.STEP
     placed = led_object.add_object(m, recording, play["object"])
     led = placed == "led"
     if play["object"] is not None and not led:

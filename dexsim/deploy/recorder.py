@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,11 +80,9 @@ class Recorder:
     def _run(self) -> None:
         w = self.writer
         add: dict[str, Callable[..., None]] = {
-            "command": w.add_command,
-            "tactile": w.add_tactile,
-            "temperature": w.add_temperature,
-            "object": w.add_object_pose,
-        }
+            "command": w.add_command, "tactile": partial(w.add, "tactile"),
+            "temperature": partial(w.add, "temperature"), "object": w.add_object_pose,
+        }  # fmt: skip
         first = None
         while (item := self._queue.get()) is not None:
             kind, t, values = item

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import msgspec
 
 from dexsim import typed, yaml_text
-from dexsim.errors import UserError
 
 Length = Annotated[float, msgspec.Meta(ge=0, le=10)]
 
@@ -50,6 +49,7 @@ class Sim(msgspec.Struct):
     timestep: Annotated[float, msgspec.Meta(ge=1e-5, le=0.1)] | None = None
     impratio: typed.Positive | None = None
     iterations: typed.Count | None = None
+    iterations_mujoco: typed.Count | None = None
     ls_iterations: typed.Count | None = None
     noslip_iterations: typed.Count | None = None
 
@@ -62,18 +62,8 @@ class Config(msgspec.Struct):
     sim: Sim | None = None
 
 
-def fault(text: str | None, source: str) -> str:
-    """Return why an attached config cannot be used, in words; empty where it can, or there is none."""
-    if text is None:
-        return ""
-    try:
-        raw: Any = yaml_text.parse(text, source)
-        if raw is not None:
-            typed.convert(
-                {k: raw[k] for k in Config.__struct_fields__ if k in raw} if isinstance(raw, dict) else raw,
-                Config,
-                source,
-            )
-    except UserError as error:
-        return str(error)
-    return ""
+def config(text: str | None, source: object) -> Config:
+    """Return what is read of an attached config; nothing of none. Raises UserError."""
+    raw: Any = (yaml_text.parse(text, f"{source}: attached config") if text else None) or {}
+    own = {k: raw[k] for k in Config.__struct_fields__ if k in raw} if isinstance(raw, dict) else raw
+    return typed.convert(own, Config, f"{source}: attached config")

@@ -15,7 +15,7 @@ from dexsim import files  # noqa: E402
 from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
 from dexsim.recording.schema import Recording, Series  # noqa: E402
 
-RECORDED, SIMULATED, COMMANDED = "#1f5fa8", "#d1641b", "#9a9a9a"
+COLOURS = {"recorded": "#1f5fa8", "simulated": "#d1641b", "command": "#9a9a9a"}
 
 
 @dataclass
@@ -113,54 +113,31 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
 def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
     """Return position.png, effort.png and, where touch was recorded or simulated, force.png: one panel a joint or
     finger."""
-    paths = [
-        _panels(
-            folder / "position.png",
-            f"{title}: position [rad]",
-            c.joints,
-            c.t,
-            [
-                ("command", COMMANDED, c.target),
-                ("recorded", RECORDED, c.position),
-                ("simulated", SIMULATED, c.position_simulated),
-            ],
-            [f"RMSE {1e3 * x:.2f} mrad" for x in c.position_rmse()],
-        )
-    ]
-    notes = [
+    unit = [
         f"{s:.2f} A per N.m{' (fitted)' if f else ''}" if s != 1 else ""
         for s, f in zip(c.effort_scale, c.fitted, strict=True)
     ]
-    lines = [("simulated", SIMULATED, c.effort_simulated)]
-    if c.effort is not None:
-        lines.insert(0, ("recorded", RECORDED, c.effort))
-    paths.append(_panels(folder / "effort.png", f"{title}: motor torque [N.m]", c.joints, c.t, lines, notes))
-    if c.finger_force is not None or c.finger_force_simulated is not None:
-        series = [
-            (n, col, s)
-            for n, col, s in (
-                ("recorded", RECORDED, c.finger_force),
-                ("simulated", SIMULATED, c.finger_force_simulated),
-            )
-            if s is not None
-        ]
-        count = max(s[1].shape[1] for _, _, s in series)
+    lines = [("command", c.t, c.target), ("recorded", c.t, c.position), ("simulated", c.t, c.position_simulated)]
+    off = [f"RMSE {1e3 * x:.2f} mrad" for x in c.position_rmse()]
+    paths = [_panels(folder / "position.png", f"{title}: position [rad]", c.joints, lines, off)]
+    lines = [("recorded", c.t, c.effort)] if c.effort is not None else []
+    lines += [("simulated", c.t, c.effort_simulated)]
+    paths.append(_panels(folder / "effort.png", f"{title}: motor torque [N.m]", c.joints, lines, unit))
+    forces = {"recorded": c.finger_force, "simulated": c.finger_force_simulated}
+    if lines := [(name, *x) for name, x in forces.items() if x is not None]:
+        count = max(value.shape[1] for _, _, value in lines)
         names = c.fingers if count == len(c.fingers) else tuple(f"pad {k}" for k in range(count))
-        figure, axes = _grid(count)
-        for k, (ax, name) in enumerate(zip(axes, names, strict=False)):
-            for label, colour, (t, value) in series:
-                ax.plot(t, value[:, k], color=colour, linewidth=0.9, label=label)
-            ax.set_title(name, fontsize=9)
-        _finish(figure, axes, count, f"{title}: normal force of each finger [{c.force_unit}]", folder / "force.png")
-        paths.append(folder / "force.png")
+        of = f"{title}: normal force of each finger [{c.force_unit}]"
+        paths.append(_panels(folder / "force.png", of, names, lines, [""] * count))
     return paths
 
 
-def _panels(path: Path, title: str, names: tuple[str, ...], t: np.ndarray, lines: list, notes: list[str]) -> Path:
+def _panels(path: Path, title: str, names: tuple[str, ...], lines: list, notes: list[str]) -> Path:
+    """Draw a panel a name; lines: (label, t [T] s, value [T, len(names)])."""
     figure, axes = _grid(len(names))
     for j, (ax, name) in enumerate(zip(axes, names, strict=False)):
-        for label, colour, value in lines:
-            ax.plot(t, value[:, j], color=colour, linewidth=0.9, label=label)
+        for label, t, value in lines:
+            ax.plot(t, value[:, j], color=COLOURS[label], linewidth=0.9, label=label)
         ax.set_title(f"{name}  {notes[j]}", fontsize=8)
     _finish(figure, axes, len(names), title, path)
     return path

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import mujoco
 import numpy as np
 
-from dexsim import yaml_text
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.hand.model import HAND_BIT, OBJECT_BIT
+from dexsim.recording import attached
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
@@ -45,7 +46,7 @@ class Stated:
     mass: float = 0.1
     friction: float = 0.8
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> attached.Thing:
         """Return the object as a recorded play states it, in MuJoCo's sizes. Raises UserError."""
         shapes = library()
         if self.shape not in shapes:
@@ -69,8 +70,7 @@ class Stated:
             half = [x / 2 for x in size] + [0.0] * (3 - count)
         else:
             half = [size[0] / float(shape.extents.max())] * 3
-        return {"shape": self.shape, "kind": shape.kind, "size": half, "mass": self.mass, "friction": self.friction,
-                "stiffness": 7000.0, "damping_ratio": 0.8}  # fmt: skip
+        return attached.Thing(shape.kind, self.shape, half, self.mass, self.friction, 7000.0, 0.8)
 
 
 def _library_size(shape: Any) -> list[float]:
@@ -85,24 +85,21 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     rather than the balance of a grasp. "marked": its path is known and its shape is not, a small ball that touches
     nothing shows where it was. "none": no path was recorded, or the mechanism is not a hand. stated: what it is;
     default: what the recording says."""
-    config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else None
-    config = config if isinstance(config, dict) else {}
-    about = config.get("recorded_world", {}).get("object") if stated is None else stated.about()
-    if (
-        recording.object_pose is None
-        or m.hand is None
-        or not np.isfinite(recording.object_pose.value).all(1).any()
-    ):
+    config = attached.config(recording.config, recording.path)
+    world = config.recorded_world
+    about = stated.about() if stated is not None else world.object if world is not None else None
+    pose = recording.object_pose
+    if pose is None or m.hand is None or not np.isfinite(pose.value).all(1).any():
         return "none"
-    body = m.spec.worldbody.add_body(name=NAME, pos=recording.object_pose.value[0, :3])
+    body = m.spec.worldbody.add_body(name=NAME, pos=pose.value[0, :3])
     body.add_freejoint(name=JOINT)
-    if not about or about["shape"] not in library():
+    if about is None or about.shape not in library():
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8],
             mass=0.01,
         )  # fmt: skip
         return "marked"
-    shape, size = library()[about["shape"]], np.array(about["size"], float)
+    shape, size = library()[about.shape], np.array(about.size, float)
     common: dict[str, Any] = dict(
         contype=OBJECT_BIT, conaffinity=HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
     )
@@ -113,29 +110,30 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
             m.spec.add_mesh(name=f"led_{k}", uservert=(np.asarray(hull) * size[0]).ravel())
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"led_{k}", **common)
     extent = shape.extents.max() * size.max() if shape.kind == "grid" else 2 * size.max()
-    body.explicitinertial, body.mass = True, about["mass"]
-    body.inertia = [0.1 * about["mass"] * extent**2] * 3
-    contact = config.get("task", {}).get("contact", {})
-    _contact(m.spec, m.hand, about, float(contact.get("impedance", 0.9)))
-    _solver(m.spec, m.hand, config.get("sim", {}))
+    body.explicitinertial, body.mass = True, about.mass
+    body.inertia = [0.1 * about.mass * extent**2] * 3
+    contact = config.task.contact if config.task is not None else None
+    _contact(m.spec, m.hand, about, contact.impedance if contact is not None and contact.impedance else 0.9)
+    sim = msgspec.structs.asdict(config.sim or attached.Sim())
+    _solver(m.spec, m.hand, {k: v for k, v in sim.items() if v is not None})
     return "led"
 
 
-def _contact(spec: mujoco.MjSpec, hand: Hand, about: dict[str, Any], d: float) -> None:
+def _contact(spec: mujoco.MjSpec, hand: Hand, about: attached.Thing, d: float) -> None:
     """Set friction on the hand, stiffness and damping of the tips: see `tasks.objects.Objects`."""
     model = spec.compile()
     for geom in spec.geoms:
         if not geom.contype or geom.parent.name == NAME:
             continue
-        geom.friction[0] = about["friction"]
+        geom.friction[0] = about.friction
         if geom.name in hand.tip_geoms:
             a = (
                 model.body_invweight0[model.geom(geom.name).bodyid[0], 0]
                 + model.body_invweight0[model.body(NAME).id, 0]
             )
-            k = about["stiffness"] * (1 - d) * a
+            k = about.stiffness * (1 - d) * a
             geom.solimp = [d, d, 1e-3, 0.5, 2.0]
-            geom.solref = [-k, -2 * about["damping_ratio"] * np.sqrt(k)]
+            geom.solref = [-k, -2 * about.damping_ratio * np.sqrt(k)]
 
 
 def _solver(spec: mujoco.MjSpec, hand: Hand, sim: dict[str, Any]) -> None:

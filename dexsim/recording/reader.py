@@ -36,7 +36,6 @@ PARTS = {schema.COMMANDS: "reference|desired", schema.STATES: "feedback|actual"}
 """What a controller's state (`control_msgs/JointTrajectoryControllerState`, new and old) says of each topic."""
 SENT = {"a trajectory": "trajectory_msgs/msg/JointTrajectory", "values": "std_msgs/msg/Float64MultiArray"}
 """Types of topics that are the commands where no other can be, by what they hold."""
-JOINT_ARRAYS = {schema.TEMPERATURES: "temperature", schema.DUTY: "duty", schema.ENABLED: "enabled"}
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
@@ -396,14 +395,17 @@ class _Reading:
             config=self.config,
             hand=self.hand if ours and set(ours) <= set(self.hand.joints) else None,
         )
-        out.temperature, out.duty, out.enabled = (self._joint_array(topic, place) for topic in JOINT_ARRAYS)
+        for name in ("temperature", "duty", "enabled"):
+            setattr(out, name, self._joint_array(schema.ARRAYS[name][0], place))
         self._convert(out, units, {ours[c]: theirs[i] for i, c in enumerate(column) if c >= 0})
         out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
         out.tactile = self._array(schema.TACTILE, self._tactile_shape)
         out.external_force, out.object_pose, out.imu = (self._vectors(topic) for topic in _VECTORS)
-        if reason := attached.fault(self.config, f"the attached {schema.ATTACHMENT}"):
+        try:
+            attached.config(self.config, schema.ATTACHMENT)
+        except UserError as error:
             out.config = None
-            self._note("damage", f"{reason}; it is not used", "error")
+            self._note("damage", f"{error}; it is not used", "error")
         out.findings = self.findings
         out.breaks = sorted(self.breaks)
         return out
@@ -678,7 +680,7 @@ class _TableReading(_Reading):
             absent = np.zeros((len(rows), 0))
             out = JointRows(table.joints, rows, absent, absent, np.zeros(len(t), np.int64), table.carried("command"))
         else:
-            quantity = (JOINT_ARRAYS | {schema.SUPPLY: "supply_voltage"}).get(ours, "")
+            quantity = next((name for name, (topic, _) in schema.ARRAYS.items() if topic == ours), "")
             if quantity not in table.value:
                 return empty, []
             if quantity == "supply_voltage":

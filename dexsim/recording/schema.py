@@ -29,6 +29,11 @@ TOPICS: dict[str, str] = {
     SUPPLY: MULTI_ARRAY, TACTILE: MULTI_ARRAY, EXTERNAL_FORCE: WRENCH, OBJECT_POSE: POSE, IMU: IMU_TYPE,
 }  # fmt: skip
 """Default topic -> ROS 2 type."""
+ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "temperature": (TEMPERATURES, ("joint",)), "duty": (DUTY, ("joint",)), "enabled": (ENABLED, ("joint",)),
+    "supply_voltage": (SUPPLY, ("supply",)), "tactile": (TACTILE, ("finger", "taxel", "axis")),
+}  # fmt: skip
+"""What of a `Recording` is an array a message: its topic, and a word for each axis."""
 
 METADATA = "dexsim"  # name of the MCAP metadata record
 ATTACHMENT = "config.yaml"  # name of the attachment with the resolved config

@@ -89,25 +89,11 @@ class Writer:
             velocity, effort = (None if x is None else np.append(x, none) for x in (velocity, effort))
         self._joints(schema.STATES, t, position, velocity, effort, stamp)
 
-    def add_temperature(self, t: float, value: np.ndarray) -> None:
-        """Add temperatures [J] in degC."""
-        self.add_array(schema.TEMPERATURES, t, value, ("joint",))
-
-    def add_duty(self, t: float, value: np.ndarray) -> None:
-        """Add duty cycles [J], -1..1."""
-        self.add_array(schema.DUTY, t, value, ("joint",))
-
-    def add_enabled(self, t: float, value: np.ndarray) -> None:
-        """Add [J]: 1 where the servo drives, 0 where it is free."""
-        self.add_array(schema.ENABLED, t, value, ("joint",))
-
-    def add_supply_voltage(self, t: float, value: float) -> None:
-        """Add the supply's voltage [V]."""
-        self.add_array(schema.SUPPLY, t, np.atleast_1d(value), ("supply",))
-
-    def add_tactile(self, t: float, value: np.ndarray) -> None:
-        """Add readings [fingers, taxels, 3] in `tactile_unit`."""
-        self.add_array(schema.TACTILE, t, value, ("finger", "taxel", "axis"))
+    def add(self, name: str, t: float, value: np.ndarray | float) -> None:
+        """Add one of `schema.ARRAYS`: temperature [J] degC, duty [J] -1..1, enabled [J] (1 where the servo drives),
+        supply_voltage [V], tactile [fingers, taxels, 3] in `tactile_unit`."""
+        topic, labels = schema.ARRAYS[name]
+        self.add_array(topic, t, np.atleast_1d(value), labels)
 
     def add_external_force(self, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None) -> None:
         """Add [6]: force [N] and torque [N.m] in `frame`."""
@@ -200,14 +186,10 @@ def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]
     for i, t in enumerate(s.position.t):
         rest = [None if x is None else x.value[i] for x in (s.velocity, s.effort)]
         yield t, 1, w.add_state, (t, s.position.value[i], *rest, _stamp(s.position, i))
-    plain = (
-        (r.temperature, w.add_temperature), (r.duty, w.add_duty), (r.enabled, w.add_enabled),
-        (r.supply_voltage, w.add_supply_voltage), (r.tactile, w.add_tactile),
-    )  # fmt: skip
-    for order, (series, add) in enumerate(plain, start=2):
-        if series is not None:
+    for order, name in enumerate(schema.ARRAYS, start=2):
+        if (series := getattr(r, name)) is not None:
             for i, t in enumerate(series.t):
-                yield t, order, add, (t, series.value[i])
+                yield t, order, w.add, (name, t, series.value[i])
     if r.object_pose is not None:
         for i, t in enumerate(r.object_pose.t):
             yield t, 7, w.add_object_pose, (t, r.object_pose.value[i], _stamp(r.object_pose, i))
