@@ -17,6 +17,7 @@ from dexsim.tasks import make_env
 from dexsim.tasks.make_grasps import DRIFT
 from dexsim.tasks.rotate_eval import summary
 from dexsim.tasks.stable_grasps import held_file, held_poses
+from dexsim.view.video import clips_of
 
 torch.set_num_threads(1)
 
@@ -530,3 +531,5 @@ def test_evaluation_counts(monkeypatch):
     assert m["seconds_per_success"] == pytest.approx(4 * m["seconds_to_fall"] / sum(m["consecutive_successes"]["all"]))
     assert set(result) == {"metrics", "tables", "frames", "plots"}
     assert len(result["frames"]["qpos"][1]) < len(result["frames"]["qpos"][0])
+    shown = clips_of(result["frames"])
+    assert len(shown) == 4 and shown[0].text[-1] == "successes 3" and len(shown[1].qpos) == len(shown[1].text)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from dexsim.cli import machine
-from dexsim.cli.report import describe_env, versions_line
+from dexsim.cli.report import versions_line
 from dexsim.learning.ranks import seed_all
 from dexsim.sim.quiet import quiet_warp
 
@@ -50,8 +50,3 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
 def close(env: Any) -> None:
     """Give back an environment's memory and threads, where it can."""
     getattr(env, "close", lambda: None)()
-
-
-def print_tables(env: Any) -> None:
-    """Print observation, action, reward, termination and randomization tables."""
-    print("\n" + describe_env(env.describe()) + "\n", flush=True)

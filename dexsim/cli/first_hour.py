@@ -681,7 +681,7 @@ def walk(
     try:
         for number, name in enumerate(names, 1):
             work = getattr(hour, name)
-            say(f"\n{number}/{len(names)}  {name}: {_sentence(work)}")
+            say(f"\n{number}/{len(names)}  {name}: {' '.join((work.__doc__ or '').split())}")
             if asks:
                 answer = input("      Enter begins, s skips, q ends: ").strip().lower()
                 if answer == "q":
@@ -729,10 +729,6 @@ def _real(given: dict[str, Any]) -> bool:
 def _still(goal: np.ndarray) -> Callable[[float], np.ndarray]:
     """Return the same targets [J] rad at all times."""
     return lambda t: goal
-
-
-def _sentence(work: Callable) -> str:
-    return " ".join((work.__doc__ or "").split())
 
 
 def _dexsim(*arguments: str) -> subprocess.CompletedProcess:

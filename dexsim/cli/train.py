@@ -12,6 +12,7 @@ from typing import Any
 from dexsim.cli import build, folder, machine
 from dexsim.cli.console import TrainingLines
 from dexsim.cli.replay import replay
+from dexsim.cli.report import describe_env
 from dexsim.cli.start import Start
 from dexsim.cli.watch import Watch
 from dexsim.console import program
@@ -64,7 +65,7 @@ def _run(
         env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts, start.given)
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
-    build.print_tables(env)
+    print("\n" + describe_env(env.describe()) + "\n", flush=True)
     if expect := cfg["task"].get("expect"):
         ranges = (f"{name} {low:g} to {high:g}" for name, (low, _, high) in _ranges(expect).items())
         print(f"expect   {', '.join(ranges)}: {expect['of']}\n")

@@ -125,11 +125,6 @@ class HandEnv(Kept):
         `agent=ppo_symmetric` learns from them too."""
         return ()
 
-    def reward_rows(self) -> list[tuple[str, float, str]]:
-        """(name, weight, what it is) of the rewards in the settings."""
-        words = self.reward_words()
-        return [(name, weight, words[name]) for name, weight in self.task["rewards"].items()]
-
     @property
     def max_episode_length(self) -> int:
         """Control steps after which an episode times out; on the device too, so that a recorded step sees a change."""
@@ -337,10 +332,6 @@ class HandEnv(Kept):
                 f" {100 * MOST_NAN:.0f} % in all. Look at what this task's settings of that name are, or lower"
                 " sim.timestep"
             )
-
-    def usual_ends(self) -> list[tuple[str, str]]:
-        """Return rows of the ends that every task has."""
-        return [("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")]
 
     def evaluate(
         self,

@@ -143,7 +143,7 @@ class GraspEnv(Launches):
         self.clearance.launch()
 
     def update(self) -> None:
-        self.launch_dropped()
+        self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)
         rate = self.task["termination"].get("untouched")  # not for sure: all worlds would begin anew at once
         if rate and self.fixed_command is None:  # an evaluation goes on, and counts
             touches = self.finger_force > 0

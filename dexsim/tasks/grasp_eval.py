@@ -13,6 +13,7 @@ The command is constant in an episode, uniform in [0, 1] over episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,14 +57,8 @@ def evaluate(env: GraspEnv, policy: Policy, episodes: int, seed: int, progress: 
     metrics = _metrics(trained, held_out, env)
     metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
     metrics["by_fingertip_share"] = by_share(trained)
-
-    def force_command(ax: Axes) -> None:
-        _force_plot(ax, trained, env)
-
-    def hold_by_command(ax: Axes) -> None:
-        _hold_plot(ax, trained)
-
-    plots = [force_command, hold_by_command]
+    plots = [("force_command", partial(_force_plot, r=trained, env=env)),
+             ("hold_by_command", partial(_hold_plot, r=trained))]  # fmt: skip
     return {
         "metrics": metrics,
         "tables": [*_papers_columns(metrics), *_tables(trained, held_out, env)],

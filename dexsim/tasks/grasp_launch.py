@@ -161,7 +161,3 @@ class Launches(Task):
         self.measured = out[len(names) :]
         # checkpoints from before lack some
         return {name: term for name, term in zip(names, out, strict=False) if name in w}
-
-    def launch_dropped(self) -> None:
-        """Find whether each object's centre is below the palm or far from it, `_dropped` [N]."""
-        self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)

@@ -10,6 +10,7 @@ cap as its time, so the mean time to fall is a restricted mean. Intervals: boots
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -123,14 +124,9 @@ def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress:
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
     metrics["ends"] = {name: int((r["end"] == name).sum()) for name in names.tolist()}
     metrics |= env.of_trials(r)
-
-    def successes(ax: Axes) -> None:
-        _successes_plot(ax, r["successes"])
-
-    def survival(ax: Axes) -> None:
-        _survival_plot(ax, r["time"], cap)
-
-    return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": [successes, survival]}
+    plots = [("successes", partial(_successes_plot, successes=r["successes"])),
+             ("survival", partial(_survival_plot, time=r["time"], cap=cap))]  # fmt: skip
+    return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": plots}
 
 
 def _by_object(env: RotateEnv, parts: list[dict]) -> dict:

@@ -640,12 +640,12 @@ class Task(HandEnv):
                     groups[group].append((x.name, wide, f"{x.unit or '1'}; {x.text or 'command'}"))
         if not groups["critic"]:
             groups["critic"] = groups["actor"]
-        ends = [(x.name, x.text) for x in self._terms["done"] if t["terminations"][x.name]]
+        ends, words = [(x.name, x.text) for x in self._terms["done"] if t["terminations"][x.name]], self.reward_words()
         return {
             "observations": groups,
             "action": self.action_rows(),
-            "rewards": [row for row in self.reward_rows() if row[1]],
-            "terminations": [*ends, *self.usual_ends()],
+            "rewards": [(name, weight, words[name]) for name, weight in t["rewards"].items() if weight],
+            "terminations": [*ends, ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
             "randomization": self.sampler.rows(),
             "notes": [*self.notes(), *self.hand_notes()],
             "headline": [f"task/{name}" for name in list(self.last)[:3]],
