@@ -200,7 +200,7 @@ def test_cfg_prints_the_settings_and_does_nothing(configs, place, capfd):
     ("learning_rate=1", "did you mean agent.algorithm.learning_rate?"),
     ("sim.engin.x=1", "unknown setting 'sim.engin.x'"),
     ("worlds.x=1", "worlds is a single value"),
-    ("task=gras", "task=gras: no such task; task can be dummy, grasp"),
+    ("task=gras", "task=gras: no such task; task can be grasp, rotate"),
     ("task=gras", "did you mean grasp?"),
     ("servo=my.yaml", "servo_file=my.yaml"),
     ("servo_file=none.yaml", "none.yaml"),

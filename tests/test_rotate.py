@@ -532,4 +532,4 @@ def test_evaluation_counts(monkeypatch):
     assert set(result) == {"metrics", "tables", "frames", "plots"}
     assert len(result["frames"]["qpos"][1]) < len(result["frames"]["qpos"][0])
     shown = clips_of(result["frames"])
-    assert len(shown) == 4 and shown[0].text[-1] == "successes 3" and len(shown[1].qpos) == len(shown[1].text)
+    assert len(shown) == 4 and shown[0].text[-1] == "successes 4" and len(shown[1].qpos) == len(shown[1].text)
