@@ -54,30 +54,26 @@ def lines(half: Half, path: Path, title: str) -> Path:
 
 def rubber(stretch: np.ndarray, nominal: np.ndarray, fit: Rubber, path: Path) -> Path:
     """Return the stress over stretch with the Mooney-Rivlin fit."""
-    figure = Figure(figsize=(7, 4.6), layout="constrained")
-    ax = figure.subplots()
-    ax.plot(stretch, 1e-6 * nominal, "o", ms=4, label="measured")
     x = np.linspace(*fit.stretch, 200)
     label = f"c10 {fit.c10 / 1e3:.1f} kPa, c01 {fit.c01 / 1e3:.1f} kPa, held out {fit.held_out / 1e3:.1f} kPa"
-    ax.plot(x, 1e-6 * stress(x, fit.c10, fit.c01), label=label)
-    ax.set(xlabel="stretch", ylabel="nominal stress, MPa")
-    ax.legend()
-    ax.grid(alpha=0.25)
-    files.picture(figure, path, dpi=120)
-    return path
+    line = x, 1e-6 * stress(x, fit.c10, fit.c01), label
+    return _fitted((stretch, 1e-6 * nominal), line, "o", "stretch", "nominal stress, MPa", path)
 
 
 def press(depth: np.ndarray, force: np.ndarray, fit: Stiffness, path: Path) -> Path:
     """Force over depth with the linear stiffness."""
+    label, most = f"{fit.value:.0f} N/m, held out {fit.held_out:.2f} N", depth.max()
+    line = [0, 1e3 * most], [0, fit.value * most], label
+    return _fitted((1e3 * depth, force), line, ".-", "depth, mm", "force, N", path)
+
+
+def _fitted(measured: tuple, line: tuple, mark: str, across: str, up: str, path: Path) -> Path:
+    """Draw points (x, y) and what was fitted to them (x, y, label)."""
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     ax = figure.subplots()
-    ax.plot(1e3 * depth, force, ".-", lw=0.6, label="measured")
-    ax.plot(
-        [0, 1e3 * depth.max()],
-        [0, fit.value * depth.max()],
-        label=f"{fit.value:.0f} N/m, held out {fit.held_out:.2f} N",
-    )
-    ax.set(xlabel="depth, mm", ylabel="force, N")
+    ax.plot(*measured, mark, ms=4, lw=0.6, label="measured")
+    ax.plot(*line[:2], label=line[2])
+    ax.set(xlabel=across, ylabel=up)
     ax.legend()
     ax.grid(alpha=0.25)
     files.picture(figure, path, dpi=120)

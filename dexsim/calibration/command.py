@@ -47,28 +47,23 @@ def run(s: dict[str, Any], reading: dict[str, dict[str, str]]) -> int:
     hand = load_hand(s["hand"], s["hand_mirror"])
     out = Path(str(s["out"])).expanduser()
     given = [Path(p.strip()) for k in ("real", "sim", "touch", "curve") if s[k] for p in str(s[k]).split(",")]
-    made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES["real" if s["realistic"] else "sim"]] * s[
-        "simulate"
-    ]
+    key = "real" if s["realistic"] else "sim"
+    made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES[key]] * s["simulate"]
     outputs.claim(out, "out=", (*RESULTS, *made_here), given)
     report: dict[str, Any] = {"schema": 1, "robot": hand.robot, "normalization": s["normalization"], "source": {}}
     if s["simulate"]:
         quiet_warp("cpu")
         every = [j for j, f in zip(hand.joints, hand.finger_of_joint, strict=True) if f >= 0]
         joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else every
-        name = "presses_realistic" if s["realistic"] else "presses_sim"
+        how = s["servo"], int(s["levels"]), s["realistic"], int(s["seed"])
         with outputs.staged(out) as stage:
-            made = simulate.make(
-                stage / name, hand, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"])
-            )
-        made = [out / p.relative_to(stage) for p in made]
-        key = "real" if s["realistic"] else "sim"
+            made = simulate.make(stage / PRESSES[key], hand, joints, *how)
         if s[key] is None:
-            s[key] = ",".join(str(p) for p in made)
+            s[key] = ",".join(str(out / p.relative_to(stage)) for p in made)
     if s["simulate_touch"]:
         quiet_warp("cpu")
         with outputs.staged(out) as stage:
-            rolled = simulate.make_rolled(stage / "pads", hand, True, int(s["seed"]), s["faults"])
+            rolled = simulate.make_rolled(stage / PRESSES["touch"], hand, True, int(s["seed"]), s["faults"])
         s["touch"] = s["touch"] or str(out / rolled.relative_to(stage))
     with outputs.staged(out) as stage:
         assumed = _fits(s, reading, stage, report, hand)
@@ -133,13 +128,10 @@ def _print_half(half: Any, key: str, symbol: str) -> None:
         if f is None:
             rows.append((joint, "-", "-", "-", "-", "-", "-", half.left_out.get(joint, "")))
             continue
-        rows.append(
-            (
-                joint, f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]", f"{f.slope:.4g} {f.offset:+.2f}",
-                f"{f.r2:.4f}", f"{f.held_out:.2f}", f"{100 * f.hysteresis:.0f}",
-                f"{f.effort_max:.3g} / {f.force_max:.3g}", "; ".join(f.why) or "linear",
-            )
-        )
+        ratio = f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]"
+        rows.append((joint, ratio, f"{f.slope:.4g} {f.offset:+.2f}", f"{f.r2:.4f}", f"{f.held_out:.2f}",
+                     f"{100 * f.hysteresis:.0f}", f"{f.effort_max:.3g} / {f.force_max:.3g}",
+                     "; ".join(f.why) or "linear"))  # fmt: skip
     head = (
         "joint", f"{symbol} N/{half.unit}, 95 %", "slope, offset", "R2", "held out N", "hysteresis %",
         f"max {half.unit} / N", "verdict",
@@ -154,23 +146,11 @@ def _print_ratio(joints: dict[str, Any]) -> None:
 
     rows = []
     for joint, e in joints.items():
-        c = e.get("current_per_torque")
-        rows.append(
-            (
-                joint,
-                "-" if c is None else f"{c['value']:.4g} [{c['low']:.4g}, {c['high']:.4g}]",
-                f"{e.get('current_max', float('nan')):.3g}",
-                f"{e.get('torque_seen', float('nan')):.3g}",
-            )
-        )
-    print(
-        table(
-            "current for torque (equal fingertip force)",
-            ("joint", "A per N.m, 95 %", "I_max A", "tau_max pressed N.m"),
-            rows,
-        )
-        + "\n"
-    )
+        c, most = e.get("current_per_torque"), [e.get(k, float("nan")) for k in ("current_max", "torque_seen")]
+        known = "-" if c is None else f"{c['value']:.4g} [{c['low']:.4g}, {c['high']:.4g}]"
+        rows.append((joint, known, *(f"{x:.3g}" for x in most)))
+    head = ("joint", "A per N.m, 95 %", "I_max A", "tau_max pressed N.m")
+    print(table("current for torque (equal fingertip force)", head, rows) + "\n")
 
 
 def _touch(s: dict[str, Any], reading: dict[str, dict[str, str]], out: Path, hand: Hand) -> dict[str, Any]:

@@ -64,18 +64,14 @@ class LineFit:
 
     def table(self) -> dict[str, object]:
         """Return the plain numbers, rounded to 6 digits."""
-
-        def nice(x: float) -> float:
-            return float(f"{x:.6g}")
-
-        return {
-            "ratio": {"value": nice(self.ratio), "low": nice(self.ratio_low), "high": nice(self.ratio_high)},
-            "slope": {"value": nice(self.slope), "low": nice(self.slope_low), "high": nice(self.slope_high)},
-            "offset_N": nice(self.offset), "r2": nice(self.r2), "r2_through_zero": nice(self.r2_ratio),
-            "held_out_N": nice(self.held_out),
-            "hysteresis": nice(self.hysteresis), "bend": nice(self.bend), "effort_max": nice(self.effort_max),
-            "force_max_N": nice(self.force_max), "presses": self.count, "linear": self.linear, "why": list(self.why),
-        }  # fmt: skip
+        x = {k: float(f"{v:.6g}") for k, v in vars(self).items() if isinstance(v, float)}
+        out: dict[str, object] = {
+            k: {"value": x[k], "low": x[f"{k}_low"], "high": x[f"{k}_high"]} for k in ("ratio", "slope")
+        }
+        named = {"offset_N": "offset", "r2": "r2", "r2_through_zero": "r2_ratio", "held_out_N": "held_out",
+                 "hysteresis": "hysteresis", "bend": "bend", "effort_max": "effort_max", "force_max_N": "force_max"}
+        return out | {k: x[v] for k, v in named.items()} | {
+            "presses": self.count, "linear": self.linear, "why": list(self.why)}  # fmt: skip
 
 
 def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:

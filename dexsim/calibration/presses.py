@@ -45,33 +45,21 @@ def levels_of(recording: Recording, hand: Hand) -> dict[str, Levels]:
         )
     finger = dict(zip(hand.joints, hand.finger_of_joint, strict=True))
     joints = [j for j in recording.joints if finger.get(j, -1) >= 0]  # a wrist presses with no fingertip
-    out: dict[str, Levels] = {}
     column = {j: recording.joints.index(j) for j in joints}
     lost = [j for j in joints if np.isnan(effort.value[:, column[j]]).all()]
     if len(lost) == len(joints):
-        raise UserError(
-            f"{recording.path}: the effort's sign is not known; state meta.effort_sign=+1 or -1"
-        )
+        raise UserError(f"{recording.path}: the effort's sign is not known; state meta.effort_sign=+1 or -1")
     holds = _holds(recording)
-    moving = {j: _pressing(recording, column[j], holds) for j in joints if j not in lost}
-    if any(len(w) >= 3 for w in moving.values()):
-        for joint, windows in moving.items():
-            if len(windows) >= 3:
-                levels = _collect(recording, effort, force, full, finger[joint], column[joint], windows)
-                if levels is not None:
-                    out[joint] = levels
-        return out
-    steady = _steady(force)
-    for joint in joints:
-        if joint in lost:
-            continue
-        touched = [w for w in steady if force.value[w[0] : w[1], finger[joint]].mean() > CONTACT]
-        times = [(force.t[a], force.t[b - 1], float("nan")) for a, b in touched]
-        if len(times) >= 3:
-            levels = _collect(recording, effort, force, full, finger[joint], column[joint], times)
-            if levels is not None:
-                out[joint] = levels
-    return out
+    windows = {j: _pressing(recording, column[j], holds) for j in joints if j not in lost}
+    if all(len(w) < 3 for w in windows.values()):  # pressed from outside
+        steady = [(a, b, float(force.t[a]), float(force.t[b - 1])) for a, b in _steady(force)]
+        for j in windows:
+            pressed = [w for w in steady if force.value[w[0] : w[1], finger[j]].mean() > CONTACT]
+            windows[j] = [(begin, end, float("nan")) for *_, begin, end in pressed]
+    found = {
+        j: _collect(recording, effort, force, full, finger[j], column[j], w) for j, w in windows.items() if len(w) >= 3
+    }
+    return {j: levels for j, levels in found.items() if levels is not None}
 
 
 def _holds(recording: Recording) -> list[tuple[float, float]]:

@@ -174,9 +174,8 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
 
 
 def make_rolled(
-    out: str | Path, hand: Hand, realistic: bool = True, seed: int = 0, faults: bool = False,
-    say: Callable[[str], None] = print,
-) -> Path:  # fmt: skip
+    out: str | Path, hand: Hand, realistic: bool = True, seed: int = 0, faults: bool = False
+) -> Path:
     """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on one finger, as
     a rehearsal; what was planted is said."""
     from dexsim.console import folders
@@ -192,15 +191,13 @@ def make_rolled(
         dead, swap = ([int(x * pads_of(hand).count[f]) for x in planted] for planted in (PLANTED_DEAD, PLANTED_SWAP))
         z[:, f, dead] = 0.0
         z[:, f, swap] = z[:, f, swap[::-1]]
-        say(
-            f"planted  {hand.finger_names[f]} finger: dead {dead}, swapped {tuple(swap)}; every pad: gains of 15 %"
-            " spread"
-        )
+        what = f"dead {dead}, swapped {tuple(swap)}; every pad: gains of 15 % spread"
+        print(f"planted  {hand.finger_names[f]} finger: {what}")
     if realistic:
         recording = delivered(recording, seed)
     path = folders.make(Path(out).expanduser(), "out=") / "rolled.mcap"
     write(path, recording)
-    say(f"mcap     {path.parent.name}/{path.name}: {recording.duration:.1f} s")
+    print(f"mcap     {path.parent.name}/{path.name}: {recording.duration:.1f} s")
     return path
 
 
