@@ -83,6 +83,11 @@ class Step:
     figures: dict[str, Any] = field(default_factory=dict)
     picture: str = ""
 
+    def judge(self, verdict: str, text: str) -> None:
+        """Say what speaks against a good result."""
+        self.verdict = verdict
+        self.text.append(text)
+
 
 @dataclass
 class Trace:
@@ -150,6 +155,12 @@ class Session:
             self.clock.sleep_until(self.clock.now() + PERIOD)
             self.driver.read()
         return proof or (False, "the hand has not said that it let go")
+
+    @property
+    def newest(self) -> HandState:
+        """The newest reading, once there is one."""
+        assert self.state is not None
+        return self.state
 
     def watch(self, seconds: float, period: float = PERIOD) -> Trace:
         """Read every `period` s, and send nothing."""
@@ -243,8 +254,7 @@ class Hour:
             f"encoders at rest: {np.median(noise):.4f} rad (training draws task.sensors.joint_noise=0.003)",
         ]
         if rate < 80 or gaps.max() > 110:
-            step.verdict = "look"
-            step.text.append("slower than the 9.6 ms a cycle that others measure: is another program on the port?")
+            step.judge("look", "slower than the 9.6 ms a cycle that others measure: is another program on the port?")
         step.picture = _picture(lambda ax: (ax.hist(gaps, bins=40), ax.set_xlabel("ms between readings")))
         return step
 
@@ -313,11 +323,9 @@ class Hour:
         step.text = [text, f"in 4 s after: the largest current {load:.0f} mA, joints moved by up to {moved:.2f} rad"]
         step.figures = {"confirmed": ok, "current_mA": load, "moved_rad": moved}
         if not ok or load > 30:
-            step.verdict = "bad"
-            step.text.append("it still resists: do not run a policy before you know how to cut its power at once")
+            step.judge("bad", "it still resists: do not run a policy before you know how to cut its power at once")
         elif moved < MOVED:
-            step.verdict = "look"
-            step.text.append("nobody moved a finger: that it gives way is not shown")
+            step.judge("look", "nobody moved a finger: that it gives way is not shown")
         return step
 
     def zero(self) -> Step:
@@ -328,9 +336,8 @@ class Hour:
         frames, silent = [], np.zeros(self.s.taxels[0], bool)
         for _ in range(50):
             self.s.watch(2 * PERIOD)
-            assert self.s.state is not None
-            frames.append(self.s.state.tactile.astype(float))
-            silent |= False if self.s.state.silent is None else self.s.state.silent
+            frames.append(self.s.newest.tactile.astype(float))
+            silent |= False if self.s.newest.silent is None else self.s.newest.silent
         bias = np.mean(frames, 0)[..., 2]
         names = self.hand.finger_names
         step.figures = {n: {"largest_counts": float(bias[f].max()), "taxels_not_zero": int((bias[f] > 0.5).sum()),
@@ -339,8 +346,7 @@ class Hour:
         step.text = [f"{n}: {v['taxels_not_zero']} taxels are not at zero, the largest {v['largest_counts']:.0f} counts"
                      for n, v in step.figures.items()]  # fmt: skip
         if silent.any():
-            step.verdict = "look"
-            step.text.append("boards that say nothing: " + ", ".join(np.array(names)[silent]))
+            step.judge("look", "boards that say nothing: " + ", ".join(np.array(names)[silent]))
         return step
 
     def taxels(self) -> Step:
@@ -359,13 +365,11 @@ class Hour:
             best = np.zeros(self.s.taxels[1])
             for _ in range(800 if self.s.asks else 100):
                 self.s.watch(PERIOD)
-                assert self.s.state is not None
-                best = np.maximum(best, self.s.state.tactile[f, :, 2])
-                if best.max() > 20 and self.s.state.tactile[f, :, 2].max() < 5:
+                best = np.maximum(best, self.s.newest.tactile[f, :, 2])
+                if best.max() > 20 and self.s.newest.tactile[f, :, 2].max() < 5:
                     break
             if best.max() < 5:
-                step.text.append(f"{name}: nobody pressed it")
-                step.verdict = "look"
+                step.judge("look", f"{name}: nobody pressed it")
                 continue
             k = int(best.argmax())
             column, row = divmod(k, 12)
@@ -392,8 +396,7 @@ class Hour:
         step, rows = Step("lowest", "The lowest current that moves each joint"), {}
         for j in self.joints:
             self.s.move(_still(self.middle), 1.0, self.amps)
-            assert self.s.state is not None
-            at, goal = float(self.s.state.position[j]), self.middle.copy()
+            at, goal = float(self.s.newest.position[j]), self.middle.copy()
             goal[j] = np.clip(at + 0.3, *self.hand.limits[j]) if at < self.hand.limits[j].mean() else at - 0.3
             found = None
             for limit in np.arange(10.0, self.most + 1, 10.0):
@@ -407,8 +410,7 @@ class Hour:
         over = f"over {self.most:g}"
         step.text = [f"{n}: {over if x is None else format(x, 'g')} mA" for n, x in rows.items()]
         if still:
-            step.verdict = "bad"
-            step.text.append(f"{', '.join(still)} did not move at all: blocked, or switched off?")
+            step.judge("bad", f"{', '.join(still)} did not move at all: blocked, or switched off?")
         return step
 
     def excite(self) -> Step:
@@ -440,8 +442,7 @@ class Hour:
             (self.out / "servo.yaml").write_bytes((folder / "servo.yaml").read_bytes())
             step.text.append("servo.yaml holds the drives that the diagnosis fitted; diagnosis/report.html says why")
         else:
-            step.verdict = "look"
-            step.text.append(f"the diagnosis ended: {(servo.stderr or servo.stdout).strip().splitlines()[-1:]}")
+            step.judge("look", f"the diagnosis ended: {(servo.stderr or servo.stdout).strip().splitlines()[-1:]}")
         return step
 
     def calibrate(self) -> Step:
@@ -488,10 +489,9 @@ class Hour:
                 self.say(f"  hold something hard to the fingertip that {name} moves, so that it cannot close")
                 self.s.move(_still(self.middle), 3.0 if self.s.asks else 1.0, self.amps)
                 block(j)
-                assert self.s.state is not None
                 for lead in LEADS:
                     goal = self.middle.copy()
-                    goal[j] = self.s.state.position[j] + lead
+                    goal[j] = self.s.newest.position[j] + lead
                     self.s.move(_still(goal), HOLD, self.most, speed=3.0)
                 block(-1)
                 self.s.move(_still(self.middle), 0.5, self.amps)
@@ -552,8 +552,7 @@ class Hour:
         if noise is not None:
             step.text.append(f"encoders at rest {noise:.4f} rad, in training {quiet:g}")
         if slow or stiff or others or short or off or (noise or 0.0) > quiet:
-            step.verdict = "look"
-            step.text.append("train with servo_file=servo.yaml, which holds what was measured here")
+            step.judge("look", "train with servo_file=servo.yaml, which holds what was measured here")
         return step
 
 
