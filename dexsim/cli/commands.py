@@ -15,7 +15,7 @@ MakeEnv = Callable[..., Any]
 
 
 def train(argv: list[str], config_dir: Path = CONFIGS, make_env: MakeEnv | None = None) -> int:
-    """Return one training run, or a sweep of them. make_env replaces `dexsim.tasks.make_env` (tests)."""
+    """Run one training, or a sweep of them. make_env replaces `dexsim.tasks.make_env` (tests)."""
     from dexsim.cli import start, sweep
 
     if sweep.wanted(argv):
@@ -29,7 +29,7 @@ def train(argv: list[str], config_dir: Path = CONFIGS, make_env: MakeEnv | None 
 
 
 def play(argv: list[str], config_dir: Path = CONFIGS, make_env: MakeEnv | None = None) -> int:
-    """Return episodes with a policy, a live view, or a recording's replay."""
+    """Play episodes with a policy, a live view, or a recording's replay."""
     from dexsim.cli import start
 
     ready = start.for_play(argv, config_dir)
@@ -41,7 +41,7 @@ def play(argv: list[str], config_dir: Path = CONFIGS, make_env: MakeEnv | None =
 
 
 def calibrate(argv: list[str], config_dir: Path = CONFIGS) -> int:
-    """Return current to torque and force, taxels, rubber."""
+    """Measure current to torque and force, taxels, rubber."""
     from dexsim.calibration import command
 
     return command.main(argv, config_dir)

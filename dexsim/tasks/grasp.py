@@ -22,7 +22,7 @@ from dexsim.tasks.terms import VECTOR, done, observe
 
 
 def _is_range(pair: Any) -> bool:
-    """Return two numbers, 0 <= low <= high <= 1."""
+    """Tell whether it is two numbers, 0 <= low <= high <= 1."""
     if not isinstance(pair, list) or len(pair) != 2:
         return False
     return all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in pair) and 0 <= pair[0] <= pair[1] <= 1

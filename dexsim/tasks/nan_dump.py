@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 KEEP = 10
 """Files a run writes at most; `nan_count` goes on counting."""
-"""Of a file, packed or not."""
-
-
 _NONE = 2**31 - 1
 _THREADS = 64  # that copy one field
 

@@ -46,7 +46,7 @@ class Held(Task):
 
     @classmethod
     def check_objects(cls, task: dict) -> None:
-        """Raises UserError for objects that this task cannot turn."""
+        """Raise UserError for objects that this task cannot turn."""
         objects, tips = task["objects"], not cls.TAKES_OBJECTS
         if not objects["train"]:
             raise UserError(f"task.objects.train=[]: must name '{CUBE}'{'' if tips else ' or mesh files'}")

@@ -73,7 +73,7 @@ class FingertipEnv(TipTrials, RotateEnv):
 
     @classmethod
     def another_world(cls, u: Any, friction: float, size: float) -> dict[str, Any]:
-        """Return None: its camera is no IMU."""
+        """Draw nothing: its camera is no IMU."""
         return {}
 
     def adapt(self) -> Mapping[str, Mapping[str, Any]]:

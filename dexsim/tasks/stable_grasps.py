@@ -20,13 +20,12 @@ from dexsim.hand import Hand
 
 FOUND = "held_cubes.npz"
 """File of a hand's folder in which a search keeps what it found."""
-"""Of a file of held poses, packed or not."""
 FINGERTIPS = Path(__file__).parents[1] / "assets" / "grasps" / "fingertips.npz"
 """Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
 
 
 CUBE = "box"
-"""What cubes are called among the objects of a task."""
+"""Name of cubes among the objects of a task."""
 ROWS = ("edge", "hand", "target", "pose")
 
 
