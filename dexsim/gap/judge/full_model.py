@@ -46,6 +46,7 @@ from dexsim.recording.mechanism import (
 )
 from dexsim.recording.schema import Recording, Series
 from dexsim.sim import make_engine
+from dexsim.sim.make import engine_of
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.batch import Windows
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 REPLAY = ("mujoco", "warp", "none")
 TURNS = 2  # times that the best of each joint together is tried
 PROBE = 1.0  # s of what was held out that are replayed first, for how long all of it takes
+HEAT, WORTH = 0.1, 20.0  # of each part by which what is far behind is told, where a part is as long [s]
+BEHIND = 2.0  # x the error of another: no whole replay of it
 KINDS = 0.7  # of the time that there is for the choice: what every joint as its own kind may take
 MORE = 2.0  # times as much of it is replayed, or none again
 LEAST = 0.1  # of each part held out: by less nothing is chosen
@@ -61,6 +64,7 @@ STEPPED = 4  # worlds that a step takes as long for as for what is around them
 REPLAYED, TOLD = "what may be written", 500  # steps from one word on it to the next
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
+LOOK = 20  # steps from one look to the next at whether anything touches, where contacts are not simulated
 BELIEVED = "believed"  # candidate: nothing is changed
 WHOLE = ", as fitted"  # of a fit's candidate: with the figures that else only absorb the search's plant's inaccuracy
 # of candidates that follow alike the first is written
@@ -359,7 +363,16 @@ def free_runs(
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
         given = [worlds[i] for i in mine]
-        return _batch(spec, joints, given, together, device, timestep, engine, torque, partial(tell, k))
+        batch = partial(_batch, spec, joints, given, together, device, timestep, engine, torque, partial(tell, k))
+        in_air = batch(False)
+
+        def moved() -> list:
+            try:
+                return in_air()
+            except Touching:
+                return batch(True)()
+
+        return moved
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
@@ -380,8 +393,10 @@ def _batch(
     kind: str,
     torque: bool,
     tell: Callable[[float], None],
+    contacts: bool,
 ) -> Callable[[], list]:
-    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done."""
+    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done;
+    contacts: simulated; without them C MuJoCo takes two thirds of the time, and `Touching` is raised where any is."""
     spec = (worlds[0].spec or spec).copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -389,6 +404,11 @@ def _batch(
     for joint in led:
         spec.joint(joint).armature = HEAVY
     N = len(worlds)
+    look = None
+    if not contacts and engine_of(kind, device) == "mujoco":
+        solid = spec.compile()
+        look = partial(_apart, solid, mujoco.MjData(solid))
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in group])
@@ -437,7 +457,7 @@ def _batch(
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
 
     def moved() -> list:
-        shown = _stepped(engine, servo, changes, seen, given, path, tell)
+        shown = _stepped(engine, servo, changes, seen, given, path, tell, look)
         tell(1.0)
         q, *tau = (x.cpu().numpy().astype(float) for x in (shown, given) if x is not None)
         return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
@@ -494,10 +514,11 @@ def _stepped(
     given: torch.Tensor | None,
     lead: Callable[[int], None],
     tell: Callable[[float], None],
+    look: Callable[[np.ndarray], None] | None,
 ) -> torch.Tensor:
     """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
-    given [S, N, J]: filled with the drives' torques; lead: of `_path`; tell: how much
-    of it is done."""
+    given [S, N, J]: filled with the drives' torques; lead: of `_path`; tell: how much of it is done; look: raises
+    `Touching` where anything touches at positions [N, nq] (None: contacts are simulated)."""
     steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
@@ -511,6 +532,8 @@ def _stepped(
             if k in changes.when:
                 changes.before(k)
             lead(k)
+            if look is not None and not k % LOOK:
+                look(at)
             if kept is None:
                 seen[k].copy_(servo.position())
             else:
@@ -541,6 +564,21 @@ def _stepped(
             if given is not None:
                 given[k].copy_(servo.torque)
     return seen
+
+
+class Touching(Exception):
+    """Something touches where contacts are not simulated."""
+
+
+def _apart(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> None:
+    """Raise `Touching` where anything of a model touches at one of qpos [N, nq]."""
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon:
+            raise Touching
 
 
 class Changes:
@@ -647,19 +685,35 @@ def write_best(
     # of each part; s of a choice
     share, pace = min(1.0, PROBE / max(kept.seconds)) if math.isfinite(room()) else 1.0, 0.0
 
-    def replayed(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
-        """Return rms by joint of each choice."""
+    def replayed(choices: Sequence[dict[str, str]], of: float = 1.0) -> list[dict[str, float]]:
+        """Return rms by joint of each choice; of: of the share of each part."""
         nonlocal pace
         if not choices:
             return []
         begun = time.monotonic()
         given = [files(m, cases, {j: by[j][name] for j, name in x.items()})[:2] for x in choices]
-        found = kept.missed(given, share, device, engine)
+        found = kept.missed(given, of * share, device, engine)
         pace = max(pace, (time.monotonic() - begun) / len(choices))
         return [{j: rms(x) for j, x in missed.items()} for missed in found]
 
+    def raced(choices: Sequence[dict[str, str]]) -> list[dict[str, float]]:
+        """Return rms by joint of each choice; of what is far behind after the first of each part, as many times that of
+        another as there."""
+        if share * max(kept.seconds) < WORTH:
+            return replayed(choices)
+        first = replayed(choices, HEAT)
+        late = behind(choices, first, noise)
+        ahead = [k for k in range(len(choices)) if k not in late]
+        out = dict(zip(ahead, replayed([choices[k] for k in ahead]), strict=True))
+        for k in late:
+            lead = {j: min(ahead, key=lambda i: first[i][j]) for j in by}  # noqa: B023
+            out[k] = {j: first[k][j] * out[i][j] / max(first[i][j], 1e-12) for j, i in lead.items()}
+        if not late <= behind(choices, [out[k] for k in range(len(choices))], noise):
+            out |= zip(sorted(late), replayed([choices[k] for k in sorted(late)]), strict=True)
+        return [out[k] for k in range(len(choices))]
+
     while True:
-        done = list(zip(kinds, replayed(kinds), strict=True))
+        done = list(zip(kinds, raced(kinds), strict=True))
         more = KINDS * room() / max(pace * len(kinds), 1e-9)
         if share >= 1.0 or more < MORE:
             break
@@ -750,10 +804,30 @@ class Kept:
         ])  # fmt: skip
 
 
+def behind(
+    choices: Sequence[Mapping[str, str]], missed: Sequence[Mapping[str, float]], noise: Mapping[str, float]
+) -> set[int]:
+    """Return numbers of the choices that are not written of any joint (`choose`), whatever the rest of a replay shows:
+    of each joint another is the same, or misses half as much, or comes before it in `ORDER` and misses no more than
+    noise does. missed: rms by joint of each; noise: floor by joint."""
+    out: set[int] = set()
+
+    def lost(k: int, i: int, j: str) -> bool:
+        mine, other = ORDER.index(choices[k][j]), ORDER.index(choices[i][j])
+        quiet = missed[i][j] <= JUDGE.within**2 * noise[j]
+        return other == mine or (quiet and other < mine) or BEHIND * missed[i][j] < missed[k][j]
+
+    for k in sorted(range(len(choices)), key=lambda k: -max(missed[k].values())):
+        others = [i for i in range(len(choices)) if i != k and i not in out]
+        if all(any(lost(k, i, j) for i in others) for j in noise if j in choices[k]):
+            out.add(k)
+    return out
+
+
 def kinds_of(by: Mapping[str, Collection[str]]) -> list[dict[str, str]]:
-    """Return choices: every joint as its own kind, of `ORDER`, where it has such a candidate."""
+    """Return choices: every joint as its own kind, of `ORDER`, where it has such a candidate, else as its first."""
     there = [k for k in ORDER if any(k in x for x in by.values())]
-    return [{j: k if k in x else next(iter(x)) for j, x in by.items()} for k in there]
+    return [{j: k if k in x else min(x, key=ORDER.index) for j, x in by.items()} for k in there]
 
 
 def composed(
@@ -777,7 +851,14 @@ def composed(
     chosen = {j: choose(x, noise[j]) for j, x in here.items()}
     # the better of belief and plain model of each joint: replayed beside the first, it takes hardly more time
     plainly = {j: [n for n in (BELIEVED, "plain") if n in x] for j, x in by.items()}
-    safe_of = lambda other: {j: min(x, key=errors[j].__getitem__) if x else other[j] for j, x in plainly.items()}  # noqa: E731
+    quiet = {j: JUDGE.within**2 * noise[j] for j in by}
+    left = lambda j, name: max(errors[j][name], quiet[j])  # noqa: E731
+
+    def safe_of(other: dict[str, str]) -> dict[str, str]:
+        best = {j: min(x, key=errors[j].__getitem__) if x else other[j] for j, x in plainly.items()}
+        alike = {j: {n, *(k for k in plainly[j] if left(j, k) <= left(j, n))} for j, n in best.items()}
+        return next((c for c, _ in done[:first] if all(c[j] in alike[j] for j in by)), best)
+
     while chosen not in [c for c, _ in done] and len(done) < first + TURNS and not passed(1):
         together = replayed([chosen] if passed(2) else [chosen, safe_of(chosen)])[0]
         done.append((chosen, together))
@@ -795,8 +876,7 @@ def composed(
     safe = safe_of(chosen)
     if safe not in [c for c, _ in done] and not passed(1):
         done += zip([safe], replayed([safe]), strict=True)
-    quiet = {j: JUDGE.within**2 * noise[j] for j in by}
-    worst = lambda x: max([x[j] / max(errors[j][safe[j]], quiet[j]) for j in by if plainly[j]], default=1.0)  # noqa: E731
+    worst = lambda x: max([x[j] / left(j, safe[j]) for j in by if plainly[j]], default=1.0)  # noqa: E731
     fair = [(c, x) for c, x in done if worst(x) <= 1 + BELIEF.tolerance] or [min(done, key=lambda d: worst(d[1]))]
     alike = lambda c: BELIEF.tolerance if c == chosen else 0.0  # noqa: E731
     total = lambda d: sum(math.log(max(d[1][j], quiet[j])) - alike(d[0]) for j in by)  # noqa: E731

@@ -27,7 +27,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
-from dexsim.gap.search.fit import Box, Fitter, Residuals
+from dexsim.gap.search.fit import Box, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
@@ -168,7 +168,10 @@ def fitted(
     start = np.clip(box.centre, box.low, box.high)
     tried = np.array([start, *fits])
     best = tried[int(np.argmin(runs.loss(runs.residuals(params, tried))))]
-    return params, best if passed() else runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3).x
+    if passed():
+        return params, best
+    slopes = slopes_of(runs.fit(params, x0=best, iterations=0))
+    return params, runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False).x
 
 
 def judged(
