@@ -60,6 +60,31 @@ def test_worlds_of_a_batch_move_as_a_replay_of_each_does():
         assert np.abs(q[:2000, 0] - alone.position[:, 0]).max() < 1e-9 < np.abs(q - together[0]).max(), k
 
 
+def test_a_link_that_meets_a_wall_in_a_replay_is_stopped_as_in_play():
+    m = mechanism_of(ServoTable.from_dict({"joints": {"*": SERVO}}))
+    m.spec.geom("bob").contype = m.spec.geom("bob").conaffinity = 1
+    t, c = motion(1, 2.0, 0)
+    run = lambda: drive(m, Series(t, c[:, None], COMMANDS, t), ["joint"], 2.0, np.array([c[0]]), timestep=1e-3)  # noqa: E731
+    free = run().position[:, 0]
+    at = 0.5 * (free.max() + free[0])  # the wall is met on the way
+    m.spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.012, 0, 0], pos=[-0.1 * np.sin(at), 0, -0.1 * np.cos(at)]
+    )
+    stopped = run().position[:, 0]
+    q = free_runs(m.spec, ["joint"], [world(m.table, t, c, 2.0, c[0])], timestep=1e-3)[0][:2000, 0]
+    assert np.abs(q - stopped).max() < 1e-9 < 1e-2 < np.abs(free - stopped).max()
+
+
+def test_of_what_is_replayed_whole_only_what_is_far_behind_on_every_joint_is_left_out():
+    kinds = [dict.fromkeys("ab", k) for k in ("found", "refitted", "believed", "plain")]
+    noise = {"a": 1.0, "b": 0.01}
+    # a: all but what is believed are within the noise; b: the plain model is half of what was found
+    missed = [{"a": 1.0, "b": 4.0}, {"a": 1.1, "b": 3.9}, {"a": 9.0, "b": 8.1}, {"a": 1.2, "b": 2.0}]
+    assert full_model.behind(kinds, missed, noise) == {2}
+    missed[3]["b"] = 1.9
+    assert full_model.behind(kinds, missed, noise) == {1, 2}
+
+
 def test_on_several_cores_worlds_move_as_on_one(monkeypatch):
     """In processes of their own, to the last bit; a process that breaks is made up for."""
     table = ServoTable.from_dict({"joints": {"*": SERVO | {"delay": 0.013}}})
