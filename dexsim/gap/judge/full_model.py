@@ -404,7 +404,7 @@ def _batch(
     for joint in led:
         spec.joint(joint).armature = HEAVY
     N = len(worlds)
-    look = None
+    look: Callable[[np.ndarray], None] | None = None
     if not contacts and engine_of(kind, device) == "mujoco":
         solid = spec.compile()
         look = partial(_apart, solid, mujoco.MjData(solid))
