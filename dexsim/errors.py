@@ -15,7 +15,7 @@ class UserError(ValueError):
     """
 
     def __init__(self, message: object = "") -> None:
-        """message: kept to one line that a terminal prints as it stands, whatever line breaks, control characters or
+        """Keep `message` to one line that a terminal prints as it stands, whatever line breaks, control characters or
         lengths a value in it has."""
         super().__init__(_plain(str(message)))
 

@@ -531,5 +531,5 @@ def test_evaluation_counts(monkeypatch):
     assert m["seconds_per_success"] == pytest.approx(4 * m["seconds_to_fall"] / sum(m["consecutive_successes"]["all"]))
     assert set(result) == {"metrics", "tables", "frames", "plots"}
     assert len(result["frames"]["qpos"][1]) < len(result["frames"]["qpos"][0])
-    shown = clips_of(result["frames"])
-    assert len(shown) == 4 and shown[0].text[-1] == "successes 4" and len(shown[1].qpos) == len(shown[1].text)
+    visible = clips_of(result["frames"])
+    assert len(visible) == 4 and visible[0].text[-1] == "successes 4" and len(visible[1].qpos) == len(visible[1].text)

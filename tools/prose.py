@@ -38,6 +38,7 @@ LABELS = {"property", "cached_property", "fixture", "setter", *"observe reward d
 """Decorators of methods whose docstring names a thing."""
 VERBS = set(
     """
+    cap click feel hear
     abort accept accumulate act adapt add adjust advance aggregate aim align allocate allow answer append apply arrange
     ascend ask assemble assert assign attach average await bake balance begin bend bind blend blur bound break bring
     broadcast bucket build bundle cache call capture carry cast catch centre change check choose circle claim clamp
@@ -56,8 +57,9 @@ VERBS = set(
     normalize note notice notify number observe offer open order orient own pack pad paint parse part pass paste
     patch pay perform persist pick pin pipe place plan play plot point poll predict prefer prepare press prevent
     price print probe produce profile project promise propose protect prove prune publish pull push put quantise
-    quantize queue quiet quote raise randomize rank reach read realise reap rebuild receive reckon record redo reduce
-    refer refine refit refresh refuse regenerate register reject relax release reload remap remember remove rename renew
+    quantize queue quiet quote raise randomize rank reach read realise reap rebuild receive reckon recompute record redo
+    reduce refer refine refit refresh refuse regenerate register reject relax release reload remap remember remove
+    rename renew
     render repeat replace replay report request require resample reserve reset resize resolve respond rest restore
     restrict resume retry return reuse reverse rewrite rig rotate round route run sample save say scale scan scatter
     schedule score search see seed select send sense separate serve set settle shadow shape share shift shorten show
