@@ -23,6 +23,8 @@ FOLLOWS, STRAY = 0.9, 0.5
 """Correlation from which on a position follows a command, and below which it does not."""
 LARGEST = 1e6
 """rad (m): no joint gets there; a wheel that turns ten times a second needs four hours."""
+POSSIBLE = {"temperature": (-40.0, 150.0, "degC"), "duty": (-1.02, 1.02, "full drive"),
+            "supply voltage": (0.0, 100.0, "V"), "enabled": (0.0, 1.0, "0 or 1")}  # fmt: skip
 SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousandths of rad/s"}
 
 
@@ -96,12 +98,9 @@ def order(r: Recording) -> Iterator[Finding]:
     exchanged = {whose[j] for j in wrong} == set(wrong)
     for j in wrong:
         k = whose[j]
-        cure = (
-            "the values are in another order: meta.joint_names="
-            + (",".join(names) if exchanged else f"... with {r.joints[j]} where {r.joints[k]} is now")
-            if nameless
-            else f"whose commands are these? remap.{r.joints[j]}=... or, of columns, remap.command.{r.joints[j]}=COLUMN"
-        )
+        right = ",".join(names) if exchanged else f"... with {r.joints[j]} where {r.joints[k]} is now"
+        cure = f"the values are in another order: meta.joint_names={right}" if nameless else (
+            f"whose commands are these? remap.{r.joints[j]}=... or, of columns, remap.command.{r.joints[j]}=COLUMN")
         text = (
             f"command of {r.joints[j]} is not what it follows: that is the command of {r.joints[k]} (correlation "
             f"{like[k, j]:.2f}, with its own {like[j, j]:.2f}); {cure}"
@@ -393,19 +392,12 @@ def units(r: Recording) -> Iterator[Finding]:
             x = series.value[:, j]
             top = float(np.nanmax(np.abs(x)))
             if top > LARGEST and (beyond := (np.abs(x) > LARGEST) & ~spiked(x, name)).any():
-                yield finding(
-                    series,
-                    f"{name} of {joint} is {x[beyond][0]:.4g} in {int(beyond.sum())} of {len(x)} samples, farther than"
-                    " any joint gets",
-                    joint,
-                )
-            elif joint in limits and top > np.abs(limits[joint]).max() + 0.5:
+                text = f"{name} of {joint} is {x[beyond][0]:.4g} in {int(beyond.sum())} of {len(x)} samples, farther"
+                yield finding(series, f"{text} than any joint gets", joint)
+            elif joint in limits and top > (most := np.abs(limits[joint]).max()) + 0.5:
                 guess = "counts?" if is_integer(x) and top > 200 else "degrees?" if top < 400 else "counts?"
-                yield finding(
-                    series,
-                    f"{name} of {joint} reaches {top:.4g} rad, its limit is {np.abs(limits[joint]).max():.3g}: {guess}",
-                    joint,
-                )
+                text = f"{name} of {joint} reaches {top:.4g} rad, its limit is {most:.3g}: {guess}"
+                yield finding(series, text, joint)
             elif not limits and is_integer(x) and top > 100:
                 text = f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts, or registers? State"
                 yield finding(series, f"{text} units.position=ticks:4096, or registers=LOW..HIGH [rad]", joint)
@@ -428,15 +420,11 @@ def units(r: Recording) -> Iterator[Finding]:
                     loose = whose == "position" and known == nearest and 0.5 < ratio / k < 1.3
                     if abs(ratio / k - 1) < 0.1 or loose:
                         named = True
-                        yield finding(
-                            s.position if whose == "position" else c,
-                            f"{whose} of {joint} is {known:.4g} times the other: {unit}?",
-                            joint,
-                        )
+                        text = f"{whose} of {joint} is {known:.4g} times the other: {unit}?"
+                        yield finding(s.position if whose == "position" else c, text, joint)
             if far and not named:
-                yield finding(
-                    s.position, f"position of {joint} goes {ratio:.4g} times as far as its command: which unit?", joint
-                )
+                text = f"position of {joint} goes {ratio:.4g} times as far as its command: which unit?"
+                yield finding(s.position, text, joint)
         if s.velocity is not None and len(s.velocity) > 20 and np.isfinite(s.velocity.value[:, j]).all():
             speed = np.gradient(s.position.value[:, j], s.position.t) if (np.diff(s.position.t) > 0).all() else None
             ratio = None if speed is None else _ratio(_smooth(speed), _smooth(s.velocity.value[:, j]))
@@ -444,20 +432,14 @@ def units(r: Recording) -> Iterator[Finding]:
                 yield finding(s.velocity, f"velocity of {joint} has the opposite sign of its position's change", joint)
             for known, unit in SPEED_RATIOS.items():
                 if ratio is not None and abs(ratio / known - 1) < 0.15:
-                    yield finding(
-                        s.velocity, f"velocity of {joint} is {ratio:.4g} times its position's change: {unit}?", joint
-                    )
+                    text = f"velocity of {joint} is {ratio:.4g} times its position's change: {unit}?"
+                    yield finding(s.velocity, text, joint)
     yield from _effort_units(r, finding)
-    plain = (
-        (r.temperature, "temperature", -40.0, 150.0, "degC"),
-        (r.duty, "duty", -1.02, 1.02, "full drive"),
-        (r.supply_voltage, "supply voltage", 0.0, 100.0, "V"),
-        (r.enabled, "enabled", 0.0, 1.0, "0 or 1"),
-    )
-    for maybe, name, low, high, unit in plain:
-        if maybe is None:
+    there = r.series()
+    for name, (low, high, unit) in POSSIBLE.items():
+        if name not in there:
             continue
-        series = maybe
+        series = there[name]
         bad = (series.value < low) | (series.value > high)
         if name == "duty":  # a wrapped one is found as such
             bad[:, [wrapped(x) is not None for x in series.value.T]] = False
@@ -466,29 +448,16 @@ def units(r: Recording) -> Iterator[Finding]:
             text = (f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
                     f" {low:g} .. {high:g} is possible")  # fmt: skip
             yield series.finding("unit", text, "error", at=at, count=int(bad.sum()))
-    if (
-        r.tactile is not None
-        and r.meta["tactile_unit"] == "N"
-        and is_integer(r.tactile.value)
-        and np.nanmax(np.abs(r.tactile.value)) > 20
-    ):
-        yield finding(
-            r.tactile,
-            f"tactile_unit is N, yet all values are whole and reach {np.nanmax(np.abs(r.tactile.value)):.0f}: counts?",
-        )
-    if (
-        r.tactile is not None
-        and r.meta["tactile_unit"] == "count"
-        and not is_integer(r.tactile.value)
-        and np.nanmax(np.abs(r.tactile.value)) > 0
-    ):
-        yield finding(r.tactile, "tactile_unit is count, yet values are not whole: newtons?")
+    if (touch := there.get("tactile")) is not None:
+        most, whole, unit = np.nanmax(np.abs(touch.value)), is_integer(touch.value), r.meta["tactile_unit"]
+        if unit == "N" and whole and most > 20:
+            yield finding(touch, f"tactile_unit is N, yet all values are whole and reach {most:.0f}: counts?")
+        if unit == "count" and not whole and most > 0:
+            yield finding(touch, "tactile_unit is count, yet values are not whole: newtons?")
     if r.object_pose is not None:
         p = r.object_pose.value
-        if np.nanmedian(np.abs(p[:, :3]).max(1)) > 10:
-            yield finding(
-                r.object_pose, f"the object is {np.nanmedian(np.abs(p[:, :3]).max(1)):.4g} m away: millimetres?"
-            )
+        if (away := np.nanmedian(np.abs(p[:, :3]).max(1))) > 10:
+            yield finding(r.object_pose, f"the object is {away:.4g} m away: millimetres?")
         if np.nanmax(np.abs(np.linalg.norm(p[:, 3:], axis=1) - 1)) > 0.02:
             yield finding(r.object_pose, "the orientation is not a unit quaternion")
     if r.imu is not None:
