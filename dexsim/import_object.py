@@ -14,6 +14,8 @@ from dexsim.assets.objects import own
 from dexsim.assets.objects.mesh import MOST_PARTS, surface
 from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
+from dexsim.surface import across, obj
+from dexsim.surface import hull as convex
 
 USAGE = """usage: dexsim import-object MESH out=FOLDER [key=value ...]     MESH: .stl, .obj, .ply or .off
 
@@ -38,8 +40,8 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = {"scale": "1", "hulls": str(own.PARTS), "out": "", "picture": "true"}
-    meshes = [text for text in argv if "=" not in text]
-    given |= typed.settings([text for text in argv if "=" in text], given)
+    meshes, own_settings = typed.words(argv, given)
+    given |= own_settings
     if len(meshes) != 1:
         raise UserError(f"one mesh is needed, {len(meshes)} given: dexsim import-object mug.obj out=objects/mug")
     if not given["out"]:
@@ -72,20 +74,11 @@ def main(argv: Sequence[str]) -> int:
         own.save(shape, stage / own.FILE)
         for k, hull in enumerate(shape.hulls):
             points = hull @ shape.file_axes.T + shape.file_centre
-            (stage / f"part_{k}.obj").write_text(hull_obj(points), encoding="ascii")
+            (stage / f"part_{k}.obj").write_text(obj(convex(points)), encoding="ascii")
         if given["picture"] == "true":
             draw(shape, path, stage / "picture.png")
     print(f"{out}: dexsim train objects='[{out}]'")
     return 0
-
-
-def hull_obj(points: np.ndarray) -> str:
-    """Return OBJ text of the convex hull of points [V, 3]."""
-    from dexsim.assets.objects.geometry import hull_mesh
-
-    vertices, faces = hull_mesh(points)
-    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices + 0.0]
-    return "\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces + 1)]) + "\n"
 
 
 def draw(shape: Shape, mesh: Path, picture: Path) -> None:
@@ -93,7 +86,6 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
     from matplotlib import colormaps
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-    from scipy.spatial import ConvexHull
 
     assert shape.grid is not None
     triangles = (surface(mesh, shape.file_scale)[0] - shape.file_centre) @ shape.file_axes
@@ -101,7 +93,7 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
     figure = Figure(figsize=(13, 4.6), dpi=90, layout="constrained")
 
     def solid(axes: Any, faces: np.ndarray, colour: np.ndarray) -> None:
-        normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+        normal = across(faces)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
         shade = 0.45 + 0.55 * np.clip(normal @ light, 0, 1)
         axes.add_collection3d(Poly3DCollection(1e3 * faces, facecolors=np.clip(shade[:, None] * colour, 0, 1)))
@@ -114,13 +106,8 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
             solid(axes, triangles[::step], np.array([0.55, 0.65, 0.8]))
         else:
             for n, hull in enumerate(shape.hulls):
-                full = ConvexHull(hull)
-                faces = hull[full.simplices]
-                out = np.einsum(
-                    "ij,ij->i", np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), full.equations[:, :3]
-                )
-                faces[out < 0] = faces[out < 0][:, ::-1]
-                solid(axes, faces, np.array(colormaps["tab20"](n % 20)[:3]))
+                vertices, faces = convex(hull)
+                solid(axes, vertices[faces], np.array(colormaps["tab20"](n % 20)[:3]))
         axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(-half, half), title=title)
         axes.set_box_aspect((1, 1, 1))
         axes.view_init(elev=38, azim=-60)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -43,6 +43,30 @@ def number(key: str, value: Any, low: float = -1e12, high: float = 1e12, unit: s
     return out
 
 
+def interval(
+    key: str, value: Any, unit: str = "", low: float = -1e12, high: float = 1e12, also: str = ""
+) -> tuple[float, float, float]:
+    """Return (low, value, high) of a number, of [low, high], whose value is their middle, or of {value, low, high};
+    texts as `real` takes them. also: what else the place may hold, for messages. Raises UserError, also outside
+    [low, high]."""
+    allowed = f"allowed: {low:g} to {high:g}{'' if unit in ('', '1') else ' ' + unit}"
+    given = [value]
+    if isinstance(value, Mapping) and "value" in value and set(value) <= {"value", "low", "high"}:
+        given = [value.get("low", value["value"]), value["value"], value.get("high", value["value"])]
+    elif isinstance(value, Mapping) or (isinstance(value, Sequence) and not isinstance(value, str)):
+        given = list(value)
+        if isinstance(value, Mapping) or len(given) != 2:
+            raise UserError(f"{key}={value}: must be a number, [low, high] or {{value, low, high}}{also}; {allowed}")
+    numbers = [real(x) for x in given]
+    for x, n in zip(given, numbers, strict=True):
+        if not low <= n <= high:
+            raise UserError(f"{key}={x}: must be a number{also}; {allowed}")
+    if sorted(numbers) != numbers:
+        raise UserError(f"{key}={given}: must rise from low to high; {allowed}")
+    middle = numbers[1] if len(numbers) == 3 else 0.5 * (numbers[0] + numbers[-1])
+    return numbers[0], middle, numbers[-1]
+
+
 def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:
     """Return a whole number as it was typed. Raises UserError for what is none, or lies outside [low, high]."""
     try:
@@ -67,9 +91,18 @@ def settings(argv: Iterable[str], keys: Collection[str], also: tuple[str, ...] =
         if not equals or not (key in keys or key.startswith(also)):
             near = difflib.get_close_matches(key, keys, 1)
             hint = f" (did you mean {near[0]}=?)" if near else ""
-            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(keys)}{hint}")
+            begun = "".join(f", {begin}..." for begin in also)
+            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(keys)}{begun}{hint}")
         out[key] = value
     return out
+
+
+def words(
+    argv: Iterable[str], keys: Collection[str], also: tuple[str, ...] = ()
+) -> tuple[list[str], dict[str, str]]:
+    """Return what of a command line is no key=value, and the `settings` that are."""
+    argv = list(argv)
+    return [text for text in argv if "=" not in text], settings([text for text in argv if "=" in text], keys, also)
 
 
 def truth(key: str, text: str) -> bool:

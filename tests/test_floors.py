@@ -25,7 +25,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "guard",
         "files",
         "console",
-        "outputs yaml_text model_file",
+        "outputs yaml_text model_file surface",
         "assets hand",
         "sim",
         "actuator tactile",

@@ -23,6 +23,7 @@ from dexsim.hand import load_hand
 from dexsim.hand.places import places
 from dexsim.import_hand import command, drop_region, geometry, importing, moves, poses, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
+from dexsim.surface import geom_surface
 from dexsim.tactile.layout import hand_layout
 from dexsim.tasks import held_drops, make_fingertip_grasps
 from dexsim.tasks.reach import Reach
@@ -192,7 +193,7 @@ def test_shapes_are_capsules_and_cores_with_the_rubbers_margin(claw):
     for finger in hand.fingers:
         g = model.geom(finger.geoms[0]).id
         assert model.geom_margin[g] == pytest.approx(shapes.MARGIN)
-        core = geometry.geom_surface(model, g)[0]
+        core = geom_surface(model, g)[0]
         assert len(core) <= shapes.CORNERS
         skin = np.array([[float(x) for x in line.split()[1:]] for line in
                          (claw / f"skin_{finger.name}.obj").read_text().splitlines() if line[0] == "v"])  # fmt: skip
@@ -623,7 +624,7 @@ def test_check_tells_a_joint_that_opens_where_it_should_close(claw, tmp_path, ca
         (["a.urdf", "out=x", "drops=3.5"], "drops=3.5: must be a whole number"),
         (["a.urdf", "out=x", "drops=100001"], "drops=100001: must be a whole number"),
         (["a.urdf", "out=x", "coupled=maybe"], "coupled=maybe: must be keep or independent"),
-        (["a.urdf", "out=x", "colour=red"], "'colour=red': no such setting"),
+        (["a.urdf", "out=x", "colour=red"], "'colour=red': expected key=value"),
         (["a.urdf", "out=x"], "a.urdf does not exist"),
     ],
 )

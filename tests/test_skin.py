@@ -18,13 +18,13 @@ from dexsim.paths import CONFIGS
 from dexsim.tactile import ShapeSet, Tactile, TaxelLayout, hand_layout
 from dexsim.tactile.posed import PosedEngine
 from dexsim.tactile.reference import distance as distance_of
-from dexsim.tactile.reference import spread
 from dexsim.tactile.shapes import bake_convex
 from dexsim.tasks import make_env
 from dexsim.tasks.building import contact_pairs, pad_pairs, self_pairs
 from tests import hands
 from tests.made_hand import made_hand
 from tests.tactile_fixtures import primitives, random_rotation
+from tools.assets.presses import spread
 
 
 @pytest.fixture(scope="module")

@@ -76,46 +76,13 @@ class Value:
         return self.value is None
 
 
-def _number(x: Any) -> float | None:
-    """Return x as a float, or None if it is not a number."""
-    number = typed.real(x)
-    return None if number != number else number
-
-
 def parse_value(raw: Any, column: Column, where: str) -> Value:
     """Return a `servo.yaml` value as a Value inside the column's allowed range; UserError starting with `where`."""
-    allowed = f"allowed: {column.low:g} .. {column.high:g} {column.unit}"
     if isinstance(raw, str) and raw == "unknown":
         return Value(None, column.low, column.high)
-    if isinstance(raw, (list, tuple)):
-        numbers = [_number(x) for x in raw]
-        if len(numbers) != 2:
-            raise UserError(f"{where}: a range needs two numbers [low, high], got {list(raw)}; {allowed}.")
-        low, high, value = numbers[0], numbers[1], None
-    elif isinstance(raw, dict):
-        extra = sorted(set(raw) - {"value", "low", "high"})
-        if extra or "value" not in raw:
-            raise UserError(f"{where}: expected {{value: .., low: .., high: ..}}, got {raw}; {allowed}.")
-        value = _number(raw["value"])
-        low, high = _number(raw.get("low", raw["value"])), _number(raw.get("high", raw["value"]))
-        numbers = [value, low, high]
-    else:
-        value = low = high = _number(raw)
-        numbers = [value]
-    if any(n is None or math.isnan(n) for n in numbers):
-        raise UserError(f"{where}: {raw!r} is not a number, [low, high], {{value, low, high}} or 'unknown'; {allowed}.")
-    assert low is not None and high is not None  # as looked at
-    for n in (low, high) if value is None else (value, low, high):
-        if not column.low <= n <= column.high and n != column.neutral:
-            raise UserError(f"{where}: {n:g} {column.unit} is out of range; {allowed}.")
-    if low > high:
-        raise UserError(f"{where}: the range is upside down, low {low:g} > high {high:g}; {allowed}.")
-    if value is None:
-        value = low if low == high else 0.5 * (low + high)
-        if math.isinf(value):
-            raise UserError(f"{where}: [{low:g}, {high:g}] has no middle; give {{value: .., low: .., high: ..}}.")
-    if not low <= value <= high:
-        raise UserError(f"{where}: value {value:g} is outside its own range {low:g} .. {high:g}.")
+    low, value, high = typed.interval(where, raw, column.unit, column.low, column.high, " or 'unknown'")
+    if math.isinf(value) and math.isfinite(low):
+        raise UserError(f"{where}={raw}: has no middle; give {{value: .., low: .., high: ..}}")
     return Value(value, low, high)
 
 
@@ -297,5 +264,5 @@ def _numbers(value: Any) -> Any:
     is."""
     if isinstance(value, dict):
         return {joint: _numbers(v) for joint, v in value.items()}
-    number = _number(value)
-    return value if number is None else number
+    number = typed.real(value)
+    return value if math.isnan(number) else number

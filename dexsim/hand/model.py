@@ -11,6 +11,7 @@ from dexsim import model_file
 from dexsim.errors import UserError
 from dexsim.hand.couplings import Couplings
 from dexsim.hand.schema import HandFile
+from dexsim.surface import rotation
 
 OBJECT_BIT, HAND_BIT = 1, 2
 """Collision bits. Colliding hand geoms have contype HAND_BIT and conaffinity OBJECT_BIT, objects' geoms contype
@@ -191,8 +192,6 @@ def _place(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
     root = spec.worldbody.bodies[0]
     was = m.body(root.name)
     quat = np.zeros(4)
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, was.quat)
-    mujoco.mju_mat2Quat(quat, (turn.T @ mat.reshape(3, 3)).ravel())
+    mujoco.mju_mat2Quat(quat, (turn.T @ rotation(was.quat)).ravel())
     root.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     root.pos, root.quat = turn.T @ (was.pos - origin), quat

@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand.derive import S
 from dexsim.hand.hand import Finger, Hand
+from dexsim.surface import geom_surface
 
 MAX_SKIN = 32 << 20
 
@@ -63,41 +63,9 @@ def obj_vertices(path: Path) -> np.ndarray:
 
 def geom_points(hand: Hand, geoms: tuple[str, ...]) -> np.ndarray:
     """Return points [V, 3] m of the surfaces of collision geoms, in the frame of their body."""
-    model = hand.compiled
-    ball = _sphere()
-    out = []
+    model, out = hand.compiled, []
     for name in geoms:
-        g = model.geom(name)
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, g.quat)
-        kind, size = int(g.type[0]), g.size
-        t = mujoco.mjtGeom
-        if kind == t.mjGEOM_MESH:
-            at, n = model.mesh_vertadr[g.dataid[0]], model.mesh_vertnum[g.dataid[0]]
-            points = model.mesh_vert[at : at + n].astype(float)
-        elif kind == t.mjGEOM_SPHERE:
-            points = ball * size[0]
-        elif kind == t.mjGEOM_ELLIPSOID:
-            points = ball * size
-        elif kind == t.mjGEOM_CAPSULE:
-            points = np.concatenate([ball * size[0] + [0, 0, s * size[1]] for s in (-1, 1)])
-        elif kind == t.mjGEOM_BOX:
-            points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        elif kind == t.mjGEOM_CYLINDER:
-            a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-            ring = np.stack([size[0] * np.cos(a), size[0] * np.sin(a), 0 * a], 1)
-            points = np.concatenate([ring + [0, 0, s * size[1]] for s in (-1, 1)])
-        else:
+        out.append(geom_surface(model, model.geom(name).id)[0])
+        if not len(out[-1]):
             raise UserError(f"hand {hand.folder}: geom '{name}' of a fingertip: must be a mesh or a solid primitive")
-        out.append(points @ turn.reshape(3, 3).T + g.pos)
     return np.concatenate(out)
-
-
-def _sphere(around: int = 32, levels: int = 17) -> np.ndarray:
-    """Return points [P, 3] on the unit sphere, both poles among them."""
-    a = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    rings = [
-        np.stack([np.cos(p) * np.cos(a), np.cos(p) * np.sin(a), np.full_like(a, np.sin(p))], 1)
-        for p in np.linspace(-np.pi / 2, np.pi / 2, levels)
-    ]
-    return np.unique(np.round(np.concatenate(rings), 12), axis=0)

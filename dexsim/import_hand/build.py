@@ -10,8 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import ConvexHull
 
+from dexsim import surface
 from dexsim.hand.model import DRIVE
 from dexsim.import_hand import geometry
 from dexsim.import_hand.drives import Pull
@@ -69,7 +69,7 @@ def build(
         while b != tree.palm:
             owner.setdefault(b, k)
             b = int(m.body_parentid[b])
-    bodies = _subtree(m, tree.palm)
+    bodies = [b for b in range(m.nbody) if tree.palm in geometry.path(m, b)]
     for b in bodies:
         if b != tree.palm and b not in owner:
             parent = int(m.body_parentid[b])
@@ -111,7 +111,7 @@ def build(
         if b in tip_of:
             k = tip_of[b]
             finger = tree.fingers[k].name
-            out.meshes[f"tip_{finger}.obj"] = hull_obj(shapes.cores[k])
+            out.meshes[f"tip_{finger}.obj"] = surface.obj(surface.hull(shapes.cores[k]))
             files.append(f"tip_{finger}.obj")
             out.tip_geoms.append(f"tip_{finger}")
             lines.append(
@@ -125,13 +125,13 @@ def build(
         if b in tip_of and len(tree.fingers[tip_of[b]].geoms) < len(geometry.solid(m, b)):
             drawn = [*drawn, *(g for g in tree.fingers[tip_of[b]].geoms if g not in drawn)]  # a rubber tip of its own
         for n, g in enumerate(drawn):
-            vertices, faces = geometry.geom_surface(m, g)
-            if not len(faces):
+            shown = surface.geom_surface(m, g)
+            if not len(shown[1]):
                 continue
             file = f"{_safe(m.body(b).name)}_{n}.obj"
             while file.lower() in {other.lower() for other in out.meshes}:  # names that differ in a dot or a case alone
                 file = f"_{file}"
-            out.meshes[file] = obj(vertices, faces)
+            out.meshes[file] = surface.obj(shown)
             files.append(file)
             lines.append(
                 f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'
@@ -233,14 +233,6 @@ def pull_range(m: mujoco.MjModel, pull: Pull) -> tuple[float, float]:
     return low, high
 
 
-def _subtree(m: mujoco.MjModel, root: int) -> list[int]:
-    out = [root]
-    for b in range(root + 1, m.nbody):
-        if m.body_parentid[b] in out:
-            out.append(b)
-    return out
-
-
 def _capsule(name: str, c: Capsule, contype: int, conaffinity: int) -> str:
     bits = f'contype="{contype}" conaffinity="{conaffinity}"'
     if np.linalg.norm(c.b - c.a) < 1e-4:
@@ -255,25 +247,6 @@ def _colour(m: mujoco.MjModel, g: int) -> str:
     if k < 0 and np.allclose(rgba, [0.5, 0.5, 0.5, 1]):
         return PLAIN
     return _n([*np.clip(rgba[:3], 0.3, 1), 1.0])
-
-
-def hull_obj(points: np.ndarray) -> str:
-    """Return OBJ text of the convex hull of points [V, 3] m, outward."""
-    hull = ConvexHull(points)
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    vertices = points[used]
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return obj(vertices, faces)
-
-
-def obj(vertices: np.ndarray, faces: np.ndarray) -> str:
-    """Return wavefront OBJ text, metres."""
-    return "".join(
-        [f"v {x:.7g} {y:.7g} {z:.7g}\n" for x, y, z in vertices + 0.0] + [f"f {a} {b} {c}\n" for a, b, c in faces + 1]
-    )
 
 
 def _n(values: ArrayLike) -> str:

@@ -42,22 +42,9 @@ settings (key=default):
   PLACE=VALUE       any place of hand.yaml, e.g. palm.normal=[0,0,1] poses.cupped.j1=0.8 fingers.thumb.closes=[1,-1]
 """
 MOST_DROPS = 100_000
-KEYS = (
-    "out",
-    "name",
-    "palm",
-    "pads",
-    "skin",
-    "effort",
-    "speed",
-    "density",
-    "inertia",
-    "coupled",
-    "holes",
-    "drops",
-    "packages",
-    "picture",
-)
+OPTIONS = {"coupled": ("keep", "independent"), "holes": ("hull", "refuse"), "inertia": ("shapes", "balance")}
+NUMBERS = {"effort": (0.001, 100.0, "N m"), "speed": (0.01, 200.0, "rad/s"), "density": (1.0, 3e4, "kg/m3")}
+KEYS = ("out", "name", "palm", "pads", "skin", *OPTIONS, *NUMBERS, "drops", "packages", "picture")
 PLACES = ("palm.", "poses.", "fingers.", "joints.", "places.", "opposing", "handedness", "span", "force")
 
 
@@ -83,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
     out = Path(given["out"]).expanduser()
     result = import_hand(
         known.model(model), out, settings(given, said), say=lambda text: print(text, flush=True),
-        picture=_yes(given.get("picture", "true")),
+        picture=typed.truth("picture", given.get("picture", "true")),
     )  # fmt: skip
     if result.corrected:
         print(f"kept     your corrections: {', '.join(result.corrected)}")
@@ -99,24 +86,13 @@ def main(argv: Sequence[str]) -> int:
 
 def arguments(argv: Sequence[str]) -> tuple[str, dict[str, str], dict[str, Any]]:
     """Return the model's file, settings, and places of hand.yaml with their values."""
-    models, given, said = [], {}, {}
-    for text in argv:
-        key, equals, value = text.partition("=")
-        if not equals:
-            models.append(text)
-        elif key in KEYS:
-            given[key] = value
-        elif key.startswith(PLACES):
-            said[key] = yaml_text.parse(value, key)
-        else:
-            raise UserError(
-                f"'{text}': no such setting; there are {', '.join(KEYS)}, and places of hand.yaml (palm.normal=...)"
-            )
+    models, given = typed.words(argv, KEYS, PLACES)
     if len(models) != 1:
         raise UserError(
             f"one model file is needed, {len(models)} given{': ' + ', '.join(models) if models else ''}:"
             " dexsim import-hand model.urdf out=hands/mine"
         )
+    said = {key: yaml_text.parse(given.pop(key), key) for key in list(given) if key not in KEYS}
     return models[0], given, said
 
 
@@ -124,25 +100,10 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
     """Return the settings as `dexsim.import_hand.importing.Settings`."""
     from dexsim.import_hand.importing import Settings
 
-    options = (
-        ("coupled", ("keep", "independent")),
-        ("holes", ("hull", "refuse")),
-        ("inertia", ("shapes", "balance")),
-    )
-    for key, allowed in options:
-        if given.get(key, allowed[0]) not in allowed:
-            raise UserError(f"{key}={given[key]}: must be {' or '.join(allowed)}")
-    out = Settings(said=said)
-    out.coupled, out.holes = given.get("coupled", "keep"), given.get("holes", "hull")
-    out.inertia, out.skin = given.get("inertia"), given.get("skin") or None
-    out.palm, out.name = given.get("palm") or None, given.get("name") or None
-    for key, low, high, unit in (
-        ("effort", 0.001, 100.0, "N m"),
-        ("speed", 0.01, 200.0, "rad/s"),
-        ("density", 1.0, 3e4, "kg/m3"),
-    ):
-        if given.get(key):
-            setattr(out, key, typed.number(key, given[key], low, high, unit))
+    own: dict[str, Any] = {key: given[key] for key in ("palm", "name", "skin") if given.get(key)}
+    own |= {key: typed.one_of(key, given[key], allowed) for key, allowed in OPTIONS.items() if key in given}
+    own |= {key: typed.number(key, given[key], *limits) for key, limits in NUMBERS.items() if given.get(key)}
+    out = Settings(said=said, **own)
     if given.get("drops"):
         out.drops = typed.whole("drops", given["drops"], 0, MOST_DROPS)
     if given.get("packages"):
@@ -161,9 +122,3 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
             raise UserError(f"pads={pads}: must be ROWSxCOLUMNS (1 to 40 each, e.g. 8x6), none, or a .csv file")
         out.pads = (int(rows), int(columns))
     return out
-
-
-def _yes(text: str) -> bool:
-    if text not in ("true", "false"):
-        raise UserError(f"picture={text}: must be true or false")
-    return text == "true"

@@ -12,6 +12,7 @@ from dexsim.import_hand import geometry, inertias
 from dexsim.import_hand.frame import Motion
 from dexsim.import_hand.source import Source
 from dexsim.import_hand.tree import Tree
+from dexsim.surface import geom_surface
 
 PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
 HOLD = 2.0  # times the weight of what it moves, in its worst pose: such a motor has at least that
@@ -114,9 +115,8 @@ def radius(m: mujoco.MjModel, name: str) -> float:
 def _weight(m: mujoco.MjModel, j: int) -> float:
     """Return the torque [N m] (a slide's force, N) of the weight of all that a joint moves, at the worst attitude of
     the hand, drawn as the file has it."""
-    d = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, d)
-    moved = [b for b in range(m.nbody) if _under(m, b, int(m.jnt_bodyid[j]))]
+    d = geometry.posed(m)
+    moved = [b for b in range(m.nbody) if m.jnt_bodyid[j] in geometry.path(m, b)]
     arms = np.linalg.norm(np.cross(d.xaxis[j], d.xipos[moved] - d.xanchor[j]), axis=1)
     if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
         arms = np.ones(len(moved))
@@ -144,11 +144,8 @@ def mended(source: Source, tree: Tree, inertia: str | None) -> list[str]:
 
 def _moves(m: mujoco.MjModel, body: int, palm: int) -> bool:
     """Return whether a joint lies between the palm and a body."""
-    joints = 0
-    while body > palm:
-        joints += int(m.body_jntnum[body])
-        body = int(m.body_parentid[body])
-    return body == palm and joints > 0
+    way = geometry.path(m, body)
+    return palm in way and any(m.body_jntnum[b] for b in way[way.index(palm) + 1 :])
 
 
 def _stated(stated: dict[str, float], name: str, given: float | None, guessed: list[str], guess: float) -> float:
@@ -175,9 +172,8 @@ def mesh_sizes(source: Source, tree: Tree) -> None:
     """Raise UserError, naming them, for meshes whose size is out of all proportion to the distances between the
     hand's joints: those in another unit than the rest."""
     m = source.model
-    d = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, d)
-    bodies = [b for b in range(1, m.nbody) if _under(m, b, tree.palm)]
+    d = geometry.posed(m)
+    bodies = [b for b in range(1, m.nbody) if tree.palm in geometry.path(m, b)]
     hand = max(float(np.linalg.norm(np.ptp(d.xpos[bodies], axis=0))), 0.01)
     if hand > BODY:  # all of it is in another unit
         return
@@ -185,7 +181,7 @@ def mesh_sizes(source: Source, tree: Tree) -> None:
     for g in range(m.ngeom):
         if m.geom_bodyid[g] not in bodies or m.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
             continue
-        size = float(np.ptp(geometry.geom_surface(m, g)[0], axis=0).max())
+        size = float(np.ptp(geom_surface(m, g)[0], axis=0).max())
         if max(hand / (100 * MESH), ANY_MESH[0]) < size < min(hand * MESH, ANY_MESH[1]):
             continue
         units = {u: f for u, f in UNITS.items() if 0.1 * hand < size * f < 1.2 * hand} or UNITS
@@ -234,14 +230,12 @@ def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
     bodies = {b for f in tree.fingers for j in f.joints for b in [int(m.jnt_bodyid[j])]}
     for b in sorted(bodies):
         name, mass, inertia = m.body(b).name, m.body_mass[b], m.body_inertia[b]
-        below = sum(
-            m.body_mass[c] for c in range(b, m.nbody) if m.body_rootid[c] == m.body_rootid[b] and _under(m, c, b)
-        )
+        below = sum(m.body_mass[c] for c in range(b, m.nbody) if b in geometry.path(m, c))
         if below < LINK_MASS[0]:
             out.append(f"link '{name}': mass {mass:g} kg: nothing that moves is so light; in tonnes or grams?")
         elif mass > LINK_MASS[1]:
             out.append(f"link '{name}': mass {mass:g} kg: heavy for a finger; in grams?")
-        points = geometry.joined([geometry.geom_surface(m, g) for g in geometry.solid(m, b)])[0]
+        points = geometry.surface(m, b)[0]
         if mass <= 0 or len(points) < 4:
             continue
         size = np.linalg.norm(np.ptp(points, axis=0))
@@ -268,7 +262,7 @@ def _massless(m: mujoco.MjModel, tree: Tree) -> list[str]:
     gravity's), and what is fixed to a moving link, which carries it."""
     out = []
     for b in range(1, m.nbody):
-        if m.body_mass[b] > 0 or m.body_jntnum[b] or not _under(m, b, tree.palm) or not geometry.solid(m, b):
+        if m.body_mass[b] > 0 or m.body_jntnum[b] or tree.palm not in geometry.path(m, b) or not geometry.solid(m, b):
             continue
         on = b
         while on != tree.palm and not m.body_jntnum[on]:
@@ -278,9 +272,3 @@ def _massless(m: mujoco.MjModel, tree: Tree) -> list[str]:
             why = "the base is held fast, its mass never counts"
         out.append(f"'{m.body(b).name}' ({why})")
     return out
-
-
-def _under(m: mujoco.MjModel, body: int, top: int) -> bool:
-    while body > top:
-        body = int(m.body_parentid[body])
-    return body == top

@@ -10,6 +10,7 @@ import numpy as np
 
 from dexsim.import_hand import geometry
 from dexsim.import_hand.tree import Finger, Tree
+from dexsim.surface import joined, of_geoms, spread
 
 PARALLEL = 0.8
 """Cosine from which on a joint's axis counts as that of the distal joint: they bend the finger in one plane."""
@@ -68,10 +69,7 @@ def motions(
     that does not tell, towards the side on which they have more room. The tip lies on the axis of the distal link,
     three quarters out.
     """
-    d = mujoco.MjData(m)
-    d.qpos[:] = neutral(m)
-    mujoco.mj_kinematics(m, d)
-    mujoco.mj_comPos(m, d)
+    d = geometry.posed(m, neutral(m))
     bends, tips = [], []
     for finger, said in zip(fingers, flexion, strict=True):
         distal = finger.joints[-1]
@@ -147,7 +145,7 @@ def _closing(
 def _tip(m: mujoco.MjModel, d: mujoco.MjData, finger: Finger, last: int) -> np.ndarray:
     """Return the end of a finger [3] m, in its tip's frame; last: id of its last flexion joint."""
     distal = finger.joints[-1]
-    points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0]
+    points = of_geoms(m, finger.geoms)[0]
     world = d.xmat[finger.tip].reshape(3, 3)
     points = points @ world.T + d.xpos[finger.tip]
     axis = d.xaxis[last]
@@ -170,7 +168,7 @@ def _moved(
     tip = tip_at(d, finger.tip, position)
     hinge = m.jnt_type[last] == HINGE
     axis = d.xaxis[last]
-    points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0] @ world.T + d.xpos[finger.tip]
+    points = of_geoms(m, finger.geoms)[0] @ world.T + d.xpos[finger.tip]
     along = points.mean(0) - d.xanchor[distal]
     along = unit(along - axis * (axis @ along))
     closing = closes[-1] * (np.cross(axis, tip - d.xanchor[last]) if hinge else d.xaxis[last])
@@ -225,10 +223,7 @@ def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
     for k, x in enumerate(motions):
         if x.finger.name == "thumb":
             return [k]
-    d = mujoco.MjData(m)
-    d.qpos[:] = stretched(m, motions)
-    mujoco.mj_kinematics(m, d)
-    mujoco.mj_comPos(m, d)
+    d = geometry.posed(m, stretched(m, motions))
     roots = np.array([d.xanchor[x.flexion[0]] for x in motions])
     tips = np.array([tip_at(d, x.finger.tip, x.position) for x in motions])
     normals = np.array([d.xmat[x.finger.tip].reshape(3, 3) @ x.normal for x in motions])
@@ -246,10 +241,7 @@ def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
 def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]) -> Palm:
     """Return the palm's frame: forward along the stretched fingers that do not oppose, the normal along their tips' way
     as they close, the origin in the middle of the palm's surface points."""
-    d = mujoco.MjData(m)
-    d.qpos[:] = stretched(m, motions)
-    mujoco.mj_kinematics(m, d)
-    mujoco.mj_comPos(m, d)
+    d = geometry.posed(m, stretched(m, motions))
     fingers = [x for k, x in enumerate(motions) if k not in thumbs]
     tips = np.array([tip_at(d, x.finger.tip, x.position) for x in fingers])
     roots = np.array([d.xanchor[x.flexion[0]] for x in fingers])
@@ -298,19 +290,14 @@ def _snapped(v: np.ndarray) -> np.ndarray:
 
 def palm_points(m: mujoco.MjModel, body: int, count: int = 4000) -> np.ndarray:
     """Return points on the palm and on what is fixed to it, in its frame."""
-    d = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, d)
-    fixed = [body]
-    for b in range(body + 1, m.nbody):
-        if m.body_parentid[b] in fixed and not m.body_jntnum[b]:
-            fixed.append(b)
+    d = geometry.posed(m)
     surfaces = []
     turn = d.xmat[body].reshape(3, 3)
-    for b in fixed:
-        v, f = geometry.joined([geometry.geom_surface(m, g) for g in geometry.solid(m, b)])
+    for b in geometry.with_fixed(m, [body]):
+        v, f = geometry.surface(m, b)
         surfaces.append(((v @ d.xmat[b].reshape(3, 3).T + d.xpos[b] - d.xpos[body]) @ turn, f))
-    surface = geometry.joined(surfaces)
-    return geometry.points_on(surface, count) if len(surface[1]) else np.zeros((0, 3))
+    vertices, faces = joined(surfaces)
+    return spread(vertices[faces], count, np.random.default_rng(0))[0] if len(faces) else np.zeros((0, 3))
 
 
 def handedness(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int], frame: Palm) -> str:
@@ -318,10 +305,7 @@ def handedness(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: lis
     left; or none, where it stands in the middle or there are two fingers."""
     if len(motions) < 3:
         return "none"
-    d = mujoco.MjData(m)
-    d.qpos[:] = stretched(m, motions)
-    mujoco.mj_kinematics(m, d)
-    mujoco.mj_comPos(m, d)
+    d = geometry.posed(m, stretched(m, motions))
     y = d.xmat[tree.palm].reshape(3, 3) @ frame.matrix[:, 1]
     # where its first moving link begins and where it ends, against the row of the others
     side = np.array([y @ (d.xanchor[x.finger.joints[0]] + tip_at(d, x.finger.tip, x.position)) / 2 for x in motions])

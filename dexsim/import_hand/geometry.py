@@ -1,67 +1,41 @@
-"""Surfaces of a model's bodies, as triangles in the body's frame, and rays that meet them."""
+"""Bodies of a model: where they are, what hangs on what, which geoms carry their surface, and rays that meet it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 import numpy as np
 
-Surface = tuple[np.ndarray, np.ndarray]
-"""Vertices [V, 3] m and triangles [T, 3], outward."""
+from dexsim.surface import Surface, of_geoms
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """Return matrix [3, 3] of a quaternion (w, x, y, z)."""
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quat, float))
-    return out.reshape(3, 3)
+def posed(m: mujoco.MjModel, q: np.ndarray | None = None) -> mujoco.MjData:
+    """Return a model's data where its joints are at q [nq], as drawn without: frames, anchors and axes."""
+    d = mujoco.MjData(m)
+    if q is not None:
+        d.qpos[:] = q
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    return d
 
 
-def quaternion(matrix: np.ndarray) -> np.ndarray:
-    """Return quaternion (w, x, y, z) of a matrix [3, 3]."""
-    out = np.zeros(4)
-    mujoco.mju_mat2Quat(out, np.asarray(matrix, float).ravel())
+def path(m: mujoco.MjModel, body: int) -> list[int]:
+    """Return the bodies from the world to this one."""
+    out = [int(body)]
+    while out[-1]:
+        out.append(int(m.body_parentid[out[-1]]))
+    return out[::-1]
+
+
+def with_fixed(m: mujoco.MjModel, bodies: Iterable[int]) -> list[int]:
+    """Return bodies, and behind them those that are fixed to them."""
+    out = list(bodies)
+    for b in range(1, m.nbody):
+        if m.body_parentid[b] in out and not m.body_jntnum[b] and b not in out:
+            out.append(b)
     return out
-
-
-def geom_surface(m: mujoco.MjModel, g: int) -> Surface:
-    """Return a geom's surface in its body's frame; empty for planes, height fields and the like."""
-    import trimesh
-
-    kind, size, t = m.geom_type[g], m.geom_size[g], mujoco.mjtGeom
-    if kind == t.mjGEOM_MESH:
-        k = m.geom_dataid[g]
-        v, f = m.mesh_vertadr[k], m.mesh_faceadr[k]
-        vertices = m.mesh_vert[v : v + m.mesh_vertnum[k]].astype(float)
-        faces = m.mesh_face[f : f + m.mesh_facenum[k]].astype(int)
-    else:
-        if kind == t.mjGEOM_BOX:
-            shape = trimesh.creation.box(extents=2 * size)
-        elif kind == t.mjGEOM_SPHERE:
-            shape = trimesh.creation.icosphere(subdivisions=3, radius=size[0])
-        elif kind == t.mjGEOM_ELLIPSOID:
-            shape = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-            shape.apply_scale(size)
-        elif kind == t.mjGEOM_CYLINDER:
-            shape = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=40)
-        elif kind == t.mjGEOM_CAPSULE:
-            shape = trimesh.creation.capsule(radius=size[0], height=2 * size[1], count=(32, 16))
-            shape.apply_translation([0, 0, -shape.bounds.mean(0)[2]])
-        else:
-            return np.zeros((0, 3)), np.zeros((0, 3), int)
-        vertices, faces = np.asarray(shape.vertices, float), np.asarray(shape.faces, int)
-    return vertices @ rotation(m.geom_quat[g]).T + m.geom_pos[g], faces
-
-
-def joined(surfaces: list[Surface]) -> Surface:
-    """Return several surfaces as one."""
-    at, vertices, faces = 0, [np.zeros((0, 3))], [np.zeros((0, 3), int)]
-    for v, f in surfaces:
-        vertices.append(v)
-        faces.append(f + at)
-        at += len(v)
-    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def colliding(m: mujoco.MjModel, body: int) -> list[int]:
@@ -80,6 +54,11 @@ def solid(m: mujoco.MjModel, body: int) -> list[int]:
     return colliding(m, body) or _geoms(m, body)
 
 
+def surface(m: mujoco.MjModel, body: int) -> Surface:
+    """Return where a body's surface is (`solid`), in its frame."""
+    return of_geoms(m, solid(m, body))
+
+
 def solid_geoms(body: Any) -> list[Any]:
     """Return the same as `solid`, of a body of a model that is still being edited."""
     return [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
@@ -88,16 +67,6 @@ def solid_geoms(body: Any) -> list[Any]:
 def _geoms(m: mujoco.MjModel, body: int) -> list[int]:
     at = int(m.body_geomadr[body])
     return list(range(at, at + int(m.body_geomnum[body]))) if at >= 0 else []
-
-
-def points_on(surface: Surface, count: int, seed: int = 0) -> np.ndarray:
-    """Return points [count, 3] spread over a surface, by area."""
-    vertices, faces = surface
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(seed)
-    chosen = corners[rng.choice(len(faces), count, p=area / area.sum())]
-    return np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), count), chosen)
 
 
 def first_hits(surface: Surface, origins: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import yaml
 
-from dexsim import yaml_text
+from dexsim import surface, yaml_text
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import (
@@ -200,7 +200,7 @@ def import_hand(
             (stage / f"taxels_{finger}.csv").write_text(pad.csv(), encoding="ascii")
         if pads:
             for finger, skin in zip(names, made.skins, strict=True):
-                (stage / f"skin_{finger}.obj").write_text(build.hull_obj(skin), encoding="ascii")
+                (stage / f"skin_{finger}.obj").write_text(surface.obj(surface.hull(skin)), encoding="ascii")
         (stage / "servo.yaml").write_text(_servo(name, hand, robot), encoding="utf-8")
         (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
         if settings.drops and not fixes.has("places.catch"):
@@ -410,19 +410,16 @@ def _pads(
             )
     else:
         pads = {}
-        d = mujoco.MjData(m)
-        d.qpos[:] = frame.neutral(m)
-        mujoco.mj_kinematics(m, d)
-        mujoco.mj_comPos(m, d)
+        d = geometry.posed(m, frame.neutral(m))
         for x, skin in zip(motions, made.skins, strict=True):
-            surface = geometry.joined([geometry.geom_surface(m, g) for g in x.finger.geoms])
+            tip = surface.of_geoms(m, x.finger.geoms)
             if len(x.finger.geoms) > 1:
-                surface = taxels._hull(skin)
+                tip = surface.hull(skin)
             anchor = d.xmat[x.finger.tip].reshape(3, 3).T @ (d.xanchor[x.finger.joints[-1]] - d.xpos[x.finger.tip])
             axis = d.xmat[x.finger.tip].reshape(3, 3).T @ d.xaxis[x.flexion[-1]]
             along = x.position - anchor
             along -= axis * (axis @ along)
-            pads[x.finger.name] = taxels.paint(x.finger.name, surface, x.position, x.normal, along, settings.pads,
+            pads[x.finger.name] = taxels.paint(x.finger.name, tip, x.position, x.normal, along, settings.pads,
                                                   settings.holes)  # fmt: skip
     for (finger, pad), skin in zip(((x.finger.name, pads[x.finger.name]) for x in motions), made.skins, strict=True):
         taxels.check(finger, pad, skin, where)

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from dexsim import files, outputs, typed
-from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import folder, picture
 from dexsim.import_hand.frame import tip_at
+from dexsim.import_hand.geometry import posed
 
 USAGE = """usage: dexsim import-hand check FOLDER [out=FOLDER] [seconds=1] [film=true] [hand_mirror=true]
 
@@ -104,18 +104,11 @@ def main(argv: Sequence[str]) -> int:
     if not argv or any(a in ("-h", "--help", "help") for a in argv):
         print(USAGE, end="")
         return 0 if argv else 2
-    where, given = argv[0], {"out": "", "seconds": "1", "film": "false", "hand_mirror": "false"}
-    for text in argv[1:]:
-        key, equals, value = text.partition("=")
-        if not equals or key not in given:
-            raise UserError(f"'{text}': expected out=FOLDER, seconds=NUMBER, film=true or hand_mirror=true")
-        given[key] = value
-    seconds = typed.number("seconds", given["seconds"], 0.2, 20.0, "s of each joint's move")
-    if given["hand_mirror"] not in ("true", "false"):
-        raise UserError(f"hand_mirror={given['hand_mirror']}: must be true or false")
-    hand = load_hand(where, given["hand_mirror"] == "true")
-    out = Path(given["out"] or hand.folder).expanduser()
-    film = given["film"] == "true"
+    given = typed.settings(argv[1:], ("out", "seconds", "film", "hand_mirror"))
+    seconds = typed.number("seconds", given.get("seconds", "1"), 0.2, 20.0, "s of each joint's move")
+    film, mirror = (typed.truth(key, given.get(key, "false")) for key in ("film", "hand_mirror"))
+    hand = load_hand(argv[0], mirror)
+    out = Path(given.get("out") or hand.folder).expanduser()
     outputs.claim(out, "out=", folder.SHOWN[: 1 + film])
     table = moves(hand)
     wide = max(22, *(len(m.joint) + 2 for m in table))
@@ -163,14 +156,9 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
 
     model = hand.spec().compile()
     start = hand.pose("open")
-    data = picture.posed(model, picture.qpos(hand, model, start))
+    data = posed(model, picture.qpos(hand, model, start))
     middle, radius = picture.bounds(model, data)
-    camera: dict[str, Any] = {
-        "lookat": [float(x) for x in middle],
-        "distance": 2.6 * radius,
-        "azimuth": 140.0,
-        "elevation": -25.0,
-    }
+    camera: dict[str, Any] = {"lookat": middle.tolist(), "distance": 2.6 * radius, "azimuth": 140.0, "elevation": -25.0}
     made = []
     try:
         _sheet(hand, model, start, camera, out / "check.png")
@@ -212,17 +200,12 @@ def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[st
         for angle in hand.limits[j]:
             q = start.copy()
             q[j] = angle
-            shots.append(
-                Shot(0, picture.qpos(hand, model, q), camera["lookat"], camera["distance"], 140.0, -25.0, (300, 250))
-            )
+            shots.append(Shot(0, picture.qpos(hand, model, q), **camera, size=(300, 250)))
             titles.append(f"{name} {angle:+.2f}")
     images = render([model], shots)
     columns = 6
     rows = -(-len(shots) // columns)
     figure = Figure(figsize=(2.6 * columns, 2.4 * rows), dpi=70, layout="constrained")
     for k, (image, title) in enumerate(zip(images, titles, strict=True)):
-        axes = figure.add_subplot(rows, columns, k + 1)
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(title, fontsize=8)
+        picture.shown(figure.add_subplot(rows, columns, k + 1), image, title, 8)
     files.picture(figure, path)

@@ -12,6 +12,7 @@ import numpy as np
 from dexsim import files
 from dexsim.hand import Hand
 from dexsim.hand.places import places
+from dexsim.import_hand.geometry import posed
 from dexsim.view.stills import Shot, render
 
 AXES = (("x forward", "#d62728"), ("y", "#2ca02c"), ("z normal", "#1f77b4"))
@@ -30,13 +31,11 @@ def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
     return data.qpos.copy()
 
 
-def posed(model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
-    """Return the model's data in a pose."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
+def shown(axes: Any, image: np.ndarray, title: str, fontsize: float = 9) -> None:
+    """Draw an image with its title, nothing around it."""
+    axes.imshow(image)
+    axes.set(xticks=[], yticks=[], xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+    axes.set_title(title, fontsize=fontsize)
 
 
 def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
@@ -78,9 +77,7 @@ def draw(hand: Hand, path: Path) -> None:
     figure = Figure(figsize=(4.6 * columns, 3.9 * rows), dpi=100, layout="constrained")
     for k, (shot, image, title) in enumerate(zip(shots, images, titles, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[], xlim=(0, shot.size[0]), ylim=(shot.size[1], 0))
-        axes.set_title(title, fontsize=9)
+        shown(axes, image, title)
         d = data["open" if k < 3 or k > 6 else "cupped"]
         if k < 6:
             _frame(axes, shot, 0.35 * radius)
@@ -118,9 +115,7 @@ def draw_skin(hand: Hand, path: Path) -> None:
     colours = colormaps["tab20"].colors  # type: ignore[attr-defined]
     for k, (shot, image) in enumerate(zip(shots, render([model], shots), strict=True)):
         axes = figure.add_subplot(1, len(shots), k + 1)
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[], xlim=(0, shot.size[0]), ylim=(shot.size[1], 0))
-        axes.set_title(f"open, {VIEWS[k][0]}", fontsize=9)
+        shown(axes, image, f"open, {VIEWS[k][0]}")
         az, el = np.radians(shot.azimuth), np.radians(shot.elevation)
         ahead = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
         for f, name in enumerate(layout.names):

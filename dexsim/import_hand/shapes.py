@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from dexsim.import_hand import geometry
 from dexsim.import_hand.frame import Motion, Palm, palm_points
 from dexsim.import_hand.tree import Tree
+from dexsim.surface import Surface, of_geoms, spread
 
 MARGIN = 0.0015
 """Rounding of a fingertip [m]: its mesh is the tip shrunk by this, its geom's `margin` adds it back (the mesh itself
@@ -50,21 +51,22 @@ def make(m: mujoco.MjModel, tree: Tree, motions: list[Motion], palm: Palm) -> Sh
     tips = {x.finger.tip: x for x in motions}
     done = set()
     for x in motions:
-        for body in _chain(m, tree.palm, x.finger.tip):
+        way = geometry.path(m, x.finger.tip)
+        for body in geometry.with_fixed(m, way[way.index(tree.palm) + 1 :]):
             geoms = [g for g in geometry.solid(m, body) if g not in x.finger.geoms]
             if body in done or not geoms:
                 continue
             done.add(body)
-            points = geometry.points_on(geometry.joined([geometry.geom_surface(m, g) for g in geoms]), 400)
+            points = _points(of_geoms(m, geoms), 400)
             found = fit(points)
             out.capsules += [Capsule(body, a, b, r) for a, b, r in found]
             off.append(np.abs(distance(points, found)))
     for x in motions:
-        points = geometry.joined([geometry.geom_surface(m, g) for g in tips[x.finger.tip].finger.geoms])[0]
+        points = of_geoms(m, tips[x.finger.tip].finger.geoms)[0]
         skin = points[ConvexHull(points).vertices]
         out.skins.append(skin)
         out.cores.append(core(skin))
-        inside = fit(geometry.points_on(_hull_surface(skin), 300), most=1)
+        inside = fit(_points((skin, ConvexHull(skin).simplices), 300), most=1)
         out.proxies += [Capsule(x.finger.tip, a, b, 0.95 * r) for a, b, r in inside]
     out.capsules += palm_row(m, tree, palm)
     if off:
@@ -73,22 +75,9 @@ def make(m: mujoco.MjModel, tree: Tree, motions: list[Motion], palm: Palm) -> Sh
     return out
 
 
-def _chain(m: mujoco.MjModel, palm: int, tip: int) -> list[int]:
-    """Return bodies of a finger below the palm down to the tip, with what is fixed to them."""
-    out, b = [], tip
-    while b != palm:
-        out.append(b)
-        b = int(m.body_parentid[b])
-    chain = out[::-1]
-    for b in range(1, m.nbody):
-        if not m.body_jntnum[b] and m.body_parentid[b] in chain and b not in chain:
-            chain.append(b)
-    return chain
-
-
-def _hull_surface(points: np.ndarray) -> geometry.Surface:
-    hull = ConvexHull(points)
-    return points, hull.simplices
+def _points(of: Surface, count: int) -> np.ndarray:
+    """Return points [count, 3] m spread over a surface."""
+    return spread(of[0][of[1]], count, np.random.default_rng(0))[0]
 
 
 def distance(points: np.ndarray, capsules: list[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:

@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,11 +17,14 @@ from dexsim import typed, yaml_text
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.schema import FILE, SkinEntry, read, write
-from dexsim.import_hand import corrections, geometry
+from dexsim.import_hand import corrections
 from dexsim.import_hand import folder as folders
 from dexsim.import_hand.frame import unit
+from dexsim.import_hand.geometry import path
 from dexsim.import_hand.taxels import Pad
 from dexsim.import_hand.text import yaml_text as hand_text
+from dexsim.surface import across, geom_surface
+from dexsim.surface import spread as spread_over
 
 USAGE = """usage: dexsim import-hand skin FOLDER skin=LINK:TAXELS,... [out=FOLDER2] [picture=true]
 
@@ -96,11 +98,8 @@ def names(hand: Hand) -> dict[str, str]:
 
 def _way(model: mujoco.MjModel, tip: str, palm: str) -> list[str]:
     """Return names of the bodies from the palm, without it, to the tip."""
-    out, b = [], model.body(tip).id
-    while b > 0 and model.body(b).name != palm:
-        out.append(model.body(b).name)
-        b = model.body_parentid[b]
-    return out[::-1]
+    way = [model.body(b).name for b in path(model, model.body(tip).id)]
+    return way[way.index(palm) + 1 if palm in way else 1 :]
 
 
 def lay(hand: Hand, requested: str) -> dict[str, tuple[str, Pad]]:
@@ -201,9 +200,9 @@ def _surface(hand: Hand, m: mujoco.MjModel, body: str, wish: Wish) -> tuple[np.n
     data = mujoco.MjData(m)
     hand.couplings.put(data, hand.pose("open"))
     mujoco.mj_kinematics(m, data)
-    solids = {g: geometry.geom_surface(m, g) for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
+    solids = {g: geom_surface(m, g) for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
     own = [m.geom(name).id for name in hand.links[body]]
-    areas = {g: _area(solids[g]) for g in own}
+    areas = {g: float(np.linalg.norm(across(solids[g][0][solids[g][1]]), axis=1).sum() / 2) for g in own}
     wanted = SAMPLES * (wish.count or sum(areas.values()) / wish.spacing**2)  # type: ignore[operator]
     total = int(np.clip(wanted, FEWEST, DENSEST))
     at, turn = data.body(body).xpos, data.body(body).xmat.reshape(3, 3)
@@ -215,13 +214,9 @@ def _surface(hand: Hand, m: mujoco.MjModel, body: str, wish: Wish) -> tuple[np.n
     points, normals = [], []
     for g in own:
         vertices, faces = solids[g]
-        corners = vertices[faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        rng = np.random.default_rng(0)
-        size = np.linalg.norm(cross, axis=1)
-        chosen = rng.choice(len(faces), max(1, round(total * areas[g] / sum(areas.values()))), p=size / size.sum())
-        p = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), len(chosen)), corners[chosen])
-        n = unit(cross[chosen])
+        count = max(1, round(total * areas[g] / sum(areas.values())))
+        p, chosen = spread_over(vertices[faces], count, np.random.default_rng(0))
+        n = unit(across(vertices[faces])[chosen])
         n *= np.where(np.sum(n * (p - vertices.mean(0)), 1) < 0, -1.0, 1.0)[:, None]  # what collides is convex
         free = np.ones(len(p), bool)
         for other, plane in planes:
@@ -245,13 +240,6 @@ def _hits(points: np.ndarray, ways: np.ndarray, planes: np.ndarray) -> np.ndarra
     missed = ((np.abs(slope) <= 1e-12) & (outside > 0)).any(1)
     out[near] = ~missed & (enter < np.minimum(leave, ROOM)) & (leave > 0)
     return out
-
-
-def _area(surface: geometry.Surface) -> float:
-    corners = surface[0][surface[1]]
-    return float(
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    )
 
 
 def directions(hand: Hand, body: str) -> tuple[np.ndarray, np.ndarray]:
@@ -318,14 +306,7 @@ def show(hand: Hand, folder: Path, say: Callable[[str], None]) -> None:
 
 def main(argv: list[str]) -> int:
     """Return the exit status. Raises UserError."""
-    given: dict[str, Any] = {}
-    hands = []
-    for text in argv:
-        key, equals, value = text.partition("=")
-        if equals and key not in ("skin", "out", "picture"):
-            raise UserError(f"'{text}': no such setting; there are skin, out, picture\n{USAGE}")
-        given |= {key: value} if equals else {}
-        hands += [] if equals else [text]
+    hands, given = typed.words(argv, ("skin", "out", "picture"))
     if len(hands) != 1 or not given.get("skin"):
         print(USAGE, end="")
         return 2
@@ -341,7 +322,7 @@ def main(argv: list[str]) -> int:
         if out != hand.folder:
             shutil.rmtree(out)
         raise
-    if given.get("picture", "true") == "true":
+    if typed.truth("picture", given.get("picture", "true")):
         show(done, out, print)
     at = out.relative_to(Path.cwd()) if out.is_relative_to(Path.cwd()) else out
     print(f"{at}/{FILE}: {len(done.pads)} pads; look at {at}/hand_skin.png. dexsim train hand={at}")

@@ -14,6 +14,7 @@ from dexsim import files
 from dexsim.errors import UserError
 from dexsim.import_hand import geometry
 from dexsim.import_hand.frame import unit
+from dexsim.surface import Surface, hull
 
 STEEPEST = 0.35
 """Least cosine between a taxel's normal and the pad's: flanks steeper than 70 degrees carry none."""
@@ -46,7 +47,7 @@ class Pad:
 
 def paint(
     finger: str,
-    surface: geometry.Surface,
+    surface: Surface,
     position: np.ndarray,
     normal: np.ndarray,
     along: np.ndarray,
@@ -68,7 +69,7 @@ def paint(
             f"finger {finger}: the mesh of its tip is not closed, {edges} edges border a hole; close it (Blender: Mesh"
             " > Clean Up > Fill Holes), or holes=hull takes its convex hull"
         )
-    hull = _hull(surface[0])
+    outer = hull(surface[0])
     normal = unit(normal)
     along = unit(along - normal * (normal @ along))
     across = np.cross(along, normal)
@@ -83,7 +84,7 @@ def paint(
         u = middle[0] + shrink * half[0] * np.linspace(-1, 1, columns) * (columns > 1)
         v = middle[1] + shrink * half[1] * np.linspace(-1, 1, rows) * (rows > 1)
         grid = np.stack([np.repeat(u, rows), np.tile(v, columns), np.full(rows * columns, high[2] + 0.01)], 1)
-        distance, facing = geometry.first_hits(hull, grid @ axes.T, -normal)
+        distance, facing = geometry.first_hits(outer, grid @ axes.T, -normal)
         if np.isfinite(distance).all() and (facing @ normal).min() > STEEPEST:
             break
     else:
@@ -104,11 +105,6 @@ def paint(
     if not edges and hollow > OFF:
         note = f"the tip is hollow there by up to {1e3 * hollow:.1f} mm: taxels lie on its convex hull, which touches"
     return Pad(point, facing, tangent, area, rows, note)
-
-
-def _hull(points: np.ndarray) -> geometry.Surface:
-    hull = ConvexHull(points)
-    return points, hull.simplices
 
 
 def _smooth(normals: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -161,9 +157,9 @@ def _spacing(points: np.ndarray) -> float:
 
 def check(finger: str, pad: Pad, skin: np.ndarray, where: str) -> None:
     """Refuse taxels that the tip's hull (corners `skin` [V, 3] m) cannot carry."""
-    hull = ConvexHull(skin)
-    slope = pad.normal @ hull.equations[:, :3].T
-    depth = -(pad.point @ hull.equations[:, :3].T + hull.equations[:, 3])
+    planes = ConvexHull(skin).equations
+    slope = pad.normal @ planes[:, :3].T
+    depth = -(pad.point @ planes[:, :3].T + planes[:, 3])
     # along its normal a taxel leaves the hull where it meets the first of the planes that the normal climbs to
     with np.errstate(divide="ignore", invalid="ignore"):
         out = np.where(slope > 1e-9, depth / slope, np.inf).min(axis=1)

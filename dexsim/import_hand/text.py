@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import math
 from typing import Any
+
+import yaml
 
 HEAD = """\
 # {name}: a hand as dexsim reads it, written by `dexsim import-hand`. Lengths in m, angles in rad.
@@ -67,21 +69,18 @@ def _small(value: dict[str, Any]) -> bool:
 
 
 def _flow(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        text = f"{value + 0.0:.6g}"
-        # YAML 1.1 takes 1e-05 for text
-        return text if any(c in text for c in ".n") or "e" not in text else text.replace("e", ".0e")
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_flow(str(k))}: {_flow(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(_flow(x) for x in value) + "]"
-    text = str(value)
-    plain = text and all(c.isalnum() or c in "_-./" for c in text) and not text[0].isdigit() and text[0] not in "-."
-    words = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
-    return text if plain and text.lower() not in words else json.dumps(text, ensure_ascii=False)
+    """Return a value on one line."""
+    text = yaml.dump(
+        value, Dumper=_Short, default_flow_style=True, width=math.inf, sort_keys=False, allow_unicode=True
+    )
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+class _Short(yaml.SafeDumper):
+    """Floats with six digits, nothing by reference."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_Short.add_representer(float, lambda dumper, x: dumper.represent_float(float(f"{x + 0.0:.6g}")))

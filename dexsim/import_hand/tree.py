@@ -64,7 +64,7 @@ def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:
     if palm is not None and mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, palm) < 0:
         raise UserError(f"{where}: palm={palm}: no such body; there are {', '.join(_names(m))}")
     root = 0 if palm is None else m.body(palm).id
-    below = {b: _path(m, b) for b in range(m.nbody)}
+    below = {b: geometry.path(m, b) for b in range(m.nbody)}
     moving = [b for b in range(1, m.nbody) if m.body_jntnum[b] and root in below[b] and b != root]
     ends = [b for b in moving if not any(b in below[c][:-1] for c in moving)]
     if len(ends) < 2:
@@ -93,14 +93,6 @@ def find(m: mujoco.MjModel, where: str, palm: str | None = None) -> Tree:
     return Tree(root, fingers, before)
 
 
-def _path(m: mujoco.MjModel, body: int) -> list[int]:
-    """Return bodies from the world to this one."""
-    out = [body]
-    while out[-1]:
-        out.append(int(m.body_parentid[out[-1]]))
-    return out[::-1]
-
-
 def _names(m: mujoco.MjModel) -> list[str]:
     return [m.body(b).name for b in range(1, m.nbody)]
 
@@ -108,15 +100,10 @@ def _names(m: mujoco.MjModel) -> list[str]:
 def _tip(m: mujoco.MjModel, end: int) -> int:
     """Return the body that carries the fingertip's surface: the distal moving body, or one fixed to it that reaches
     farther (a rubber tip on a link of its own)."""
-    fixed = [end]
-    for b in range(end + 1, m.nbody):
-        if m.body_parentid[b] in fixed and not m.body_jntnum[b]:
-            fixed.append(b)
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
+    data = geometry.posed(m)
     best, reach = end, -1.0
-    for b in fixed:
-        points = geometry.joined([geometry.geom_surface(m, g) for g in geometry.solid(m, b)])[0]
+    for b in geometry.with_fixed(m, [end]):
+        points = geometry.surface(m, b)[0]
         if not len(points):
             continue
         far = np.linalg.norm(points @ data.xmat[b].reshape(3, 3).T + data.xpos[b] - data.xpos[end], axis=1).max()

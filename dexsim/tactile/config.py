@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from typing import Annotated, Literal
+
+import msgspec
 
 from dexsim import typed
 from dexsim.errors import UserError
-from dexsim.tactile.kernel import LAWS
-from dexsim.tactile.pads import PadConfig, pad_configs
+from dexsim.tactile.pads import PadConfig, pad_configs, plain, value_range
 
 Range = tuple[float, float]
 
@@ -30,24 +31,39 @@ COLUMNS: dict[str, tuple[str, float, float, float]] = {
 }
 
 
-@dataclass(frozen=True)
-class TactileConfig:
+Law = Literal["linear", "hertz", "mooney_rivlin"]
+Stiffness = Annotated[float, msgspec.Meta(ge=1e-9, le=1e15)]
+Modulus = Annotated[float, msgspec.Meta(ge=0, le=1e12)]
+
+
+class Rubber(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Thickness [m] and constants [Pa] of a skin's rubber, for law mooney_rivlin."""
+
+    thickness: Annotated[float, msgspec.Meta(ge=1e-5, le=0.1)] = 2.0e-3
+    c10: Modulus = 4.0e4
+    c01: Modulus = 1.0e4
+
+    def __getitem__(self, name: str) -> float:
+        return float(getattr(self, name))
+
+
+class TactileConfig(msgspec.Struct, frozen=True):
     """See dexsim/configs/tactile/default.yaml for what each key means."""
 
-    sum: str = "solver"
-    law: str = "hertz"
-    stiffness: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    rubber: Mapping[str, float] = field(default_factory=lambda: {"thickness": 2.0e-3, "c10": 4.0e4, "c01": 1.0e4})
-    reach: float = 1.0e-3
+    sum: Literal["solver", "spring"] = "solver"
+    law: Law = "hertz"
+    stiffness: dict[Law, dict[str, Stiffness] | Stiffness] = {}
+    rubber: Rubber = Rubber()
+    reach: Annotated[float, msgspec.Meta(ge=1e-6, le=1e-2)] = 1.0e-3
     lift: bool = True
     others: bool = True
     feel_others: bool = False
     raw: bool = False
     shear: bool = False
-    full_scale: int = 255
-    period: float = 0.02
-    params: Mapping[str, Range] = field(default_factory=dict)
-    pads: Mapping[str, PadConfig] = field(default_factory=dict)
+    full_scale: Annotated[int, msgspec.Meta(ge=1, le=2**24)] = 255
+    period: Annotated[float, msgspec.Meta(ge=1e-4, le=1.0)] = 0.02
+    params: dict[str, Range] = {}
+    pads: dict[str, PadConfig] = {}
 
     def range(self, name: str) -> Range:
         return self.params.get(name, (COLUMNS[name][3],) * 2)
@@ -68,49 +84,24 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
     if isinstance(cfg, TactileConfig):
         return cfg
     cfg = dict(cfg or {})
-    known = {f.name for f in fields(TactileConfig)} - {"params"}
-    out: dict = {"params": {}}
-    for key, value in cfg.items():
-        if key in COLUMNS:
-            out["params"][key] = _range(key, value)
-        elif key not in known:
-            raise UserError(f"tactile.{key}: unknown setting; valid ones: {', '.join(sorted(known | set(COLUMNS)))}")
-        else:
-            out[key] = value
-    for key, options in (("sum", ("solver", "spring")), ("law", tuple(LAWS))):
-        if key in out and out[key] not in options:
-            raise UserError(f"tactile.{key}={out[key]}: must be one of {', '.join(options)}")
-    for key in ("lift", "others", "feel_others", "raw", "shear"):
-        if key in out and not isinstance(out[key], bool):
-            raise UserError(f"tactile.{key}={out[key]}: must be true or false")
-    for key, low, high in (("reach", 1e-6, 1e-2), ("period", 1e-4, 1.0)):
-        if key in out:
-            out[key] = _number(key, out[key], low, high)
-    if "full_scale" in out:
-        out["full_scale"] = int(_number("full_scale", out["full_scale"], 1, 2**24))
-    if "stiffness" in out:
-        out["stiffness"] = _stiffness(out["stiffness"])
-    if "rubber" in out:
-        limits = {"thickness": (1e-5, 0.1), "c10": (0.0, 1e12), "c01": (0.0, 1e12)}
-        rubber = dict(TactileConfig().rubber)
-        for k, v in dict(out["rubber"]).items():
-            if k not in limits:
-                raise UserError(f"tactile.rubber.{k}: unknown; valid: {', '.join(limits)}")
-            rubber[k] = _number(f"rubber.{k}", v, *limits[k])
-        if rubber["c10"] + rubber["c01"] <= 0.0:
-            raise UserError("tactile.rubber: c10 + c01 must be positive [Pa]")
-        out["rubber"] = rubber
-    if "pads" in out:
-        out["pads"] = pad_configs(out["pads"])
-    done = TactileConfig(**out)
+    known = {*TactileConfig.__struct_fields__, *COLUMNS} - {"params"}
+    for key in cfg:
+        if key not in known:
+            raise UserError(f"tactile.{key}: unknown setting; valid ones: {', '.join(sorted(known))}")
+    params = {key: value_range(f"tactile.{key}", cfg.pop(key), *COLUMNS[key][:3]) for key in COLUMNS if key in cfg}
+    pads = pad_configs(cfg.pop("pads")) if "pads" in cfg else {}
+    done = typed.convert({"tactile": plain(cfg)}, dict[str, TactileConfig], "settings")["tactile"]
+    if done.rubber.c10 + done.rubber.c01 <= 0.0:
+        raise UserError("tactile.rubber: c10 + c01 must be positive [Pa]")
     if done.feel_others and not done.others:
         raise UserError("tactile.feel_others=true needs tactile.others=true")
-    return done
+    return msgspec.structs.replace(done, params=params, pads=pads)
 
 
 def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
     """Return the foundation stiffness of each pad by its kind, in the unit of the force law (`STIFFNESS_UNITS`)."""
-    given = cfg.stiffness.get(cfg.law, {})
+    stated = cfg.stiffness.get(cfg.law, {})
+    given = stated if isinstance(stated, dict) else {"all": stated}
     out = []
     for kind in kinds:
         if kind not in given and "all" not in given:
@@ -121,30 +112,3 @@ def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
             )
         out.append(given[kind] if kind in given else given["all"])
     return out
-
-
-def _stiffness(value: object) -> dict[str, dict[str, float]]:
-    if not isinstance(value, Mapping):
-        raise UserError(f"tactile.stiffness={value}: must map a law ({', '.join(LAWS)}) to a value by kind of pad")
-    out: dict[str, dict[str, float]] = {}
-    for law, by_kind in value.items():
-        if law not in LAWS:
-            raise UserError(f"tactile.stiffness.{law}: unknown law; valid: {', '.join(LAWS)}")
-        by_kind = by_kind if isinstance(by_kind, Mapping) else {"all": by_kind}
-        out[law] = {str(k): _number(f"stiffness.{law}.{k}", v, 1e-9, 1e15) for k, v in by_kind.items()}
-    return out
-
-
-def _number(key: str, value: object, low: float, high: float) -> float:
-    return typed.number(f"tactile.{key}", value, low, high)
-
-
-def _range(key: str, value: object) -> Range:
-    unit, low, high, _ = COLUMNS[key]
-    pair = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
-    if len(pair) != 2:
-        raise UserError(f"tactile.{key}={value}: must be a number or [low, high] ({unit})")
-    a, b = (_number(key, v, low, high) for v in pair)
-    if a > b:
-        raise UserError(f"tactile.{key}={value}: low must not exceed high ({unit})")
-    return a, b

@@ -295,17 +295,15 @@ def tip_points(model: mujoco.MjModel, geoms: Sequence[str]) -> list[np.ndarray]:
     feel."""
     import mujoco
 
+    from dexsim.surface import geom_surface
+
     out = []
     for name in geoms:
         g = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         if g < 0 or model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
             why = "not in the model" if g < 0 else "not a mesh"
             raise UserError(f"tip geom '{name}': {why}; touch between fingers needs a convex mesh")
-        m = model.geom_dataid[g]
-        at = model.mesh_vertadr[m]
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[g])
-        out.append(model.mesh_vert[at : at + model.mesh_vertnum[m]] @ turn.reshape(3, 3).T + model.geom_pos[g])
+        out.append(geom_surface(model, g)[0])
     return out
 
 

@@ -18,7 +18,6 @@ A value is a number, [low, high], or {value, low, high}; what has a range is dra
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,7 +29,7 @@ from dexsim.errors import UserError
 
 Range = tuple[float, float]
 Number = float | str
-"""YAML reads 1e-3 as text: that is accepted (`_number`)."""
+"""YAML reads 1e-3 as text: that is accepted (`typed.real`)."""
 
 
 class Interval(msgspec.Struct, forbid_unknown_fields=True):
@@ -102,15 +101,15 @@ class PadConfig:
 def pad_configs(value: Mapping[str, Any]) -> dict[str, PadConfig]:
     """Check `tactile.pads`; return a PadConfig by name of pad. Raises UserError naming the setting, its value and what
     is allowed."""
-    typed.convert({"tactile": {"pads": _plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")
+    typed.convert({"tactile": {"pads": plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")
     return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
 
 
-def _plain(node: object) -> object:
+def plain(node: object) -> object:
     """Return other mappings and sequences (a config's) as dicts and lists; names as text."""
     if isinstance(node, Mapping):
-        return {k if isinstance(k, int) else str(k): _plain(v) for k, v in node.items()}
-    return [_plain(v) for v in node] if isinstance(node, Sequence) and not isinstance(node, str) else node
+        return {k if isinstance(k, int) else str(k): plain(v) for k, v in node.items()}
+    return [plain(v) for v in node] if isinstance(node, Sequence) and not isinstance(node, str) else node
 
 
 def _pad(where: str, entry: Mapping) -> PadConfig:
@@ -136,38 +135,14 @@ def _pad(where: str, entry: Mapping) -> PadConfig:
 
 def value_range(where: str, value: object, unit: str, low: float, high: float) -> Range:
     """Return the range (low, high) of a number, [low, high] or {value, low, high}; UserError starting with `where`."""
-    allowed = f"allowed: {low:g} to {high:g}{'' if unit == '1' else ' ' + unit}"
-    if isinstance(value, Mapping):
-        if set(value) - {"value", "low", "high"} or "value" not in value:
-            raise UserError(f"{where}={dict(value)}: must be a number, [low, high] or {{value, low, high}}; {allowed}")
-        given = [value.get("low", value["value"]), value["value"], value.get("high", value["value"])]
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        given = list(value)
-        if len(given) != 2:
-            raise UserError(f"{where}={given}: must be a number, [low, high] or {{value, low, high}}; {allowed}")
-    else:
-        given = [value]
-    numbers = []
-    for x in given:
-        number = _number(x)
-        if number is None or not low <= number <= high:
-            raise UserError(f"{where}={x}: must be a number; {allowed}")
-        numbers.append(number)
-    if sorted(numbers) != numbers:
-        raise UserError(f"{where}={given}: must rise from low to high; {allowed}")
-    return numbers[0], numbers[-1]
-
-
-def _number(x: object) -> float | None:
-    """Return x as a finite float, None where it is none (YAML reads 1e-3 as text: that is accepted)."""
-    number = typed.real(x)
-    return number if math.isfinite(number) else None
+    ends = typed.interval(where, value, unit, low, high)
+    return ends[0], ends[2]
 
 
 def _index(where: str, k: object) -> int:
     """Return a taxel's number; keys of a checkpoint's config are text."""
-    number = _number(k)
-    if number is None or number != int(number) or number < 0:
+    number = typed.real(k)
+    if not 0 <= number < 2**31 or number != int(number):
         raise UserError(f"{where}: '{k}' is no taxel; taxels are counted from 0")
     return int(number)
 

@@ -1,8 +1,6 @@
-"""The same laws in NumPy, float64, one plain line each: what the kernels are tested against."""
+"""Distances and the rubber of touch in NumPy, float64: what a diagnosis reads touch with."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -34,16 +32,9 @@ def sd_cylinder(q: np.ndarray, radius: float, half: float) -> np.ndarray:
 def sd_grid(q: np.ndarray, grid: Grid) -> np.ndarray:
     """Interpolate trilinearly; outside the grid sqrt(gap^2 + value at the nearest point of the box ^2)."""
     q = np.asarray(q, dtype=float)
-    top = np.array(grid.data.shape) - 1
-    g = (q - grid.origin) / grid.spacing
-    c = np.clip(g, 0, top)
-    i = np.minimum(c.astype(int), top - 1)
-    f = c - i
-    v = np.zeros(q.shape[:-1])
-    for corner in np.ndindex(2, 2, 2):
-        w = np.where(corner, f, 1.0 - f).prod(-1)
-        v += w * grid.data[tuple(np.moveaxis(i + corner, -1, 0))]
-    gap = np.linalg.norm((g - c) * grid.spacing, axis=-1)
+    end = grid.origin + grid.spacing * (np.array(grid.data.shape) - 1)
+    gap = np.linalg.norm(q - np.clip(q, grid.origin, end), axis=-1)
+    v = grid.sample(q.reshape(-1, 3)).reshape(q.shape[:-1])
     return np.where(gap > 0.0, np.hypot(gap, np.maximum(v, 0.0)), v)
 
 
@@ -61,45 +52,7 @@ def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = Non
     return size[0] * sd_grid(q / size[0], grid)
 
 
-def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None, eps: float = 1e-6) -> np.ndarray:
-    """Return outward unit normal [..., 3] at the nearest surface point: the gradient of the distance."""
-    g = np.stack(
-        [distance(kind, size, q + e, grid) - distance(kind, size, q - e, grid) for e in eps * np.eye(3)], axis=-1
-    )
-    return g / np.linalg.norm(g, axis=-1, keepdims=True)
-
-
-# -- laws ----------------------------------------------------------------------------------------------------------
-
-
-def linear_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.ndarray:
-    return stiffness * area * np.maximum(depth, 0.0)
-
-
-def hertz_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.ndarray:
-    return stiffness * area * np.sqrt(np.maximum(depth, 0.0))
-
-
 def mooney_rivlin_force(depth: np.ndarray, area: np.ndarray, thickness: float, c10: float, c01: float) -> np.ndarray:
     """Return uniaxial compression, stretch l = 1 - depth / thickness: pressure 2 (l^-2 - l) (c10 + c01 / l)."""
     stretch = 1.0 - np.minimum(np.maximum(depth, 0.0) / thickness, MAX_STRAIN)
     return area * 2.0 * (stretch**-2 - stretch) * (c10 + c01 / stretch)
-
-
-def taxel_force(
-    law: str, depth: np.ndarray, area: np.ndarray, stiffness: float, rubber: Mapping, threshold: float = 0.0
-) -> np.ndarray:
-    if law == "linear":
-        f = linear_force(depth, area, stiffness)
-    elif law == "hertz":
-        f = hertz_force(depth, area, stiffness)
-    else:
-        f = stiffness * mooney_rivlin_force(depth, area, rubber["thickness"], rubber["c10"], rubber["c01"])
-    return np.where(f <= threshold, 0.0, f)
-
-
-def spread(force: float, d: np.ndarray, area: np.ndarray, reach: float) -> np.ndarray:
-    """Share the solver's force among taxels at distances d: by area times squared depth under the level max(min d +
-    reach, 0)."""
-    w = area * np.maximum(np.maximum(d.min() + reach, 0.0) - d, 0.0) ** 2
-    return force * w / w.sum()

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from dexsim import system
-from dexsim.view.render import CAMERA, backdrop
+from dexsim.view.render import CAMERA, Pictures
 from dexsim.view.video import NoRenderer
 
 
@@ -19,36 +19,25 @@ class Frames:
     """Renders worlds of one scene. size: width, height; camera: what differs from the usual view (`render.CAMERA`)."""
 
     def __init__(self, size: tuple[int, int] = (640, 480), camera: dict[str, Any] | None = None):
-        self.size, self._view = size, CAMERA | (camera or {})
-        self._behind = backdrop(size[1], size[0])
-        self._renderer: Any = None
-        self._model: Any = None
+        self.size = size
+        self._view: Any = CAMERA | (camera or {})
+        self._pictures: Pictures | None = None
 
     def __call__(self, model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         """Return the picture [H, W, 3] uint8 of a model at qpos [nq]. Raises NoRenderer."""
-        if self._model is not model:
+        if self._pictures is None or self._pictures.model is not model:
             self.close()
-            model.vis.global_.offwidth, model.vis.global_.offheight = self.size
-            model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
-            model.vis.map.znear = 0.02
-            self._renderer, self._model = renderer(model, *self.size), model
-            self._data, self._camera = mujoco.MjData(model), mujoco.MjvCamera()
-            self._camera.lookat[:], self._camera.distance = self._view["lookat"], self._view["distance"]
-            self._camera.azimuth, self._camera.elevation = self._view["azimuth"], self._view["elevation"]
-        self._data.qpos[:] = qpos
-        mujoco.mj_forward(model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        picture = self._renderer.render()
-        return np.where(picture.any(axis=2, keepdims=True), picture, self._behind)
+            self._pictures = Pictures(model, self.size, renderer)
+        return self._pictures(qpos, self._view)
 
     def close(self) -> None:
         """Give back the context."""
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = self._model = None
+        if self._pictures is not None:
+            self._pictures.close()
+        self._pictures = None
 
 
-def renderer(model: mujoco.MjModel, width: int, height: int) -> Any:
+def renderer(model: mujoco.MjModel, height: int, width: int) -> Any:
     """Return MuJoCo's renderer on the first backend that opens; MUJOCO_GL asks for one. MuJoCo chooses as it is
     imported, and chooses a window where nothing is said, so the choice is made here. Raises NoRenderer."""
     backend = _backend()

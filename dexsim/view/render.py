@@ -1,4 +1,4 @@
-"""The rendering process of :mod:`dexsim.view.video`; not for direct use.
+"""Renders poses of models; and the rendering process of :mod:`dexsim.view.video`, not for direct use.
 
     MUJOCO_GL=egl python -m dexsim.view.render FOLDER OUT.mp4
 """
@@ -9,6 +9,8 @@ import json
 import math
 import os
 import sys
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypedDict
@@ -88,6 +90,48 @@ def film(folder: Path, path: Path, settings: dict[str, Any]) -> None:
         part.unlink(missing_ok=True)
 
 
+class Pictures:
+    """Renders poses of a model, in the OpenGL context of this process. size: width and height [pixels]; renderer:
+    makes MuJoCo's from a model, a height and a width."""
+
+    def __init__(self, model: Any, size: Sequence[int], renderer: Callable[..., Any] | None = None) -> None:
+        import mujoco
+
+        width, height = size
+        look = model.vis
+        look.global_.offwidth, look.global_.offheight = width, height
+        look.quality.offsamples, look.quality.shadowsize = 4, 2048
+        look.headlight.ambient[:], look.headlight.diffuse[:], look.headlight.specular[:] = 0.45, 0.55, 0.15
+        look.map.znear = 0.01
+        self.model, self.data = model, mujoco.MjData(model)
+        self._renderer = (renderer or partial(mujoco.Renderer, max_geom=20_000))(model, height, width)
+        self._sky = any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        self._behind = backdrop(height, width)
+
+    def __call__(
+        self, qpos: Any, camera: Camera = CAMERA, groups: Sequence[int] = (0, 1, 2),
+        draw: Callable[[Any, Any], None] = lambda scene, data: None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return the picture [H, W, 3] uint8 of a pose [nq]; groups: of geoms that are drawn; draw: is given the scene
+        and the model's data, to add to it."""
+        import mujoco
+
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+        view, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        for name, value in camera.items():
+            setattr(view, name, value)
+        option.geomgroup[:] = [k in groups for k in range(len(option.geomgroup))]
+        self._renderer.update_scene(self.data, view, option)
+        draw(self._renderer.scene, self.data)
+        image = self._renderer.render()
+        return image if self._sky else np.where(image.any(axis=2, keepdims=True), image, self._behind)
+
+    def close(self) -> None:
+        """Give back the context."""
+        self._renderer.close()
+
+
 class Tile:
     """One world: renders its frames with label and bars."""
 
@@ -99,20 +143,13 @@ class Tile:
         from dexsim.view.overlay import room
 
         self._full_taxel = FULL_TAXEL
-        self._mujoco, self._clip, self._settings = mujoco, clip, settings
+        self._clip, self._settings = clip, settings
         arrays = np.load(folder / f"{index}.npz")
         self.qpos = arrays["qpos"]
         self._force = arrays["force"] if "force" in arrays else None
         self._command = arrays["command"] if "command" in arrays else None
         width, height = settings["size"]
         model = mujoco.MjModel.from_binary_path(str(folder / f"{index}.mjb"))
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        model.vis.quality.offsamples = 4
-        model.vis.quality.shadowsize = 2048
-        model.vis.headlight.ambient[:] = 0.45
-        model.vis.headlight.diffuse[:] = 0.55
-        model.vis.headlight.specular[:] = 0.15
-        model.vis.map.znear = 0.02
         self._titled = bool(clip["label"] or clip["text"])
         above, below = room(height, self._titled, self._force is not None)
         self._height, height = height, height - above - below
@@ -122,29 +159,19 @@ class Tile:
             layout: Any = SimpleNamespace(pads=len(parts["count"]), **parts)
             self._taxels, self._map = arrays["taxels"], TaxelMap(layout)
         self._decor = Decor(model, arrays, clip["bodies"], clip["colours"]) if clip["decor"] else None
-        self._sky = any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-        self._model, self._data = model, mujoco.MjData(model)
-        self._renderer = mujoco.Renderer(model, height, width, max_geom=20_000)
-        self._camera = mujoco.MjvCamera()
-        view = CAMERA | settings["camera"]
-        self._camera.lookat[:] = view["lookat"]
-        self._camera.distance, self._camera.azimuth = view["distance"], view["azimuth"]
-        self._camera.elevation = view["elevation"]
-        self._behind = backdrop(height, width)
+        self._pictures, self._view = Pictures(model, (width, height)), CAMERA | settings["camera"]
 
     def frame(self, k: int) -> np.ndarray:
         """Return the frame ``k`` [H, W, 3] uint8; past the end, the last one."""
         from dexsim.view.overlay import DARK, annotate
 
         k = min(k, len(self.qpos) - 1)
-        self._data.qpos[:] = self.qpos[k] if self._decor is None else self._decor.turn(k, self.qpos[k])
-        self._mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        if self._decor is not None:
-            self._decor.draw(self._renderer.scene, self._data, k)
-        image = self._renderer.render()
-        if not self._sky:
-            image = np.where(image.any(axis=2, keepdims=True), image, self._behind)
+        if self._decor is None:
+            image = self._pictures(self.qpos[k], self._view)
+        else:
+            image = self._pictures(
+                self._decor.turn(k, self.qpos[k]), self._view, draw=partial(self._decor.draw, k=k)
+            )
         pads = None
         if self._taxels is not None:
             pads = self._map.pictures(self._taxels[k], self._full_taxel, np.array(DARK, np.uint8))

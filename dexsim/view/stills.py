@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from dexsim.view.frames import renderer
-from dexsim.view.render import backdrop
+from dexsim.view.render import CAMERA, Pictures
 
 FIELD_OF_VIEW = 30.0  # degrees, from top to bottom
 
@@ -46,29 +45,16 @@ class Shot:
 
 def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
     """Return the pictures [H, W, 3] uint8. Raises `dexsim.view.video.NoRenderer` where no OpenGL backend works."""
-    pictures: dict[int, np.ndarray] = {}
-    for k in sorted({s.model for s in shots}):
-        own = [(n, s) for n, s in enumerate(shots) if s.model == k]
-        model = copy.copy(models[k])
-        model.vis.global_.fovy = FIELD_OF_VIEW
-        model.vis.global_.offwidth, model.vis.global_.offheight = (max(s.size[i] for _, s in own) for i in (0, 1))
-        model.vis.quality.offsamples, model.vis.quality.shadowsize = 4, 2048
-        light = model.vis.headlight
-        light.ambient[:], light.diffuse[:], light.specular[:] = 0.45, 0.55, 0.1
-        model.vis.map.znear = 0.01
-        data = mujoco.MjData(model)
-        for size in {s.size for _, s in own}:
-            drawing = renderer(model, *size)
-            for n, shot in [(n, s) for n, s in own if s.size == size]:
-                data.qpos[:] = shot.qpos
-                mujoco.mj_forward(model, data)
-                camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-                camera.lookat[:] = shot.lookat
-                camera.distance, camera.azimuth, camera.elevation = shot.distance, shot.azimuth, shot.elevation
-                option.geomgroup[:] = 0
-                option.geomgroup[list(shot.groups)] = 1
-                drawing.update_scene(data, camera, option)
-                image = drawing.render()
-                pictures[n] = np.where(image.any(axis=2, keepdims=True), image, backdrop(size[1], size[0]))
-            drawing.close()
-    return [pictures[n] for n in range(len(shots))]
+    made: dict[tuple[int, ...], Pictures] = {}
+    out = []
+    for shot in shots:
+        key = shot.model, *shot.size
+        if key not in made:
+            model = copy.copy(models[shot.model])
+            model.vis.global_.fovy = FIELD_OF_VIEW
+            made[key] = Pictures(model, shot.size, renderer)
+        view: Any = {name: getattr(shot, name) for name in CAMERA}
+        out.append(made[key](shot.qpos, view, shot.groups))
+    for pictures in made.values():
+        pictures.close()
+    return out

@@ -16,12 +16,11 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
-from dexsim.tactile import reference as ref
 from dexsim.tactile.config import TactileConfig
 from dexsim.tactile.kernel import LAWS
 from dexsim.tactile.layout import TaxelLayout
-from dexsim.tactile.pressing import Press, presses
 from dexsim.tactile.sensors import Sensors
+from tools.assets.presses import Press, presses, taxel_force
 
 CONTACT_STIFFNESS = 7000.0  # N/m
 DEPTHS = (0.3e-3, 0.7e-3, 1.0e-3)  # m
@@ -55,7 +54,7 @@ def calibrate_stiffness(
     area = layout.area[pad, : layout.count[pad]]
     ratio: dict[float, list[float]] = {}
     for p in pressed:
-        f = ref.taxel_force(law, -p.d, area, 1.0, rubber).sum()
+        f = taxel_force(law, -p.d, area, 1.0, rubber).sum()
         ratio.setdefault(p.depth, []).append(f / (contact * p.depth))
     k = 1.0 / np.mean([np.median(r) for depth, r in ratio.items() if depth > 0.5e-3])
     return float(k), {d: np.percentile(np.array(r) * k, [5, 25, 50, 75, 95]) for d, r in ratio.items()}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.assets.objects.geometry import hull_mesh
+from dexsim.surface import hull as hull_mesh
 
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices [n, 3] m, triangles [m, 3]
 

@@ -118,7 +118,7 @@ def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
 @cache
 def _tip_skin(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return `tip_skin_mesh` of all fingers with this pad."""
-    from dexsim.assets.objects.geometry import hull_mesh
+    from dexsim.surface import hull as hull_mesh
     from tools.assets.surface import PADS, Lattice, tip_points, to_link, to_sensor
 
     pad = PADS[name]

@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.assets.objects.geometry import mass_properties, signed_distance, union_boundary
 from dexsim.assets.objects.shape import Grid, Shape
+from dexsim.surface import spread
 
 SPACING = 1.25e-3  # m between samples
 MARGIN = 9e-3  # m of grid beyond the shape on every side
@@ -32,13 +33,10 @@ def grid_error(hulls: Sequence[np.ndarray], grid: Grid, band: float = 2e-3, n: i
     The largest lies at sharp edges, where the distance has a kink inside one cell (about 0.3 cells at a right angle).
     """
     rng = np.random.default_rng(0)
-    triangles = union_boundary(hulls)
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    chosen = triangles[rng.choice(len(triangles), n, p=area / area.sum())]
-    w = rng.dirichlet(np.ones(3), n)
+    on = spread(union_boundary(hulls), n, rng)[0]
     direction = rng.normal(size=(n, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    points = np.einsum("pk,pki->pi", w, chosen) + direction * rng.uniform(0, band, (n, 1))
+    points = on + direction * rng.uniform(0, band, (n, 1))
     error = np.abs(grid.sample(points) - signed_distance(hulls, points))
     return float(error.mean()), float(error.max())
 

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from dexsim.surface import across
+
 # Corners this close to a plane (relative to the size of the hull) lie in it.
 _FLAT = 2e-6
 
@@ -21,24 +23,12 @@ def hull_vertices(points: np.ndarray) -> np.ndarray:
     return points[np.sort(ConvexHull(points).vertices)]
 
 
-def hull_mesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return convex hull of points [V, 3] as a closed mesh: vertices [n, 3], outward facing triangles [m, 3]."""
-    hull = ConvexHull(points)
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    vertices = hull.points[used]
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return vertices, faces
-
-
 def hull_planes(vertices: np.ndarray) -> np.ndarray:
     """Planes [F, 4] (outward unit normal n, offset d; inside is n . x + d <= 0), coplanar triangles merged."""
     hull = ConvexHull(vertices)
     tol = _FLAT * np.ptp(vertices, axis=0).max()
     corners = vertices[hull.simplices]  # [T, 3, 3]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(across(corners), axis=1)
     kept: list[np.ndarray] = []
     # Largest first: a sliver's own normal is uncertain, so it should join a face, not found one.
     for k in np.argsort(-area, kind="stable"):

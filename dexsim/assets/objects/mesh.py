@@ -16,6 +16,7 @@ from dexsim.assets.objects.decompose import CONVEX
 from dexsim.assets.objects.geometry import mass_properties, principal_axes, simplify_hull, union_boundary
 from dexsim.assets.objects.shape import MAX_HULLS, MAX_VERTICES, Shape
 from dexsim.errors import UserError
+from dexsim.surface import spread
 
 SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold
 _CELLS = 62  # along the longest side of the grid, margin included
@@ -112,10 +113,7 @@ def _split(file: Path, triangles: np.ndarray, parts: int) -> tuple[list[np.ndarr
 def _depth_of_surface(triangles: np.ndarray, hulls: list[np.ndarray], count: int = 3000) -> np.ndarray:
     """Return how deep [count] m points of a surface lie in the union of hulls (negative: outside), evenly spread by
     area."""
-    rng = np.random.default_rng(0)
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    chosen = triangles[rng.choice(len(triangles), count, p=area / area.sum())]
-    points = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), count), chosen)
+    points = spread(triangles, count, np.random.default_rng(0))[0]
     planes = [ConvexHull(h).equations for h in hulls]
     return np.max([-(points @ p[:, :3].T + p[:, 3]).max(axis=1) for p in planes], axis=0)
 

@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from dexsim.assets.objects.baking import MARGIN
 from dexsim.assets.objects.shape import Grid
+from dexsim.surface import across, spread
 
 SEAM = 3e-4
 """m: a face's point that is nearer than this to another part, or in it, belongs to a cut."""
@@ -49,12 +50,8 @@ def boundary(hulls: Sequence[np.ndarray], step: float, seed: int = 0) -> np.ndar
     out = []
     for k, (hull, corners) in enumerate(zip(full, hulls)):
         triangles = corners[hull.simplices]
-        area = (
-            np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
-        )
-        count = int(np.ceil(2 * area.sum() / step**2))
-        chosen = triangles[rng.choice(len(triangles), count, p=area / area.sum())]
-        points = np.concatenate([corners, np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), count), chosen)])
+        count = int(np.ceil(np.linalg.norm(across(triangles), axis=1).sum() / step**2))
+        points = np.concatenate([corners, spread(triangles, count, rng)[0]])
         hidden = np.zeros(len(points), bool)
         for n, other in enumerate(full):
             if n != k:
