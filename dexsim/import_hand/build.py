@@ -125,13 +125,13 @@ def build(
         if b in tip_of and len(tree.fingers[tip_of[b]].geoms) < len(geometry.solid(m, b)):
             drawn = [*drawn, *(g for g in tree.fingers[tip_of[b]].geoms if g not in drawn)]  # a rubber tip of its own
         for n, g in enumerate(drawn):
-            shown = surface.geom_surface(m, g)
-            if not len(shown[1]):
+            look = surface.geom_surface(m, g)
+            if not len(look[1]):
                 continue
             file = f"{_safe(m.body(b).name)}_{n}.obj"
             while file.lower() in {other.lower() for other in out.meshes}:  # names that differ in a dot or a case alone
                 file = f"_{file}"
-            out.meshes[file] = surface.obj(shown)
+            out.meshes[file] = surface.obj(look)
             files.append(file)
             lines.append(
                 f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'

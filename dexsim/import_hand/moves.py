@@ -207,5 +207,5 @@ def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[st
     rows = -(-len(shots) // columns)
     figure = Figure(figsize=(2.6 * columns, 2.4 * rows), dpi=70, layout="constrained")
     for k, (image, title) in enumerate(zip(images, titles, strict=True)):
-        picture.shown(figure.add_subplot(rows, columns, k + 1), image, title, 8)
+        picture.panel(figure.add_subplot(rows, columns, k + 1), image, title, 8)
     files.picture(figure, path)

@@ -31,7 +31,7 @@ def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
     return data.qpos.copy()
 
 
-def shown(axes: Any, image: np.ndarray, title: str, fontsize: float = 9) -> None:
+def panel(axes: Any, image: np.ndarray, title: str, fontsize: float = 9) -> None:
     """Draw an image with its title, nothing around it."""
     axes.imshow(image)
     axes.set(xticks=[], yticks=[], xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
@@ -77,7 +77,7 @@ def draw(hand: Hand, path: Path) -> None:
     figure = Figure(figsize=(4.6 * columns, 3.9 * rows), dpi=100, layout="constrained")
     for k, (shot, image, title) in enumerate(zip(shots, images, titles, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
-        shown(axes, image, title)
+        panel(axes, image, title)
         d = data["open" if k < 3 or k > 6 else "cupped"]
         if k < 6:
             _frame(axes, shot, 0.35 * radius)
@@ -115,7 +115,7 @@ def draw_skin(hand: Hand, path: Path) -> None:
     colours = colormaps["tab20"].colors  # type: ignore[attr-defined]
     for k, (shot, image) in enumerate(zip(shots, render([model], shots), strict=True)):
         axes = figure.add_subplot(1, len(shots), k + 1)
-        shown(axes, image, f"open, {VIEWS[k][0]}")
+        panel(axes, image, f"open, {VIEWS[k][0]}")
         az, el = np.radians(shot.azimuth), np.radians(shot.elevation)
         ahead = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
         for f, name in enumerate(layout.names):
