@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from dexsim import yaml_text
 from dexsim.errors import UserError
 from dexsim.hand import load_hand, schema
 from dexsim.hand.skin import tip_skins
+from dexsim.import_hand.text import write
 from tests.made_hand import _MODEL, content, made_hand
 from tools.assets import xhand
 
@@ -194,7 +196,7 @@ def test_names_of_hands(tmp_path, monkeypatch):
 def test_written_and_read_again(tmp_path):
     folder = made_hand(tmp_path / "made")
     file = schema.read(folder / "hand.yaml")
-    schema.write(file, folder / "hand.yaml")
+    write(yaml_text.load(folder / "hand.yaml", "hand"), folder)
     assert schema.read(folder / "hand.yaml") == file
     assert load_hand(folder).file.guessed == ["palm.normal"]
 

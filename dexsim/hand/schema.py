@@ -1,4 +1,4 @@
-"""`hand.yaml`: its declared types, read and written. What must hold between its fields and the model's is checked by
+"""`hand.yaml`: its declared types, read. What must hold between its fields and the model's is checked by
 `dexsim.hand.load`."""
 
 from __future__ import annotations
@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import yaml
 
-from dexsim import files, yaml_text
+from dexsim import yaml_text
 from dexsim.errors import UserError
 from dexsim.typed import Positive, Real, convert
 
-FORMAT, VERSION = "dexsim-hand", 1
+FORMAT = "dexsim-hand"
 FILE = "hand.yaml"
 SEE = "see docs/reference/hand.md"
 
@@ -140,44 +139,3 @@ def read(path: Path) -> HandFile:
     if not isinstance(raw, dict) or raw.get("format") != FORMAT:
         raise UserError(f"hand {path}: format: must be {FORMAT} in its first line; {SEE}")
     return convert(raw, HandFile, f"hand {path}", SEE)
-
-
-def to_yaml(file: HandFile) -> str:
-    """Return the file's text, fields in their order; what is at its default and optional is left out."""
-    data = msgspec.to_builtins(file)
-    for joint in data["joints"]:
-        if joint["armature"] is None:
-            del joint["armature"]
-    for finger in data["fingers"]:
-        if finger["closes"] is None:
-            del finger["closes"]
-    for name in ("skin", "places", "held_cubes", "sensed"):
-        if not data[name]:
-            del data[name]
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=116, default_flow_style=False)
-
-
-def write(file: HandFile, path: Path) -> None:
-    """Write the file whole or not at all."""
-    text = to_yaml(file)
-    if len(text.encode()) > files.MAX_TEXT:
-        raise UserError(f"hand {path}: {len(text)} characters, at most {files.MAX_TEXT} are read")
-    with files.beside(path) as part:
-        part.write_text(text, encoding="utf-8")
-
-
-class _Dumper(yaml.SafeDumper):
-    """Lists of numbers or words, and small mappings, on one line."""
-
-    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.Node:
-        flat = all(not isinstance(x, (dict, list)) for x in sequence)
-        return super().represent_sequence(tag, sequence, flow_style=flat)
-
-    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.Node:
-        items = list(mapping.values()) if isinstance(mapping, dict) else [v for _, v in mapping]
-        small = len(items) <= 5 and bool(items) and all(not isinstance(x, (dict, list)) for x in items)
-        return super().represent_mapping(tag, mapping, flow_style=small)
-
-
-_Dumper.add_representer(list, lambda d, x: d.represent_sequence("tag:yaml.org,2002:seq", x))
-_Dumper.add_representer(dict, lambda d, x: d.represent_mapping("tag:yaml.org,2002:map", x.items()))

@@ -33,7 +33,7 @@ from dexsim.import_hand import (
 from dexsim.import_hand import skin as links
 from dexsim.import_hand.corrections import Corrections
 from dexsim.import_hand.drives import Pull
-from dexsim.import_hand.text import yaml_text as hand_text
+from dexsim.import_hand.text import write
 
 DROPS = 256  # objects let fall to find where they are held: some 40 s of one core, with the trial
 SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's stiffness where nothing is known
@@ -202,16 +202,16 @@ def import_hand(
             for finger, skin in zip(names, made.skins, strict=True):
                 (stage / f"skin_{finger}.obj").write_text(surface.obj(surface.hull(skin)), encoding="ascii")
         (stage / "servo.yaml").write_text(_servo(name, hand, robot), encoding="utf-8")
-        (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+        write(hand, stage)
         if settings.drops and not fixes.has("places.catch"):
             _drop_region(stage, hand, settings.drops, tell)
-            (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+            write(hand, stage)
         loaded = _loads(stage)
         before = yaml_text.load(out / folder.HAND, "hand") if note and (out / folder.HAND).is_file() else {}
         requested = settings.skin or (before.get("source") or {}).get("skin")
         if requested:
             hand["skin"], hand["source"]["skin"] = links.write_pads(loaded, stage, requested, tell), requested
-            (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+            write(hand, stage)
             loaded = _loads(stage)
             if picture:
                 links.show(loaded, stage, tell)

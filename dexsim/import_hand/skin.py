@@ -16,13 +16,13 @@ from scipy.spatial import ConvexHull, cKDTree
 from dexsim import typed, yaml_text
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
-from dexsim.hand.schema import FILE, SkinEntry, read, write
+from dexsim.hand.schema import FILE
 from dexsim.import_hand import corrections
 from dexsim.import_hand import folder as folders
 from dexsim.import_hand.frame import unit
 from dexsim.import_hand.geometry import path
 from dexsim.import_hand.taxels import Pad
-from dexsim.import_hand.text import yaml_text as hand_text
+from dexsim.import_hand.text import write
 from dexsim.surface import across, geom_surface
 from dexsim.surface import spread as spread_over
 
@@ -279,15 +279,11 @@ def add(folder: Path, requested: str, say: Callable[[str], None] = lambda text: 
     """Lay the skin that is asked for over the hand in a folder, in place of what it had: skin_*.csv, entries of
     hand.yaml. Returns the hand. Raises UserError, with nothing changed."""
     entries = write_pads(load_hand(folder), folder, requested, say)
-    file, note = read(folder / FILE), corrections.written(folder)
-    for old in {e.taxels for e in file.skin} - {e["taxels"] for e in entries}:
+    data, note = yaml_text.load(folder / FILE, "hand"), corrections.written(folder)
+    for old in {e["taxels"] for e in data.get("skin") or []} - {e["taxels"] for e in entries}:
         (folder / old).unlink(missing_ok=True)
-    file.skin, file.source = [SkinEntry(**e) for e in entries], {**file.source, "skin": requested}
-    if note is None:
-        write(file, folder / FILE)
-    else:  # with its words, and so that the next import knows these files for its own
-        data = yaml_text.load(folder / FILE, "hand") | {"skin": entries, "source": file.source}
-        (folder / FILE).write_text(hand_text(data, file.guessed), encoding="utf-8")
+    write(data | {"skin": entries, "source": (data.get("source") or {}) | {"skin": requested}}, folder)
+    if note is not None:  # so that the next import knows these files for its own
         note["files"] |= {e["taxels"]: folders.sha(folder / e["taxels"]) for e in entries}
         (folder / corrections.NOTE).write_text(json.dumps(note, indent=1), encoding="utf-8")
     return load_hand(folder)
@@ -334,8 +330,5 @@ def copy(hand: Hand, out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"out={out}: exists and is not empty; choose another, or leave out= away for the hand itself")
     shutil.copytree(hand.folder, out, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
-    file = read(hand.folder / FILE)
-    file.name = out.name
     shutil.copy2(hand.servo_path, out / "servo.yaml")
-    file.servo = "servo.yaml"
-    write(file, out / FILE)
+    write(yaml_text.load(hand.folder / FILE, "hand") | {"name": out.name, "servo": "servo.yaml"}, out)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from dexsim import files
+from dexsim.hand.schema import FILE
 
 HEAD = """\
 # {name}: a hand as dexsim reads it, written by `dexsim import-hand`. Lengths in m, angles in rad.
@@ -25,14 +29,16 @@ ABOUT = {
 }
 
 
-def yaml_text(hand: dict[str, Any], guessed: list[str]) -> str:
-    """Write a hand as YAML. hand: plain data as `dexsim.hand.schema.HandFile` has it."""
+def write(hand: dict[str, Any], folder: Path) -> None:
+    """Write a hand.yaml whole or not at all. hand: plain data as `dexsim.hand.schema.HandFile` has it."""
+    guessed = set(hand.get("guessed") or [])
     out = [HEAD.format(name=hand["name"])]
     for key, value in hand.items():
         if key in ABOUT:
             out.append(f"\n# {ABOUT[key]}\n")
-        out.append(_entry(key, value, key, 0, set(guessed)))
-    return "".join(out)
+        out.append(_entry(key, value, key, 0, guessed))
+    with files.beside(folder / FILE) as part:
+        part.write_text("".join(out), encoding="utf-8")
 
 
 def _entry(key: str, value: Any, place: str, depth: int, guessed: set[str]) -> str:
