@@ -439,9 +439,9 @@ BAD = [
     ),
     (
         "tactile: {pads: {little: {gain: 0.5}}}",
-        "tactile.pads.little: no such fingertip; fingertips: thumb, index, mid, ring, pinky",
+        "tactile.pads.little: no such pad; pads: thumb, index, mid, ring, pinky",
     ),
-    ("tactile: {pads: {index: {dead: [200]}}}", "tactile.pads.index: no taxel 200; a fingertip has 120"),
+    ("tactile: {pads: {index: {dead: [200]}}}", "tactile.pads.index: no taxel 200; this pad has 120"),
     ("tactile: {pads: {index: {gian: 0.5}}}", "tactile.pads.index.gian: unknown; valid ones: gain"),
     ("tactile: {delays: 0.1}", "tactile.delays: unknown; valid ones: pads, stiffness_scale"),
     (

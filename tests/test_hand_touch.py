@@ -64,7 +64,7 @@ def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     path = tmp_path / "tactile.yaml"
     assert diagnosis.save_tactile(diagnosis.handed(result.findings, result.facts, result.names), path)
     assert list(load(path, claw)["tactile"]["pads"]) == ["middle"]
-    with pytest.raises(UserError, match=r"pads\.middle: no such fingertip; fingertips: thumb, index, mid"):
+    with pytest.raises(UserError, match=r"pads\.middle: no such pad; pads: thumb, index, mid"):
         load(path)  # of the xHand
 
 

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from dexsim.errors import UserError
 from dexsim.tactile.config import TactileConfig
 from dexsim.tactile.kernel import (
     LAWS,
@@ -33,7 +32,7 @@ from dexsim.tactile.kernel import (
 )
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import NEVER, counts, relax, rubber_force
-from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS
+from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS, check
 from dexsim.tactile.sdf import Shapes, distance
 
 if TYPE_CHECKING:
@@ -69,15 +68,9 @@ class ByPad:
         order, beside = np.tile(np.arange(t), (f, 1)), np.full((f, t, BESIDE), -1)
         stuck: list[tuple[int, int, float]] = []
         thickness, rubber = np.full(f, THICKNESS), np.zeros(f, dtype=bool)
+        check(cfg.pads, layout.names, layout.count)
         for name, pad in cfg.pads.items():
-            if name not in layout.names:
-                raise UserError(f"tactile.pads.{name}: no such pad; pads: {', '.join(layout.names)}")
             i = layout.names.index(name)
-            for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
-                if k >= layout.count[i]:
-                    raise UserError(
-                        f"tactile.pads.{name}: no taxel {k}; this pad has {layout.count[i]}, counted from 0"
-                    )
             for c, (a, b) in pad.params.items():
                 j = COLUMNS.index(c)
                 low[j, i], high[j, i], own[j, i] = a, b, True

@@ -24,7 +24,7 @@ from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.tactile.config import COLUMNS
 from dexsim.tactile.layout import hand_layout
-from dexsim.tactile.pads import Pad, Value, pad_configs, value_range
+from dexsim.tactile.pads import Pad, Value, check, pad_configs, value_range
 
 RANGES: dict[str, tuple[str, float, float]] = {
     "object.friction": ("1", 0.05, 3.0),
@@ -95,11 +95,5 @@ def _pads(value: Any, hand: Hand) -> dict[str, Any]:
         if not value:
             return dict(value)
         raise UserError(f"tactile.pads: hand={hand.name} has no touch pads; take it out of the file")
-    for name, pad in pad_configs(value).items():
-        if name not in layout.names:
-            raise UserError(f"tactile.pads.{name}: no such fingertip; fingertips: {', '.join(layout.names)}")
-        taxels = int(layout.count[layout.names.index(name)])
-        for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
-            if k >= taxels:
-                raise UserError(f"tactile.pads.{name}: no taxel {k}; a fingertip has {taxels}, counted from 0")
+    check(pad_configs(value), layout.names, layout.count)
     return dict(value)

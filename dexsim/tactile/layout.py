@@ -158,21 +158,6 @@ def _gap(point: bytes, normal: bytes, corners: bytes) -> np.ndarray:
     return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
 
 
-def neighbours(columns: int, rows: int) -> list[list[int]]:
-    """Return taxels beside each taxel of a lattice, k = column * rows + row."""
-    out = []
-    for k in range(columns * rows):
-        c, r = divmod(k, rows)
-        out.append(
-            [
-                a * rows + b
-                for a, b in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1))
-                if 0 <= a < columns and 0 <= b < rows
-            ]
-        )
-    return out
-
-
 def tangents(
     normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)
 ) -> tuple[np.ndarray, np.ndarray]:

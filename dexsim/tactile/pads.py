@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from dexsim import typed
 from dexsim.errors import UserError
@@ -103,6 +104,17 @@ def pad_configs(value: Mapping[str, Any]) -> dict[str, PadConfig]:
     is allowed."""
     typed.convert({"tactile": {"pads": plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")
     return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
+
+
+def check(pads: Mapping[str, PadConfig], names: Sequence[str], count: Sequence[int] | np.ndarray) -> None:
+    """Raise UserError for a pad that is none of `names`, and for a taxel beyond its `count`."""
+    for name, pad in pads.items():
+        if name not in names:
+            raise UserError(f"tactile.pads.{name}: no such pad; pads: {', '.join(names)}")
+        taxels = int(count[list(names).index(name)])
+        for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
+            if k >= taxels:
+                raise UserError(f"tactile.pads.{name}: no taxel {k}; this pad has {taxels}, counted from 0")
 
 
 def plain(node: object) -> object:

@@ -47,8 +47,8 @@ def annotate(
     small = _small(height or frame.shape[0])
     above, below = room(height or frame.shape[0], bool(text), bars)
     width = frame.shape[1]
-    whole = np.concatenate([np.full((rows, width, 3), DARK, np.uint8) for rows in (above, 0)] + [frame]
-                           + [np.full((below, width, 3), DARK, np.uint8)])  # fmt: skip
+    whole = np.full((above + frame.shape[0] + below, width, 3), DARK, np.uint8)
+    whole[above : above + frame.shape[0]] = frame
     image = Image.fromarray(whole)
     draw = ImageDraw.Draw(image, "RGBA")
     if text:

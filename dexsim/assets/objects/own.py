@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -129,20 +128,15 @@ def cache_folder() -> Path:
 def save(shape: Shape, path: Path) -> None:
     """Write a shape, whole or not at all."""
     assert shape.grid is not None
-    handle, part = tempfile.mkstemp(suffix=".npz", dir=path.parent, prefix=".writing-")
-    os.close(handle)
-    try:
+    with files.beside(path) as part, open(part, "wb") as file:
         np.savez_compressed(
-            part, format=FORMAT, name=shape.name, hulls=np.concatenate(shape.hulls).astype(np.float32),
+            file, format=FORMAT, name=shape.name, hulls=np.concatenate(shape.hulls).astype(np.float32),
             hull_sizes=np.array([len(h) for h in shape.hulls], np.int32), volume=shape.volume,
             inertia_unit=shape.inertia_unit, origin=shape.grid.origin, spacing=shape.grid.spacing,
             data=shape.grid.data.astype(np.float32), grid_error=np.array(shape.grid_error),
             notes=np.array(shape.notes, str),
             file_centre=shape.file_centre, file_axes=shape.file_axes, file_scale=shape.file_scale,
         )  # fmt: skip
-        os.replace(part, path)
-    finally:
-        Path(part).unlink(missing_ok=True)
 
 
 def _read(path: Path) -> Shape:
