@@ -67,10 +67,7 @@ class TaxelLayout:
                 f"tactile.pads.{self.names[pad]}.crosstalk: which taxels lie beside one another is not known of this"
                 " layout; use 0"
             )
-        lattice = np.pad(np.arange(n).reshape(-1, rows), 1, constant_values=-1)
-        return np.stack([lattice[:-2, 1:-1], lattice[2:, 1:-1], lattice[1:-1, :-2], lattice[1:-1, 2:]], -1).reshape(
-            n, 4
-        )
+        return lattice(n // rows, rows)
 
     def lifted(self, tips: Sequence[np.ndarray], limit: float = 1e-3) -> TaxelLayout:
         """Return the taxels moved along their normals onto the convex hulls of `tips` ([V, 3] m each, body frames), the
@@ -156,6 +153,17 @@ def _gap(point: bytes, normal: bytes, corners: bytes) -> np.ndarray:
     along = n @ planes[:, :3].T
     gap = -(p @ planes[:, :3].T + planes[:, 3])
     return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
+
+
+def lattice(columns: int, rows: int) -> np.ndarray:
+    """Return the taxels [n, 4] beside each taxel of a lattice, k = column * rows + row, -1 where there is none."""
+    at = np.pad(np.arange(columns * rows).reshape(columns, rows), 1, constant_values=-1)
+    return np.stack([at[:-2, 1:-1], at[2:, 1:-1], at[1:-1, :-2], at[1:-1, 2:]], -1).reshape(-1, 4)
+
+
+def neighbours(columns: int, rows: int) -> list[list[int]]:
+    """Return the taxels beside each taxel of a `lattice`."""
+    return [[int(k) for k in beside if k >= 0] for beside in lattice(columns, rows)]
 
 
 def tangents(

@@ -9,7 +9,7 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.hand.skin import link_skins, tip_skins
-from dexsim.tactile.layout import TaxelLayout, hand_layout
+from dexsim.tactile.layout import TaxelLayout, hand_layout, neighbours
 from dexsim.tactile.pressing import Skin, skin_of
 
 
@@ -60,8 +60,9 @@ class Sensors:
 
     def beside(self, pad: int) -> list[list[int]]:
         """Return taxels beside each taxel of a pad: in its lattice, or by where they lie where there is none."""
-        if self.lattice(pad) is not None:
-            return [[int(k) for k in row if k >= 0] for row in self._pads.beside(pad)]
+        lattice = self.lattice(pad)
+        if lattice is not None:
+            return neighbours(*lattice)
         return _gabriel(self._pads.point[pad, : self._pads.count[pad]])
 
     def mixing(self, pad: int) -> np.ndarray:
