@@ -260,13 +260,14 @@ def _of_the_sensors(case: Case) -> list[Param]:
     return out
 
 
-# s that a search takes yet, at least and at most, for each that it took until here: four in five of 45 searches (two on
+# s that a search takes yet, at least and at most, for each that it took until here: four in five of 55 searches (two on
 # each of twenty hands, and of the own set). quiet: nothing seems to be missing; enough: what was found explains it
 AHEAD = {
-    "begun": (6.0, 30.0), "begun, quiet": (3.5, 9.0), "scanned": (1.5, 7.0), "scanned, quiet": (0.25, 1.2),
-    "drafted": (0.4, 3.5), "fitted": (0.4, 2.8), "fitted, enough": (0.15, 0.7),
+    "begun": (6.0, 30.0), "begun, quiet": (2.5, 11.0), "scanned": (1.5, 7.0), "scanned, quiet": (0.4, 2.0),
+    "drafted": (0.4, 3.5), "fitted": (0.35, 2.8), "fitted, enough": (0.2, 1.0),
     "scanned again": (0.35, 1.6), "drafted again": (0.25, 1.3), "fitted again": (0.15, 1.0),
-    "fitted again, enough": (0.1, 0.5), "ending": (0.1, 0.5), "settling": (0.04, 0.36),
+    "fitted again, enough": (0.1, 0.5), "ending": (0.2, 0.75), "ending, nothing": (0.02, 0.75),
+    "settling": (0.03, 0.36), "settling, nothing": (0.02, 0.75),
 }  # fmt: skip
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate

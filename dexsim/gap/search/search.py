@@ -121,7 +121,7 @@ def search_joint(search: JointSearch) -> Outcome:
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
-    search.reached("ending")
+    search.reached("ending", "" if current.members else ", nothing")
     current, final = settled(search, current, pool)
     rivals = {e: x[0] for e, x in final.items()}
     confidence, gains = {e: x[1] for e, x in final.items()}, {e: x[2] for e, x in final.items()}
@@ -662,7 +662,7 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
         if not search.deadline.over():
             found.best = simpler(search, found.best)
         search.whole = search.case.plant.refined(FINER)
-    search.reached("settling")
+    search.reached("settling", "" if found.best.members else ", nothing")
     polished(search, found.best), polished(search, found.none)  # kept for the judgement
 
 
