@@ -22,7 +22,7 @@ def test_of_hypotheses_that_are_out_of_time_the_first_is_fitted(monkeypatch):
     s.fitted = {}
     listed = scan_catalogue(s, none)[:4]
     s.deadline = SimpleNamespace(over=lambda: True)
-    drafts = drafts_of(s, listed, none, {}, {})
+    drafts = drafts_of(s, listed, none, {})
     assert len(drafts) == 1 and drafts[0][0][0].id == listed[0][2].id
     assert len(finished_drafts(s, drafts * 2, none)) == 1
 

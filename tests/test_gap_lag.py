@@ -26,7 +26,7 @@ def moved(inertia: float, columns: dict[str, float], targets: np.ndarray, dt: fl
     """[steps, 2] q, motor torque of a link in free air, with targets[k] in force from step k on."""
     steps = len(targets)
     t = dt * np.arange(steps)
-    constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, inertia, 0.0)
+    constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, inertia)
     plant = JointPlant("joint", constants, dt, False, "joint", "joint")
     series = np.zeros((2, len(SERIES)))
     for name, value in (("inertia", inertia), ("supply", 1.0), ("enabled", 1.0)):

@@ -26,7 +26,7 @@ class Judged(JointAnswer):
         self.member = SimpleNamespace(id="lag", effect=effect, variant=SimpleNamespace(fixed=(), note=""))
         self.best, self.none = (
             SimpleNamespace(members=(self.member,), fit=None),
-            SimpleNamespace(fit=SimpleNamespace(params=[], x=[])),
+            SimpleNamespace(fit=SimpleNamespace(params=[], x=[]), fixed=()),
         )
         self.case = SimpleNamespace(joint="j", sigma=1.0)
         self.kept = SimpleNamespace(runs=[], train=[], test=[], proven=True)
@@ -105,7 +105,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=Fal
     monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)
     monkeypatch.setattr(joint_answer, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
-    return JointAnswer._weighed(answer, answer.member, {}, fitted, 1.0, 0.1, False, borne_out, 1.0)
+    return JointAnswer._weighed(answer, answer.member, {}, 1.0, 0.1, borne_out, 1.0)
 
 
 @pytest.mark.parametrize(

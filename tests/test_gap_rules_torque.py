@@ -134,7 +134,7 @@ def test_a_loop_tells_of_the_joint_where_its_law_is_right_in_the_main():
 
 def test_a_drive_is_sound_by_its_logged_duty():
     def sound(fit=0.99, slope=1.0, delay=0.0):
-        return Stage("j", "duty", slope, 0.9, 1.1, 0.0, delay, fit, late=0.0075).sound
+        return Stage("j", "duty", slope, 0.9, 1.1, delay, fit, late=0.0075).sound
 
     assert sound() and sound(fit=0.96) and not sound(fit=0.9)
     assert sound(slope=1.04) and not sound(slope=1.08) and not sound(slope=0.92)

@@ -422,7 +422,7 @@ def test_what_is_taken_back_does_not_reach_a_search():
         def locate(self, rng, seed):
             pass
 
-    found = Outcome("j", "none", "three", {}, {}, {}, {}, [])
+    found = Outcome("j", "none", "three", {}, {}, [])
     answer = Answer.of(None, None, found, None)
     assert (found.best, answer.outcome.best) == ("three", "one")
     assert [answer.earlier.outcome.best, answer.earlier.earlier.outcome.best] == ["two", "three"]

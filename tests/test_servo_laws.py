@@ -49,7 +49,7 @@ def plant_motion(columns: dict, times, targets, seconds: float, v0=0.0, dt=0.001
     """[steps, 2] q, motor torque of the same link in the search's plant."""
     steps = round(seconds / dt)
     t = dt * np.arange(steps)
-    constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, INERTIA, 0.0)
+    constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, INERTIA)
     plant = JointPlant("joint", constants, dt, False, "joint", "joint")
     series = np.zeros((2, len(SERIES)))
     for name, value in (

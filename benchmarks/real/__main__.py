@@ -92,7 +92,6 @@ def emps(data: Path, out: Path, engine: Engine) -> dict:
         "low": {k: tool.low[n] for k, n in names.items()},
         "high": {k: tool.high[n] for k, n in names.items()},
         "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 3) for k in by},
-        "extra": tool.extra[:3],
         "residual": tool.residual,
         "named": [
             {k: getattr(n, k) for k in ("text", "effect", "value", "low", "high", "share")}

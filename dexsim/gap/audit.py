@@ -20,7 +20,7 @@ import numpy as np
 
 from dexsim.console.tables import table as columns_of
 from dexsim.errors import UserError
-from dexsim.gap.read import Run, agreement, channels, inputs, same_commands
+from dexsim.gap.read import Run, agreement, channels, conditions, inputs
 from dexsim.gap.read.noise import noise
 from dexsim.hand import load_hand
 from dexsim.recording.arguments import read_arguments
@@ -74,13 +74,8 @@ class Repeats:
 
 def repeats(runs: Sequence[Run]) -> list[Repeats]:
     """Return recordings of the same commands, motion by motion: the floor of each."""
-    groups: list[list[Run]] = []
-    for run in runs:
-        mine = next((g for g in groups if same_commands(g[0], run)), None)
-        if mine is None:
-            groups.append([run])
-        else:
-            mine.append(run)
+    number = conditions(list(runs))
+    groups = [[run for run, k in zip(runs, number, strict=True) if k == g] for g in dict.fromkeys(number)]
     return [_apart(g) for g in groups if len(g) > 1]
 
 

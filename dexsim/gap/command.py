@@ -81,26 +81,7 @@ settings (key=default):
   remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state,
                               remap.position.elbow=enc1
 """
-KEYS = (
-    "recordings",
-    "fleet",
-    "before",
-    "held_out",
-    "model",
-    "hand",
-    "hand_mirror",
-    "servo",
-    "out",
-    "effects",
-    "next",
-    "seed",
-    "device",
-    "replay",
-    "demo",
-    "columns",
-    "limit",
-    "joints",
-)
+KEYS = tuple(re.findall(r"^  (\w+)=\S*  ", HELP, re.M))  # as they are listed there
 
 
 def parse(argv: list[str]) -> dict:
@@ -245,33 +226,23 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
 
     if given.get("replay", "mujoco") not in REPLAY:
         raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
-    allowed = None
-    if given.get("effects"):
-        known = (*EFFECTS, *(e for e in TOUCH_EFFECTS if e not in EFFECTS))
-        for e in given["effects"]:
-            if e not in known:
-                raise UserError(
-                    f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}"
-                )
-        allowed = set(given["effects"])
+    known = tuple(dict.fromkeys((*EFFECTS, *TOUCH_EFFECTS)))
+    for e in given.get("effects", ()):
+        if e not in known:
+            raise UserError(
+                f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}"
+            )
     fitted, held_out = inputs.parted(given["recordings"], given.get("held_out"))
+    same = ("model", "servo", "seed", "replay", "meta", "remap", "limit", "hand", "hand_mirror")
     return Settings(
         fitted,
         out,
         held_out,
-        given.get("model"),
-        given.get("servo"),
-        given.get("seed", 0),
-        device,
-        given.get("next", True),
-        allowed,
-        replay=given.get("replay", "mujoco"),
-        meta=given["meta"],
-        remap=given["remap"],
-        limit=given.get("limit"),
-        joints=set(given["joints"]) if given.get("joints") else None,
-        hand=given.get("hand"),
-        hand_mirror=given.get("hand_mirror", False),
+        device=device,
+        next_recording=given.get("next", True),
+        allowed=set(given.get("effects", ())) or None,
+        joints=set(given.get("joints", ())) or None,
+        **{k: given[k] for k in same if k in given},
     )
 
 

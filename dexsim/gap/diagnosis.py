@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.gap import compute, posterior
+from dexsim.gap import compute
 from dexsim.gap.compute import LONGER, Span, TimeLimit, map_joints, workers
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import (
@@ -35,6 +35,7 @@ from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
 from dexsim.gap.plant.columns import DRAGGERS
+from dexsim.gap.plant.mechanics import chain
 from dexsim.gap.read import Run, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next
@@ -624,7 +625,6 @@ class Drives(Steps):
                 "does"
             )
         d.stages = [x.text for x in self.stages] + self.behind
-        d.hypotheses = {x.case.joint: posterior.entry(x.search.shadow.hypotheses) for x in self.searched}
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
         conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out
@@ -712,12 +712,7 @@ def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outc
     """Return what was fitted to each joint, as the others are moved by it. Where an encoder misreads, joints along the
     same chain seem to misread as well (gravity is turned for all of them): of one chain only the clearest is
     believed."""
-    chains = []
-    for joint in joints:
-        body = int(model.jnt_bodyid[model.joint(joint).id])
-        chains.append({body})
-        while body := int(model.body_parentid[body]):
-            chains[-1].add(body)
+    chains = [{*chain(model, model.jnt_bodyid[model.joint(x).id])} for x in joints]
     removed = [x.none.fit.loss - x.best.fit.loss for x in found]
     misreads = [k for k, x in enumerate(found) if any(m.effect.misreads for m in x.best.members)]
     clearer = lambda a, b: removed[a] > removed[b] and (chains[a] <= chains[b] or chains[b] <= chains[a])  # noqa: E731

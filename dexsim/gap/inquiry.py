@@ -138,7 +138,7 @@ class Diagnosis:
     findings: list[Finding] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     spots: list[locate.Spot] = field(default_factory=list)
-    # by joint: before, after, sigma; as_fitted: after, where it was taken back
+    # by joint: before, after, sigma
     joints: dict[str, dict[str, float]] = field(default_factory=dict)
     outcomes: list[Outcome] = field(default_factory=list)
     servo: ServoTable | None = None
@@ -146,7 +146,6 @@ class Diagnosis:
     mechanism: Mechanism | None = None
     stages: list[str] = field(default_factory=list)
     shares: dict[str, float] = field(default_factory=dict)
-    spans: dict[str, float] = field(default_factory=dict)
     touch: TouchResult | None = None
     lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
     standins: list[handed_on.StandIn] = field(default_factory=list)
@@ -158,7 +157,6 @@ class Diagnosis:
     # joints that ring by themselves, as what was found of them does in what was held out
     ringing: frozenset[str] = frozenset()
     judged: Judged | None = None  # None where no joint is
-    hypotheses: dict[str, Any] = field(default_factory=dict)  # by joint: what was tried, with masses (`posterior`)
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import erfc, sqrt
 
 import numpy as np
+from scipy.stats import false_discovery_control
 
 from dexsim import intervals
 from dexsim.gap.rules import JUDGE
@@ -108,7 +110,7 @@ def spots(
             spot, size = out[k], float(np.sqrt(inner[k] / max(outer[k], 1e-300)))
             spot.ratio, spot.ratio_low, spot.ratio_high = size, float(low), float(high)
             spot.rms = float(np.sqrt(inner[k]))
-            spot.p = 2 * _tail(abs(np.log(max(size, 1e-9)) / max(deviation, 1e-6)))
+            spot.p = erfc(abs(np.log(max(size, 1e-9)) / max(deviation, 1e-6)) / sqrt(2))
     return [out[k] for k in often]
 
 
@@ -146,21 +148,9 @@ def control(found: list[Spot]) -> list[Spot]:
     efforts."""
     if not found:
         return []
-    order = np.argsort([s.p for s in found])
-    m = len(found)
-    q, last = np.empty(m), 1.0
-    for k in range(m - 1, -1, -1):
-        last = min(last, found[order[k]].p * m / (k + 1))
-        q[order[k]] = last
-    for s, value in zip(found, q, strict=True):
+    for s, value in zip(found, false_discovery_control([s.p for s in found]), strict=True):
         s.q = float(value)
     return sorted(
         [s for s in found if s.q <= JUDGE.level and s.ratio > JUDGE.within],
         key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)),
     )
-
-
-def _tail(z: float) -> float:
-    from math import erfc, sqrt
-
-    return 0.5 * erfc(z / sqrt(2))

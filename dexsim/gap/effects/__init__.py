@@ -227,7 +227,7 @@ class Effect:
     by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
     # whether that column names it; else it only keeps others from taking its trace for their own
     named_by_torque: ClassVar[bool] = True
-    # columns of the plant that training has no like of, and is given others in the place of (`approximate_columns`)
+    # columns of the plant that training has no like of, and is given others in the place of (`columns_beside`)
     approximated: ClassVar[tuple[str, ...]] = ()
     by_warmth: ClassVar[tuple[str, ...]] = ()  # columns with which training is given the recorded temperatures
 
@@ -270,19 +270,15 @@ class Effect:
         """Return its size for the line about logged torque, with its unit; empty where the coefficient says it."""
         return ""
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        """Return whether a coefficient of inverse dynamics can be what it is called. joint: as of `ByTorque`; slowest:
-        the lowest cutoff [Hz] of what was filtered."""
-        return True
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
+        """Return why a coefficient of inverse dynamics cannot be what it is called; empty where that is passed over,
+        None where it can. joint: as of `ByTorque`; slowest: the lowest cutoff [Hz] of what was filtered."""
+        return None
 
-    def impossible_by_torque(self, value: float, joint: dict[str, float]) -> str:
-        """Return why such a coefficient is told as a refusal where it is not possible; empty where it is not. The
-        arguments: as of `possible_by_torque`."""
-        return ""
-
-    def columns_beside(self, variant: Variant, joints: Sequence[str]) -> dict[str, float]:
-        """Return servo columns that go with a kind of it beside its fitted ones: what that kind sets, and of one that
-        another joint has part in, the number of that joint among the mechanism's."""
+    def columns_beside(self, variant: Variant, joints: Sequence[str], row: np.ndarray, case: Case) -> dict[str, float]:
+        """Return servo columns that go with a kind of it beside its fitted ones: what that kind sets, of one that
+        another joint has part in the number of that joint among the mechanism's, and what stands in the place of those
+        `approximated`. row [C]: the plant's, as fitted."""
         out = {name: value for name, value in variant.fixed if name in SERVO_INDEX}
         if "coupling_from" in out:
             out["coupling_from"] = float(joints.index(variant.note["from_joint"]))
@@ -292,10 +288,6 @@ class Effect:
         """Return of what training has no law as it was fitted, and what it is given in its place; None where it has
         all."""
         return None
-
-    def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
-        """Return servo columns in the place of those `approximated`. row: the plant's, as fitted."""
-        return {}
 
     def said(self, finding: Finding, believed: dict[str, float]) -> str:
         """Return what it does, in words, with its direction where its size tells that. believed: columns of the joint,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from dexsim.actuator.columns import DRY_FRICTION
 from dexsim.actuator.reference import torque_along
@@ -281,14 +282,7 @@ def temperature_follows(case: Case, runs: Sequence[int]) -> str:
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Return Spearman's, with ties at their middle rank; 0 where one does not change."""
-    if np.ptp(a) <= 0 or np.ptp(b) <= 0:
-        return 0.0
-
-    def ranks(x: np.ndarray) -> np.ndarray:
-        _, inverse, count = np.unique(x, return_inverse=True, return_counts=True)
-        return (np.cumsum(count) - 0.5 * (count - 1))[inverse]
-
-    return float(np.corrcoef(ranks(a), ranks(b))[0, 1])
+    return float(spearmanr(a, b).statistic) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
 
 
 class GainMismatch(Effect):

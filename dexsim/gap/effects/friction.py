@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -123,13 +123,11 @@ class ViscousFriction(Effect):
         asymmetry |= {k: float(np.clip(asymmetry[k], -2.0, 2.0)) for k in ("value", "low", "high")}
         return {"coefficient": entry(own, own * 0.95, own * 1.05, unit), "asymmetry": asymmetry}
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        return abs(value) <= joint.get("viscous_friction", 0.0)
-
-    def impossible_by_torque(self, value: float, joint: dict[str, float]) -> str:
-        return (
-            f"the least squares give {joint.get('viscous_friction', 0.0):.3g} with {value:.3g} more forwards and less "
-            "backwards, and neither direction's can be negative"
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
+        own = joint.get("viscous_friction", 0.0)
+        return None if abs(value) <= own else (
+            f"the least squares give {own:.3g} with {value:.3g} more forwards and less backwards, and neither "
+            "direction's can be negative"
         )
 
 
@@ -170,8 +168,8 @@ class StribeckFriction(Effect):
         v_s = found.speed
         return {"peak": found.entry(found.force), "v_s": entry(v_s, 0.5 * v_s, 2 * v_s, f"{found.length}/s")}
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        return value > 0  # an excess is more
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
+        return None if value > 0 else ""  # an excess is more
 
 
 def _falling(d: Columns, speed: float) -> np.ndarray:
@@ -223,12 +221,15 @@ class LoadFriction(Effect):
     def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
         return {"fraction": found.entry("1")}
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        return 0 < value < 1 and joint.get("coulomb_friction", 0.0) >= 0
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
+        return None if 0 < value < 1 and joint.get("coulomb_friction", 0.0) >= 0 else ""
 
-    def approximate_columns(self, row: np.ndarray, case: Case) -> dict[str, float]:
-        """Dry friction that grows with the torque on the joint, per torque from outside: the servo table knows that
-        torque without the joint's own inertia, and a line. As large as on average while the joint slid."""
+    def columns_beside(self, variant: Variant, joints: Sequence[str], row: np.ndarray, case: Case) -> dict[str, float]:
+        """Return what stands in for dry friction that grows with the torque on the joint, per torque from outside: the
+        servo table knows that torque without the joint's own inertia, and a line. As large as on average while the
+        joint slid."""
+        if not variant.approximate:
+            return {}
         share, back, power, unit = (
             row[PLANT_INDEX[f"gear_load_{n}"]] for n in ("friction", "friction_backdriven", "power", "unit")
         )
@@ -280,8 +281,9 @@ class Presliding(Effect):
         ways = (k * own.span for k in DISTANCES)
         return {f"{self.by_torque} (over {way:.2g})": partial(_gives, way=way) for way in ways}
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
-        return 0 < value < 2 * joint.get("coulomb_friction", 0.0)  # what gives way is friction that is there
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
+        # what gives way is friction that is there
+        return None if 0 < value < 2 * joint.get("coulomb_friction", 0.0) else ""
 
 
 def _gives(d: Columns, way: float) -> np.ndarray:

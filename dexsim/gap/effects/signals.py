@@ -89,9 +89,9 @@ class Lag(Effect):
     def size_by_torque(self, found: ByTorque) -> str:
         return f"{1e3 * found.value / found.joint['inertia']:.2g} ms"
 
-    def possible_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> bool:
+    def refused_by_torque(self, value: float, joint: dict[str, float], slowest: float) -> str | None:
         # late, and its first term alone is fitted, which serves up to a radian of the lowest cutoff
-        return 0 < value < abs(joint["inertia"]) / (2 * np.pi * slowest)
+        return None if 0 < value < abs(joint["inertia"]) / (2 * np.pi * slowest) else ""
 
 
 class SetpointProfile(Effect):

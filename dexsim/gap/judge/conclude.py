@@ -23,7 +23,8 @@ from dexsim.gap.inquiry import Diagnosis, Judged, Settings, TouchResult
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
 from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
-from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, nuisances, rms
+from dexsim.gap.judge.held_out import rms
+from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, nuisances
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
@@ -81,7 +82,6 @@ def into_diagnosis(
         joint = a.case.joint
         findings += a.found
         d.evidence += a.evidence
-        d.spans |= a.spans
         d.joints[joint] = a.numbers
         d.mae |= {(joint, name): v for name, v in a.mae().items()}
         d.outcomes.append(a.outcome)
@@ -269,7 +269,7 @@ def _take_back(
         d.data["nuisance"] = {
             key: x for key, x in d.data["nuisance"].items() if not key.endswith(f"@{joint}")
         } | nuisances(joint, a.none)
-        v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
+        v["after"] = v["before"]
     return refuted
 
 
@@ -719,7 +719,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     """Return the verdict in one or two sentences."""
     h = data["held_out"]
     metric = h["error"]
-    effort, unit = metric.startswith("effort"), _unit(metric)
+    effort, unit = metric.startswith("effort"), unit_of(metric)
     if unit == "mN" and not effort:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
@@ -779,13 +779,10 @@ def _where_judged(h: dict) -> str:
     return "recordings not used for the fit"
 
 
-def _unit(metric: str) -> str:
+def unit_of(metric: str) -> str:
     """Return the thousandth in which an error is told, of `held_out.error`."""
-    if metric.startswith("effort"):
-        return "mN" if metric.endswith("_N") else "mN.m"
-    if metric.startswith("tactile"):
-        return "mN"
-    return "mm" if metric.endswith("_m") else "mrad"
+    ends = {"_N": "mN", "_Nm": "mN.m", "_m": "mm"}
+    return next((unit for end, unit in ends.items() if metric.endswith(end)), "mrad")
 
 
 def _first_of_all(findings: list[Finding], bad: list[Finding], d: Diagnosis) -> str:

@@ -105,6 +105,12 @@ def not_repeated(params: Sequence, folds: np.ndarray, case: Case) -> str:
     return ""
 
 
+def earned(before: float, after: float) -> float:
+    """Return 0 to 1: what an effect has earned by the error held out, without and with it: 1 where that falls by
+    `JUDGE.earns` or more."""
+    return float(np.clip((before - after) / (JUDGE.earns * before + 1e-12), 0.0, 1.0))
+
+
 def left_over(after: float, before: float, noise: float) -> float:
     """Share of a squared error `before` that stays, above `JUDGE.within` x the noise."""
     base = (JUDGE.within * noise) ** 2

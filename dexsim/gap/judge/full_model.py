@@ -339,12 +339,10 @@ def free_runs(
     device: str = "cpu",
     timestep: float = STEP,
     engine: str = "auto",
-    torque: bool = False,
     progress: Callable[..., None] | None = None,
 ) -> list:
     """Return reported positions [T, J] of each world at every step, from its first position and speed on, as one batch
-    a drive and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead. progress: of
-    `compute.watched`."""
+    a drive and gravity. progress: of `compute.watched`."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         # as long as the longest of a batch all of it runs
@@ -363,7 +361,7 @@ def free_runs(
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
         given = [worlds[i] for i in mine]
-        batch = partial(_batch, spec, joints, given, together, device, timestep, engine, torque, partial(tell, k))
+        batch = partial(_batch, spec, joints, given, together, device, timestep, engine, partial(tell, k))
         in_air = batch(False)
 
         def moved() -> list:
@@ -391,7 +389,6 @@ def _batch(
     device: str,
     timestep: float,
     kind: str,
-    torque: bool,
     tell: Callable[[float], None],
     contacts: bool,
 ) -> Callable[[], list]:
@@ -451,16 +448,14 @@ def _batch(
         servo.state[:, :, servo.slots["integral"]] = up(held)
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
-    given = torch.zeros_like(seen) if torque else None
     heated = "warmth" in varied or "rare" in servo.features
     changes = Changes(servo, worlds, now, steps, timestep, up, heated)
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
 
     def moved() -> list:
-        shown = _stepped(engine, servo, changes, seen, given, path, tell, look)
+        q = _stepped(engine, servo, changes, seen, path, tell, look).cpu().numpy().astype(float)
         tell(1.0)
-        q, *tau = (x.cpu().numpy().astype(float) for x in (shown, given) if x is not None)
-        return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+        return [q[:, i] for i in range(N)]
 
     return moved
 
@@ -511,14 +506,13 @@ def _stepped(
     servo: Servo,
     changes: Changes,
     seen: torch.Tensor,
-    given: torch.Tensor | None,
     lead: Callable[[int], None],
     tell: Callable[[float], None],
     look: Callable[[np.ndarray], None] | None,
 ) -> torch.Tensor:
     """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
-    given [S, N, J]: filled with the drives' torques; lead: of `_path`; tell: how much of it is done; look: raises
-    `Touching` where anything touches at positions [N, nq] (None: contacts are simulated)."""
+    lead: of `_path`; tell: how much of it is done; look: raises `Touching` where anything touches at positions [N, nq]
+    (None: contacts are simulated)."""
     steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
@@ -540,8 +534,6 @@ def _stepped(
                 kept[k] = at
             servo.before_each()
             lead(k)
-            if given is not None:
-                given[k].copy_(servo.torque)
 
         engine.step(steps, before_each)
         if turned is not None:
@@ -561,8 +553,6 @@ def _stepped(
                 lead(k)
 
             engine.step(1, forces)
-            if given is not None:
-                given[k].copy_(servo.torque)
     return seen
 
 

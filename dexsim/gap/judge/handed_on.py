@@ -31,6 +31,7 @@ from dexsim.actuator.reference import (
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.finding import Finding
+from dexsim.gap.judge import confidence
 from dexsim.gap.plant.case import Case, true_motion
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
@@ -72,18 +73,6 @@ APPROXIMATED = frozenset(name for e in CATALOGUE for name in e.approximated)
 BY_WARMTH = frozenset(name for e in CATALOGUE for name in e.by_warmth)
 
 
-def approximate_columns(case: Case, trial: Trial) -> dict[str, float]:
-    """Return servo columns in the place of fitted ones that training has no like of."""
-    fitted = {name for p in trial.fit.params for name in p.columns}
-    wanted = [e for e in CATALOGUE if fitted & {*e.approximated}]
-    if not wanted:
-        return {}
-    row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0].copy()
-    for name, value in (f for m in trial.members for f in m.variant.fixed):
-        row[PLANT_INDEX[name]] = value
-    return {name: value for e in wanted for name, value in e.approximate_columns(row, case).items()}
-
-
 def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
     """Return servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is,
     which of the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take
@@ -91,8 +80,8 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
     out: dict[str, float] = {}
     fitted = {name for p in trial.fit.params for name in p.columns}
     for x in trial.members:
-        out |= x.effect.columns_beside(x.variant, joints)
-    out |= approximate_columns(case, trial)
+        row = expand(case.plant, trial.fit.params, trial.fit.x[None], trial.fixed)[0, 0]
+        out |= x.effect.columns_beside(x.variant, joints, row, case)
     if fitted & {*FEATURES["play"]} and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out
@@ -196,16 +185,15 @@ def earned(finding: Finding) -> float:
     error, others = finding.held_out or {}, sum(float(x["confidence"]) for x in finding.alternatives)
     if not error or error["before"] is None or error["after"] is None:
         return 0.0
-    less = float(np.clip((error["before"] - error["after"]) / (JUDGE.earns * error["before"] + 1e-12), 0.0, 1.0))
-    return less * max(1.0 - others, 0.0)
+    return confidence.earned(error["before"], error["after"]) * max(1.0 - others, 0.0)
 
 
-def widen(table: ServoTable, case: Case, member: Member, confidence: float, earned: float = 0.0) -> bool:
-    """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of
-    a half and less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the
+def widen(table: ServoTable, case: Case, member: Member, sure: float, earned: float = 0.0) -> bool:
+    """Widens the ranges of an effect's columns towards what was believed before the fit: all the way where its name is
+    half `sure` and less, 2 (1 - sure) of the way above, so that what training draws is on average as far from the
     belief as the effect is sure; and of that way only the share that is not `earned`: a policy meets the drive, not the
     name. The fitted values stay. Returns whether a range changed."""
-    changed, share = False, min(1.0, 2.0 * (1.0 - confidence)) * (1.0 - earned)
+    changed, share = False, min(1.0, 2.0 * (1.0 - sure)) * (1.0 - earned)
     if share <= 0.0:
         return False
     for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
@@ -317,10 +305,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     Where the joint hardly moves, dry friction hides any torque.
     """
     plant, j = case.plant, case.index
-    row = expand(plant, trial.fit.params, trial.fit.x[None])[0, run]
-    for member in trial.members:
-        for name, value in member.variant.fixed:
-            row[PLANT_INDEX[name]] = value
+    row = expand(plant, trial.fit.params, trial.fit.x[None], trial.fixed)[0, run]
     p = lambda name: row[PLANT_INDEX[name]]  # noqa: E731
     r = runs[run]
     shown = r.t, r.qs[:, j], r.vs[:, j], r.as_[:, j]
@@ -431,7 +416,6 @@ def _held_out(
 ) -> tuple[float, float]:
     """Return held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
     windows = case.plant.windows(None, test, span=span_test)
-    fixed = [f for m in trial.members for f in m.variant.fixed]
     measured = case.plant.q[windows.sample_row]
     out = []
     for k in (0.0, 1.0):
@@ -439,7 +423,7 @@ def _held_out(
         q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
         series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
         plant.set_series(series)
-        simulated, _ = free_run(replace(case, plant=plant), trial.fit.params, trial.fit.x, windows, fixed)
+        simulated, _ = free_run(replace(case, plant=plant), trial.fit.params, trial.fit.x, windows, trial.fixed)
         out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
     return out[0], out[1]
 

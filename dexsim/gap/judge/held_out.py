@@ -221,6 +221,11 @@ def _near(cases: Sequence[Case], names: Collection[str]) -> dict[str, np.ndarray
 DRAWS = 400  # of a bootstrap
 
 
+def rms(squares: np.ndarray) -> float:
+    """Return root of the mean of squares; 0 for none."""
+    return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
+
+
 def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str, dict[str, float]]:
     """Return (noise floor of the position error, root mean square over joints; how; that of each joint): from repeats
     of the same commands, never below the noise of samples, else from split samples, else from the encoder's quantum.

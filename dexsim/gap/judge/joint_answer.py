@@ -17,6 +17,7 @@ from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.inquiry import Curve
 from dexsim.gap.judge import confidence, held_out
+from dexsim.gap.judge.held_out import rms
 from dexsim.gap.plant.case import Case, intervals_of
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.plant.free_run import free_run
@@ -46,16 +47,8 @@ class JointAnswer:
         self.whole = replace(case, plant=search.whole)
         self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
         rows = self.rows = self.windows.sample_row
-        self.q_before, effort_before = free_run(
-            self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True
-        )
-        fixed = [f for mm in self.best.members for f in mm.variant.fixed]
-        with_it = (
-            free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True)
-            if self.best.members
-            else (self.q_before, effort_before)
-        )
-        self.q_after, effort_after = with_it
+        self.q_before, effort_before = without = self._run_free(self.none)
+        self.q_after, effort_after = self._run_free(self.best) if self.best.members else without
         self.measured, self.t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
         self.before, self.after = (self.measured - self.q_before) ** 2, (self.measured - self.q_after) ** 2
         self.torque = case.plant.torque[rows]
@@ -72,7 +65,6 @@ class JointAnswer:
         self._trials: dict[str, tuple[Trial, np.ndarray, np.ndarray]] = {}  # of `_without`
         self.earlier: JointAnswer | None = None  # with an effect that was taken back since
         self.raw: dict[str, dict[str, float]] = {}
-        self.spans: dict[str, float] = {}
         self.found: list[Finding] = []
         self.evidence: list[confidence.Evidence] = []
         self.spots: list[locate.Spot] = []
@@ -81,20 +73,15 @@ class JointAnswer:
     @property
     def numbers(self) -> dict[str, float]:
         """Errors for the page."""
-        out = {
+        told_before, told_after = self.told
+        return {
             "before": rms(self.before),
             "after": rms(self.after),
-            "mae_before": float(np.abs(self.measured - self.q_before).mean()),
-            "mae_after": float(np.abs(self.measured - self.q_after).mean()),
             "sigma": self.case.sigma,
             "fitted": self._followed,
-            "left": 0.0,
-            "told_before": self.told[0],
-            "told_after": self.told[1],
+            "told_before": told_before,
+            "told_after": told_after,
         }
-        if self.effort_before is not None and self.effort_after is not None:
-            out |= {"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)}
-        return out
 
     @property
     def told(self) -> tuple[float, float]:
@@ -145,6 +132,10 @@ class JointAnswer:
                 best, least = trial, float(np.mean(lost))
         return best
 
+    def _run_free(self, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and effort (rows,) of a hypothesis' free run over what was held out."""
+        return free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, trial.fixed, True)
+
     def _without_id(self, effect: str) -> np.ndarray:
         """Return position (rows,) of a free run by the best hypothesis without an effect of this id."""
         return self._without(next(mm for mm in self.best.members if mm.id == effect))[1]
@@ -155,9 +146,7 @@ class JointAnswer:
             rest = tuple(x for x in self.best.members if x is not mm)
             less = lambda: self.best.but(self.best.members.index(mm))  # noqa: E731
             trial = self.search.fit(*less(), self.best, quick=True) if rest else self.none
-            fixed = [f for x in rest for f in x.variant.fixed]
-            run = free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, fixed, True)
-            self._trials[mm.id] = trial, *run
+            self._trials[mm.id] = trial, *self._run_free(trial)
         return self._trials[mm.id]
 
     def judge(self, m: Mechanism) -> None:
@@ -206,7 +195,6 @@ class JointAnswer:
         same += [(e, 0.0) for e in alike if e not in dict(same)][: 2 - len(same)]
         signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
-        self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
         late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.within**2 else None
         sizes = mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table))
         alike = [mm.id, *(e for e, _ in same)] if same else []
@@ -237,9 +225,7 @@ class JointAnswer:
         share of the squared error that it removes in all but a twentieth of its draws; before: error before anything
         was named, where that is not of all that was held out."""
         effort_only, borne_out = mm.effect.effort_only, surely >= JUDGE.borne_out
-        before = rms(self.before) if before is None else before
-        spread = self._fitted(mm, self.widest)[1]
-        evidence = self._weighed(mm, raw, spread, was, left, effort_only, borne_out, before)
+        evidence = self._weighed(mm, raw, was, left, borne_out, rms(self.before) if before is None else before)
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
@@ -279,35 +265,22 @@ class JointAnswer:
         return raw, spread
 
     def _weighed(
-        self,
-        mm: Member,
-        raw: dict[str, float],
-        spread: dict,
-        error_without: float,
-        after: float,
-        effort_only: bool,
-        borne_out: bool,
-        before: float,
+        self, mm: Member, raw: dict[str, float], error_without: float, after: float, borne_out: bool, before: float
     ) -> confidence.Evidence:
         """Return how sure the name is, and every reason to doubt it. error_without, after: rms error on what was held
         out without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the
         motion then tells nothing of it). borne_out: whether what was held out surely shows it; before: error of the
         motion before anything was named."""
-        case, outcome = self.case, self.outcome
+        case, outcome, effort_only, params = self.case, self.outcome, mm.effect.effort_only, mm.variant.params
         # the one effect of the reading: nothing else explains the effort
         before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (before, case.sigma)
-        earned = (
-            1.0
-            if effort_only
-            else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
-        )
+        earned = 1.0 if effort_only else confidence.earned(error_without, after)
+        as_fitted, reported = (self._fitted(mm, x)[1] for x in (self.widest, self.bounds))
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence[mm.id], earned,
             confidence.left_over(after, before, noise),
             confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)
-        nothing, as_reported = (
-            confidence.holds_nothing(mm.variant.params, x, case) for x in (spread, self._fitted(mm, self.bounds)[1])
-        )
+        nothing, as_reported = (confidence.holds_nothing(params, x, case) for x in (as_fitted, reported))
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
         elif as_reported:
@@ -315,25 +288,21 @@ class JointAnswer:
                 "its interval, as wide as what is left and the laws it may follow make it, holds the size at which "
                 "nothing is missing"
             )
-        small = (
-            ""
-            if effort_only
-            else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
-        )
-        blurred = "" if effort_only or small else confidence.unresolved(error_without, after, case.quantum)
-        if small or blurred:
-            evidence.reasons.append(small or blurred)
+        small = blurred = ""
+        if not effort_only:
+            small = confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
+            blurred = "" if small else confidence.unresolved(error_without, after, case.quantum)
+        evidence.reasons += [x for x in (small, blurred) if x]
         if mm.id in self.search.unasked:
             evidence.reasons.append("the search ended before all that it may be confused with was tried in its place")
-        stopped = at_bound(mm.variant.params, raw, case)
-        if stopped:
+        if stopped := at_bound(params, raw, case):
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
-        elif far := confidence.beyond(mm.variant.params, self._fitted(mm, self.bounds)[1], case):
+        elif far := confidence.beyond(params, reported, case):
             evidence.reasons.append(f"its {far.replace('_', ' ')} may be larger than what is looked for")
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
         evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
-        if unlike := confidence.not_repeated(mm.variant.params, self._by_fold(mm), case):
+        if unlike := confidence.not_repeated(params, self._by_fold(mm), case):
             evidence.reasons.append(unlike)
         if (nothing and as_reported) or small or (blurred and not borne_out) or stopped or unlike:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
@@ -349,8 +318,7 @@ class JointAnswer:
 
     def floor_beyond(self) -> float:
         """Return what repeats differ by beyond what was found [rad or m]; inf without repeats."""
-        fixed = [f for mm in self.best.members for f in mm.variant.fixed]
-        return held_out.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, fixed)
+        return held_out.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, self.best.fixed)
 
     def locate(self, rng: np.random.Generator, seed: int) -> None:
         """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is
@@ -423,11 +391,6 @@ def traded(fit: Fitted) -> np.ndarray:
     if len(i):
         out[i] = np.maximum(np.diag(np.linalg.inv(A))[i] - np.diag(np.linalg.inv(A[np.ix_(i, i)])), 0.0)
     return 1.645 * np.sqrt(BELIEF.prior * out) * span
-
-
-def rms(squares: np.ndarray) -> float:
-    """Return root of the mean of squares; 0 for none."""
-    return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
 
 
 def nuisances(joint: str, trial: Trial) -> dict[str, float]:

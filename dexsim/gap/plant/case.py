@@ -17,7 +17,7 @@ from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
-from dexsim.gap.plant.mechanics import JointConstants, along
+from dexsim.gap.plant.mechanics import JointConstants, along, chain
 from dexsim.gap.read import Run, spans
 from dexsim.gap.read.noise import BESIDE, noise, noise_of, noises
 from dexsim.gap.rules import BELIEF, SEARCH
@@ -555,21 +555,10 @@ def dragged_by(case: Case, others: Sequence[Case]) -> Case:
 def _draggers(model: mujoco.MjModel, joints: Sequence[str], j: int, runs: Sequence[Run]) -> list[int]:
     """Return other joints that move, the nearest in the kinematic tree first."""
     moved = [o for o in range(len(joints)) if o != j and max(np.ptp(r.qs[:, o]) for r in runs) > 0.01]
-    body = [int(model.jnt_bodyid[model.joint(n).id]) for n in joints]
-
-    def chain(b: int) -> list[int]:
-        out = []
-        while b:
-            out.append(b)
-            b = int(model.body_parentid[b])
-        return out
-
-    own = chain(body[j])
+    chains = [{*chain(model, model.jnt_bodyid[model.joint(n).id])} for n in joints]
 
     def far(o: int) -> tuple[float, int]:
-        other = chain(body[o])
-        shared = len(set(own) & set(other))
-        return (len(own) - shared) + (len(other) - shared) - 0.1 * shared, o
+        return len(chains[j] ^ chains[o]) - 0.1 * len(chains[j] & chains[o]), o
 
     return sorted(moved, key=far)
 
@@ -663,10 +652,7 @@ def refine_motion_by_fits(
     at, was = [], [run.fine for run in runs]
     place = [runs[0].joints.index(case.joint) for case in cases]
     for case, trial in zip(cases, fitted, strict=True):
-        with_fixed = expand(case.plant, trial.fit.params, trial.fit.x[None])
-        for name, value in (f for m in trial.members for f in m.variant.fixed):
-            with_fixed[:, :, INDEX[name]] = value
-        at.append(with_fixed)
+        at.append(expand(case.plant, trial.fit.params, trial.fit.x[None], trial.fixed))
     motion = compute.each(len(cases), lambda k: _motions(runs, place[k], cases[k].plant, at[k]))
     misread = [k for k, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 

@@ -28,9 +28,7 @@ def free_run(
 
     underway: the position at which a window begins in motion, and its speed there, are fitted to its first `FIRST`
     seconds: what a few samples on one side say of a speed is off by far where a target has just jumped."""
-    plants = expand(case.plant, params, x[None])
-    for name, value in fixed:
-        plants[:, :, INDEX[name]] = value
+    plants = expand(case.plant, params, x[None], fixed)
     q, tau = _begun(case, plants, windows) if underway else case.plant.simulate(plants, windows)
     return q[0], plants[0, 0, INDEX["effort_gain"]] * tau[0] + plants[0, 0, INDEX["effort_offset"]]
 

@@ -34,9 +34,7 @@ class JointConstants:
     slide: bool
     armature: float
     inertia: float  # median about the joint, kg.m2
-    gravity: float  # largest gravity torque along the motion, N.m
-    leaf: str = ""  # the last link after it
-    leaf_mass: float = 0.0  # of that link, kg
+    leaf_mass: float = 0.0  # of the last link after it, kg
     own_mass: float = 0.0  # of the joint's own link, kg
     carried: float = 0.0  # of all links that the joint moves, kg
     centre: np.ndarray | None = None  # [3] m: that link's centre of mass in the link's frame
@@ -47,12 +45,18 @@ def leaf_of(model: mujoco.MjModel, body: int) -> int:
     """Return the last link after `body`: the deepest body of its subtree that has mass."""
     best, depth = body, 0
     for b in range(body, model.nbody):
-        d, p = 0, b
-        while p not in (0, body):
-            p, d = int(model.body_parentid[p]), d + 1
-        if p == body and d > depth and model.body_mass[b] > 0:
-            best, depth = b, d
+        up = chain(model, b)
+        if body in up and up.index(body) > depth and model.body_mass[b] > 0:
+            best, depth = b, up.index(body)
     return best
+
+
+def chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return a body and those that carry it, the nearest first, without the world's."""
+    out = [int(body)]
+    while parent := int(model.body_parentid[out[-1]]):
+        out.append(parent)
+    return out
 
 
 def along(
@@ -67,12 +71,26 @@ def along(
     t0, t1 = run.t[0], run.t[-1]
     n = max(int(np.ceil((t1 - t0) * (FINE if run.fine else RATE))) + 1, 2)
     times = np.linspace(t0, t1, n)
+    known, motion = (run.fine[0], run.fine[1:]) if run.fine else (run.t, (run.qs, run.vs, run.as_))
+    q, v, a = (on_lines(times, known, x) for x in motion)
+    return times, *of_motion(model, joints, run.gravity, q, v, a, added)
+
+
+def of_motion(
+    model: mujoco.MjModel,
+    joints: Sequence[str],
+    gravity: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    added: bool = True,
+) -> tuple[np.ndarray, list[JointConstants]]:
+    """Return the values and constants of `along` of positions, speeds and accelerations [n, J] in world gravity [3];
+    the model's other joints rest where the model has them."""
     ids = [model.joint(name).id for name in joints]
     qadr = np.array([model.jnt_qposadr[i] for i in ids])
     dadr = np.array([model.jnt_dofadr[i] for i in ids])
-    known, motion = (run.fine[0], run.fine[1:]) if run.fine else (run.t, (run.qs, run.vs, run.as_))
-    q, v, a = (on_lines(times, known, x) for x in motion)
-    J = len(joints)
+    n, J = len(q), len(joints)
     bodies = np.array([model.jnt_bodyid[i] for i in ids])
     leaves = np.array([leaf_of(model, b) for b in bodies])
     places = _places(model, mujoco.MjData(model), ids, leaves)
@@ -117,7 +135,7 @@ def along(
         loads = (("load", 1.0, point[:, j]), *([("own", 1.0, own[:, j])] if leaves[j] != bodies[j] else []))
         loads = loads if added else ()
         for prefix, m, where in (("gravity", mass[j], com[:, j]), *loads):
-            c, s, square = _turned(axis[:, j], where - anchor[:, j], m, run.gravity, slide[j])
+            c, s, square = _turned(axis[:, j], where - anchor[:, j], m, gravity, slide[j])
             put(j, f"{prefix}_cos", c)
             put(j, f"{prefix}_sin", s)
             if prefix != "gravity":
@@ -128,21 +146,20 @@ def along(
         for name, way in zip(("out", "across"), places[j], strict=True):
             arm = turn[:, j] @ way
             if not slide[j]:
-                c, s, _ = _turned(axis[:, j], arm, 1.0, run.gravity, False)
+                c, s, _ = _turned(axis[:, j], arm, 1.0, gravity, False)
                 put(j, f"com_{name}_cos", c)
                 put(j, f"com_{name}_sin", s)
                 put(j, f"com_{name}_inertia", 2.0 * (lever * cross(axis[:, j], arm)).sum(-1))
         for k, letter in enumerate("xyz"):
-            tilted = np.cross(np.eye(3)[k], run.gravity)
+            tilted = np.cross(np.eye(3)[k], gravity)
             c, s, _ = _turned(axis[:, j], com[:, j] - anchor[:, j], mass[j], tilted, slide[j])
             put(j, f"tilt_{letter}_cos", c)
             put(j, f"tilt_{letter}_sin", s)
-    gravity = np.abs(out[:, :, SERIES_INDEX["gravity_cos"]]).max(1)
     constants = [
-        _constants(model, ids[j], bodies[j], leaves[j], bool(slide[j]), places[j], diag[:, j], gravity[j])
+        _constants(model, ids[j], bodies[j], leaves[j], bool(slide[j]), places[j], diag[:, j])
         for j in range(J)
     ]
-    return times, out, constants
+    return out, constants
 
 
 def _constants(
@@ -153,10 +170,9 @@ def _constants(
     slide: bool,
     places: np.ndarray,
     inertia: np.ndarray,
-    gravity: float,
 ) -> JointConstants:
     """Return what does not change along a motion. joint, body, leaf: numbers in the model; inertia [n]: along the
-    motion; gravity: its largest torque."""
+    motion."""
     dof = model.jnt_dofadr[joint]
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-1e9, 1e9)
     return JointConstants(
@@ -167,8 +183,6 @@ def _constants(
         slide=slide,
         armature=float(model.dof_armature[dof]),
         inertia=float(np.median(inertia)),
-        gravity=float(gravity),
-        leaf=model.body(int(leaf)).name,
         leaf_mass=float(model.body_mass[leaf]),
         own_mass=float(model.body_mass[body]),
         carried=float(model.body_subtreemass[body]),

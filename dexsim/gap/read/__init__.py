@@ -3,6 +3,7 @@ plain arrays, in the order of the joints that are diagnosed."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -122,14 +123,22 @@ def same_commands(a: Run, b: Run) -> bool:
 def spans(t: np.ndarray, on: np.ndarray, join: float) -> list[tuple[float, float]]:
     """Stretches of time (start, end) [s] in which `on` [S] holds at the samples t [S] s, those less than `join` s apart
     joined."""
+    step = float(np.median(np.diff(t))) if on.any() else 0.0
+    return joined([(float(t[a]), float(t[b - 1] + step)) for a, b in pieces(on)], join)
+
+
+def pieces(on: np.ndarray) -> list[tuple[int, int]]:
+    """Return (first sample, first behind it) of each stretch in which `on` [S] bool holds."""
+    edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0])).tolist()
+    return list(zip(edge[::2], edge[1::2], strict=True))
+
+
+def joined(spans: Iterable[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
+    """Return stretches of time (start, end) [s], in their order; those less than `gap` s apart joined."""
     out: list[tuple[float, float]] = []
-    if not on.any():
-        return out
-    edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
-    step = float(np.median(np.diff(t)))
-    for a, b in zip(t[edge[::2]], t[edge[1::2] - 1] + step, strict=True):
-        if out and a - out[-1][1] < join:
-            out[-1] = (out[-1][0], float(b))
+    for a, b in spans:
+        if out and a - out[-1][1] < gap:
+            out[-1] = (out[-1][0], max(out[-1][1], b))
         else:
-            out.append((float(a), float(b)))
+            out.append((a, b))
     return out

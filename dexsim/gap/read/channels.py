@@ -25,7 +25,7 @@ from scipy import fft
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.finding import WRONG_SIGNAL, Finding
-from dexsim.gap.read import COLUMNS, Run
+from dexsim.gap.read import COLUMNS, Run, pieces
 from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
@@ -170,12 +170,11 @@ def _repeated(
     lost = [(float(t[a]), float(t[b])) for a, b in long if t[b] - t[a] > SIGNAL.blind]
     said: list[tuple[str, Spans]] = []
     if held.any():
-        edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
         text = (
             f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old "
             "readings, sent again"
         )
-        said.append((text, [(t[a], t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)]))
+        said.append((text, [(t[a], t[min(b, len(q)) - 1]) for a, b in pieces(held)]))
     elif single.any():
         text = (
             f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: "
@@ -597,8 +596,7 @@ def _keep(run: Run, on: np.ndarray) -> None:
 
 def rests(q: np.ndarray) -> list[tuple[int, int]]:
     """Return (first, last) sample of each stretch of readings that are all the same."""
-    edge = np.flatnonzero(np.diff(np.r_[0, (np.diff(q) == 0).astype(int), 0]))
-    return list(zip(edge[::2].tolist(), edge[1::2].tolist(), strict=True))
+    return pieces(np.diff(q) == 0)
 
 
 def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:

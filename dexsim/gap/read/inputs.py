@@ -4,9 +4,11 @@ not in free air found."""
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence, Set
 from dataclasses import replace
 from glob import glob
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.finding import WRONG_SIGNAL, Finding
-from dexsim.gap.read import COLUMNS, Run, channels
+from dexsim.gap.read import COLUMNS, Run, channels, joined, pieces
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording import readers, spikes
 from dexsim.recording.mechanism import Mechanism, merged
@@ -424,34 +426,18 @@ def self_touch(runs: list[Run], model: mujoco.MjModel) -> dict[str, list[tuple[f
             bodies = (sorted(int(model.geom_bodyid[g]) for g in contacts.geom[c]) for c in deep)
             pairs = {(a, b) for a, b in bodies}
             seen.append((run.name, float(t), pairs))
-    counts: dict[tuple[int, int], int] = {}
-    for _, _, pairs in seen:
-        for p in pairs:
-            counts[p] = counts.get(p, 0) + 1
+    counts = Counter(p for _, _, pairs in seen for p in pairs)
     always = {p for p, n in counts.items() if n > 0.9 * len(seen)}
     out: dict[str, list[tuple[float, float]]] = {}
     for name, t, pairs in seen:
         if pairs - always:
-            spans = out.setdefault(name, [])
-            if spans and t - spans[-1][1] < 0.3:
-                spans[-1] = (spans[-1][0], t + 1 / rate)
-            else:
-                spans.append((t - 1 / rate, t + 1 / rate))
-    return out
+            out.setdefault(name, []).append((t - 1 / rate, t + 1 / rate))
+    return {name: joined(spans, 0.3 - 1 / rate) for name, spans in out.items()}
 
 
 def merged_spans(*several: dict[str, list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
     """Stretches of several sources by recording, sorted, those that overlap joined."""
-    out: dict[str, list[tuple[float, float]]] = {}
-    for name in {n for s in several for n in s}:
-        joined: list[tuple[float, float]] = []
-        for a, b in sorted(x for s in several for x in s.get(name, [])):
-            if joined and a <= joined[-1][1]:
-                joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
-            else:
-                joined.append((a, b))
-        out[name] = joined
-    return out
+    return {name: joined(sorted(x for s in several for x in s.get(name, [])), 1e-9) for name in {*chain(*several)}}
 
 
 # -- end stops --------------------------------------------------------------------------------------------------------
@@ -519,11 +505,8 @@ def unforeseen_end_stops(model: mujoco.MjModel, runs: list[Run]) -> dict[str, li
             found = _end(model, data, runs, j, side)
             if found is not None and side * (limit - found[0]) > found[2]:
                 for run in runs:
-                    on = (side * run.q[:, j] > side * found[0] - found[2]).astype(int)
-                    edges = np.flatnonzero(np.diff(np.r_[0, on, 0]))
-                    out.setdefault(run.name, []).extend(
-                        (float(run.t[a]), float(run.t[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
-                    )
+                    on = side * run.q[:, j] > side * found[0] - found[2]
+                    out.setdefault(run.name, []).extend((float(run.t[a]), float(run.t[b - 1])) for a, b in pieces(on))
     return {name: spans for name, spans in out.items() if spans}
 
 
@@ -545,9 +528,7 @@ def _end(
     need = max(SIGNAL.pressed * float(np.quantile(usual, 0.95)), 3 * near)
     ends, names = [], []
     for run, error, on in zip(runs, errors, at, strict=True):
-        on = on & (error > need)
-        edges = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        for a, b in pieces(on & (error > need)):
             q, target = run.q[a:b, j], run.q[a:b, j] + side * error[a:b]
             if (
                 run.t[b - 1] - run.t[a] < SIGNAL.meeting

@@ -27,7 +27,7 @@ SHIFTS = np.arange(-0.01, 0.0401, 0.002)  # s: by which a drive may act later th
 @dataclass
 class Stage:
     """The law of one joint's drive against what was logged. slope: logged over predicted, with its 90 % interval by a
-    block bootstrap; offset in the logged unit; delay [s] at which they agree best, and the most that any drive may
+    block bootstrap; delay [s] at which they agree best, and the most that any drive may
     have; fit: share of the variance explained."""
 
     joint: str
@@ -35,7 +35,6 @@ class Stage:
     slope: float
     slope_low: float
     slope_high: float
-    offset: float
     delay: float
     fit: float
     late: float
@@ -89,7 +88,6 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
                 float(slope),
                 float(np.quantile(slopes, 0.05)),
                 float(np.quantile(slopes, 0.95)),
-                float(offset),
                 float(SHIFTS[best]),
                 float(fit),
                 _late(case, [runs[r] for r, _ in read]),

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from dexsim.console.tables import number
+from dexsim.gap.plant.mechanics import chain
 from dexsim.tactile.sensors import Sensors
 
 GRID, INK, SOFT = "#e6e9ee", "#333", "#8a94a3"
@@ -401,8 +402,7 @@ def _links(d: _Drawing, joints: list[int]) -> list[str]:
     """Return lines from joint to joint, so that a mechanism without shapes still shows."""
     out = []
     for i in joints:
-        parent = int(d.model.body_parentid[int(d.model.jnt_bodyid[i])])
-        while parent:
+        for parent in chain(d.model, d.model.jnt_bodyid[i])[1:]:
             inside = [k for k in joints if int(d.model.jnt_bodyid[k]) == parent]
             if inside:
                 a, b = d.at(d.data.xanchor[inside[-1]])[0], d.at(d.data.xanchor[i])[0]
@@ -411,7 +411,6 @@ def _links(d: _Drawing, joints: list[int]) -> list[str]:
                     'stroke-width="2"/>'
                 )
                 break
-            parent = int(d.model.body_parentid[parent])
     return out
 
 

@@ -23,7 +23,7 @@ from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.finding import Finding, gathered
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.judge import handed_on
-from dexsim.gap.judge.conclude import place, spoken, words_of
+from dexsim.gap.judge.conclude import place, spoken, unit_of, words_of
 from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
 from dexsim.gap.report import charts
@@ -57,7 +57,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             except (ValueError, mujoco.FatalError) as error:
                 d.notes.append(f"model.xml could not be written: {error}")
         asked, more = specified(d.data)
-        more |= {"notes": d.notes, "seconds": d.shares, "hypotheses": d.hypotheses}
+        more |= {"notes": d.notes, "seconds": d.shares}
         data = {"diagnosis.json": asked, "details.json": more} | (
             {"evidence.json": [e.plain() for e in d.evidence]} if d.evidence else {}
         )
@@ -183,7 +183,7 @@ class Hero(Section):
         word, tone = VERDICTS[d.data["verdict"]]
         said, replayed = d.sentence, ""
         if d.written is not None and d.written.replayed is not None:
-            text = d.written.text(unit_of(h["error"])[0])
+            text = d.written.text(unit_of(h["error"]))
             if said.endswith(text):
                 said, replayed = said[: -len(text)].rstrip(), text
         kept = h.get("how") or ", ".join(h["recordings"])
@@ -237,17 +237,12 @@ class Where(Section):
             "picture": Markup(picture),
             "pads": None if taxels is None else self._pads(taxels, marked),
             "words": " ".join(words),
-            "joints": len(d.joints) if self.unit_shown in ("mrad", "mm") else 0,
+            "joints": len(d.joints) if unit_of(self.held_out["error"]) in ("mrad", "mm") else 0,
             "bars": self._bars(),
             "rows": _rows(d, self.unit, MOST) if several else [],
             "more": max(len(d.joints) - MOST, 0),
             "spots": spots,
         }
-
-    @property
-    def unit_shown(self) -> str:
-        """Unit of the error on what was held out."""
-        return unit_of(self.held_out["error"])[0]
 
     def _pads(self, taxels: np.ndarray, marked: set[str]) -> list[dict[str, Any]]:
         out: list[dict[str, Any]] = []
@@ -266,7 +261,7 @@ class Where(Section):
         d, h = self.d, self.held_out
         if h["before"] is None:
             return None
-        unit, k = unit_of(h["error"])
+        unit, k = unit_of(h["error"]), 1e3
 
         def row(name: str, which: str, colour: str) -> tuple[str, float, float | None, float | None, str]:
             low, high = (None if (v := h[f"{which}_{end}"]) is None else k * v for end in ("low", "high"))
@@ -304,7 +299,7 @@ class Findings(Section):
         """Return one finding."""
         e, h = entry(f), f.held_out
         where = place(f, self.d.mechanism) if len(f.joints) < 4 else f"{len(f.joints)} joints"
-        unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
+        unit = unit_of(self._metric(f)) if h else ""
         doubtful = f.indistinguishable or f.hint
         return {
             "kind": "bad" if f.wrong_signal else "set" if doubtful else "",
@@ -316,8 +311,8 @@ class Findings(Section):
             else f"{where}: {f.regime}.",
             "parameters": [_parameter(key, p) for key, p in f.parameters.items() if p["value"] is not None],
             "strip": self._strip(f),
-            "before": number(k * h["before"]) if h else "",
-            "after": number(k * h["after"]) if h else "",
+            "before": number(1e3 * h["before"]) if h else "",
+            "after": number(1e3 * h["after"]) if h else "",
             "unit": unit,
         } | self._lost(f)
 
@@ -487,15 +482,6 @@ def render(section: Section) -> Markup:
     """Return a section as HTML; empty where it has nothing to show."""
     values = section.values()
     return Markup("") if values is None else Markup(ENVIRONMENT.get_template(section.template).render(values).strip())
-
-
-def unit_of(metric: str) -> tuple[str, float]:
-    """Return (unit in which a metric of `diagnosis.json` is shown, factor)."""
-    if metric.startswith("effort"):
-        return ("mA" if metric.endswith("_A") else "mN" if metric.endswith("_N") else "mN.m"), 1e3
-    if metric.endswith("_N"):
-        return "mN", 1e3
-    return ("mm" if metric.endswith("_m") else "mrad"), 1e3
 
 
 def _name(effect: str) -> str:

@@ -20,9 +20,8 @@ from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
 from dexsim.gap.finding import Finding
 from dexsim.gap.inquiry import Diagnosis, Settings
 from dexsim.gap.judge.conclude import place
-from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case, build
-from dexsim.gap.plant.columns import INDEX, expand
+from dexsim.gap.plant.columns import expand
 from dexsim.gap.read import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import JointSearch, Outcome, SearchedJoint, Trial
@@ -205,13 +204,13 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
     run.smooth()
     there = build(m.spec.compile(), [run])[column]
     plant, windows = there.plant, there.plant.windows(None)
-    guesses = [_guess(plant, a, a.fit.x), _guess(plant, b, b.fit.x)]
+    guesses = [expand(plant, h.fit.params, h.fit.x[None], h.fixed)[0] for h in (a, b)]
     moves = []
     for i, q in enumerate(a.fit.params):
         if q.nuisance:
             x = a.fit.x.copy()
             x[i] = np.clip(x[i] + 0.05 * q.span * (1 if x[i] + 0.05 * q.span <= q.high else -1), q.low, q.high)
-            guesses.append(_guess(plant, a, x))
+            guesses.append(expand(plant, a.fit.params, x[None], a.fixed)[0])
             moves.append(q)
     seen, _ = plant.simulate(np.stack(guesses), windows)
     difference = (seen[1] - seen[0]) / case.sigma
@@ -233,10 +232,3 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
     return out
 
 
-def _guess(plant: JointPlant, trial: Trial, x: np.ndarray) -> np.ndarray:
-    """Return [R, C] plant parameters of a hypothesis at x."""
-    out = expand(plant, trial.fit.params, x[None])[0]
-    for member in trial.members:
-        for name, value in member.variant.fixed:
-            out[:, INDEX[name]] = value
-    return out

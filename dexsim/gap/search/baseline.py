@@ -26,6 +26,7 @@ from dexsim.gap.effects.body import add_armature
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
+from dexsim.gap.read import pieces
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search.fit import Box, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import subset
@@ -326,8 +327,7 @@ def room_for_friction(case: Case, runs: Sequence[int], dry: Mapping[str, float] 
             on = way * v > JUDGE.slides * case.scales.speed
             net = drive[way] - way * pull
             free = TORQUE.room * net - (_beyond_coulomb(dry, way, q, drive[way], pull) if dry else 0.0)
-            edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
-            for a, b in zip(edge[::2], edge[1::2], strict=True):
+            for a, b in pieces(on):
                 if a == 0 or abs(q[b - 1] - q[a]) < max(gives, 20 * case.sigma):
                     continue
                 a = max(a - 2, 0)  # the torque that set it off is from just before

@@ -17,7 +17,6 @@ from dexsim.gap.effects.friction import give
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
-from dexsim.gap.posterior import Shadow
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, Fitter, Residuals, disbelief, slopes_of
@@ -46,11 +45,15 @@ class Trial:
     fit: Fitted
     left_out: np.ndarray | None = None
     folds: list[np.ndarray] = field(default_factory=list)
-    refitted: bool = False  # whether `left_out` is of fits of their own without each condition
 
     @property
     def ids(self) -> tuple[str, ...]:
         return tuple(m.id for m in self.members)
+
+    @property
+    def fixed(self) -> tuple[tuple[str, float], ...]:
+        """Constants that its effects set on the plant."""
+        return tuple(f for m in self.members for f in m.variant.fixed)
 
     @property
     def values(self) -> list[np.ndarray]:
@@ -74,13 +77,9 @@ class Outcome:
     best: Trial
     rivals: dict[str, list[tuple[str, float]]]  # by effect: what else would do, with its share of bootstraps
     confidence: dict[str, float]
-    gains: dict[str, float]  # by effect: share of the squared left-out error that it removes
-    price: dict[str, float]
     scanned: list[tuple[str, float, float]]  # (effect, share of squared error in the scan, its price)
-    folds: dict[str, list[float]] = field(
-        default_factory=dict
-    )  # by effect: relative cost of dropping it, by condition left out
-    note: str = ""
+    # by effect: relative cost of dropping it, by condition left out
+    folds: dict[str, list[float]] = field(default_factory=dict)
 
 
 def named(member: Member) -> list[Param]:
@@ -336,7 +335,6 @@ class JointSearch:
                 for k in sorted(set(fold.values()))
             ]
         self.blocks = self._blocks(self.fitter, self.long)
-        self.shadow = Shadow(self.fitter, (sigma, case.sigma_torque), self.fold_of)
         # what it finds as it goes: losses by block without any effect; the best fit by effects; the first of an
         # effect's laws, by effect and label; what a scan's guesses save in hindsight, and other starts; what each
         # effect costs when dropped, by condition; by effect the hypothesis by every law that it may have

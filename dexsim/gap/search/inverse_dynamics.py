@@ -12,7 +12,6 @@ held out only judges them.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -22,6 +21,9 @@ from scipy.signal import butter, filtfilt
 
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import BY_TORQUE
+from dexsim.gap.plant.columns import SERIES_INDEX
+from dexsim.gap.plant.lines import on_lines
+from dexsim.gap.plant.mechanics import of_motion
 from dexsim.gap.read import BLOCK, Run
 from dexsim.gap.rules import BELIEF, SEARCH, TORQUE
 
@@ -104,37 +106,16 @@ def low_pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
 
 
 def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: Motion) -> Body:
-    """Return of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the
-    model has them."""
-    model = copy.copy(model)
-    data = mujoco.MjData(model)
-    ids = [model.joint(name).id for name in joints]
-    at, dof = np.array([model.jnt_qposadr[i] for i in ids]), np.array([model.jnt_dofadr[i] for i in ids])
-    bodies = np.array([model.jnt_bodyid[i] for i in ids])
-    slide = np.array([int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for i in ids])
+    """Return of `joints` (the motion's columns) in world gravity [3] m/s2."""
     every = max(int(round(1.0 / (MODEL_RATE * m.step))), 1)
     rows = np.unique(np.r_[np.arange(0, len(m.t), every), len(m.t) - 1])
-    rest, diag = np.empty((2, len(rows), len(ids)))
-    axis, arm = np.empty((2, len(rows), len(ids), 3))
-    model.opt.gravity[:] = gravity
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    full = np.zeros((model.nv, model.nv))
-    for k, i in enumerate(rows):
-        data.qpos[at], data.qvel[dof], data.qacc[dof] = m.q[i], m.v[i], m.a[i]
-        mujoco.mj_inverse(model, data)
-        mujoco.mj_fullM(model, data, full)
-        diag[k] = full[dof, dof]
-        rest[k] = data.qfrc_inverse[dof] - diag[k] * m.a[i]
-        axis[k], arm[k] = data.xaxis[ids], data.subtree_com[bodies] - data.xanchor[ids]
-    mass, turned = model.body_subtreemass[bodies], np.cross(axis, arm)
-    pull = -mass * np.where(slide, axis @ gravity, turned @ gravity)
-    across = np.where(slide, 0.0, -mass * (np.cross(axis, turned) @ gravity))
-    back = lambda x: np.stack([np.interp(m.t, m.t[rows], c) for c in x.T], 1)  # noqa: E731
-    inertia, dry = back(diag), np.array([float(model.dof_frictionloss[d]) for d in dof])
-    torque = inertia * m.a + back(rest)
-    for j in np.flatnonzero(dry > 0):
-        torque[:, j] += dry[j] * m.smooth(np.sign(m.v[:, j]))
-    return Body(torque, back(pull), back(across), inertia)
+    series, own = of_motion(model, joints, gravity, m.q[rows], m.v[rows], m.a[rows], False)
+    names = ("inertia", "rest", "gravity_cos", "gravity_sin")
+    inertia, rest, pull, across = (on_lines(m.t, m.t[rows], series[:, :, SERIES_INDEX[n]].T) for n in names)
+    torque = inertia * m.a + rest + pull + m.v * [c.damping for c in own]
+    for j in np.flatnonzero([c.friction > 0 for c in own]):
+        torque[:, j] += own[j].friction * m.smooth(np.sign(m.v[:, j]))
+    return Body(torque, pull, across, inertia)
 
 
 @dataclass(frozen=True)
@@ -296,9 +277,9 @@ SQUARE = "friction with the square of the speed"  # a law that the catalogue has
 
 @dataclass
 class Named:
-    """One further effect. text: as `Inverse.extra` names it; value, low, high (90 %) of its coefficients; share of the
-    bootstraps in which it was the best to add; residual rms before and after on the recording held out (N.m, N for a
-    slide), and the share of its square that it removes there (90 %, stretches of two seconds)."""
+    """One further effect. text: its law, and what that was given; value, low, high (90 %) of its coefficients; share of
+    the bootstraps in which it was the best to add; residual rms before and after on the recording held out (N.m, N for
+    a slide), and the share of its square that it removes there (90 %, stretches of two seconds)."""
 
     text: str
     value: float
@@ -325,15 +306,14 @@ class Named:
 class Inverse:
     """value, low, high by `NAMES` (90 %, block bootstrap), in kg.m2, N.m.s/rad, N.m (kg, N.s/m, N for a slide), all but
     the inertia beyond the model's, and by `WEIGHT` where gravity pulls; residual: rms of what is left over the rms of
-    the torque. extra: (one further effect alone, share of the residual's rms it removes); named: further effects one
-    after another; full: `NAMES` fitted with those of them that the catalogue has. refused: figures that came out
-    negative where nothing can be, with the reason; they are 0 in `value`, the rest refitted."""
+    the torque. named: further effects one after another; full: `NAMES` fitted with those of them that the catalogue
+    has. refused: figures that came out negative where nothing can be, with the reason; they are 0 in `value`, the rest
+    refitted."""
 
     value: dict[str, float]
     low: dict[str, float]
     high: dict[str, float]
     residual: float
-    extra: list[tuple[str, float]]
     named: list[Named] = field(default_factory=list)
     full: dict[str, float] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
@@ -375,20 +355,11 @@ def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int 
     rng = np.random.default_rng(seed)
     X, u, blocks = own.X, own.u, own.blocks
     theta, low, high = _intervals(X, u, blocks, rng)
-    further = _further(own)
-    mine, theirs = ({n: c(d) for n, c in further.items()} for d in (own, other))
-    before = np.std(other.u - other.X @ theta)
-    extra = []
-    for name in further:
-        more = least(np.column_stack([X, mine[name]]), u)
-        extra.append((name, float(1 - np.std(other.u - np.column_stack([other.X, theirs[name]]) @ more) / before)))
+    mine, theirs = ({n: c(d) for n, c in _further(own).items()} for d in (own, other))
     named, full, impossible = _name(own, other, mine, theirs, rng)
     left = float(np.std(u - X @ theta) / max(np.std(own.torque), 1e-12))
     pack = lambda x: {n: 0.0 for n in refused} | own.pack(x)  # noqa: E731
-    extra.sort(key=lambda e: -e[1])
-    return Inverse(
-        pack(theta), pack(low), pack(high), left, extra, named, pack(full), refused | impossible, cutoff
-    )
+    return Inverse(pack(theta), pack(low), pack(high), left, named, pack(full), refused | impossible, cutoff)
 
 
 def _not_weighed(d: Columns) -> list[str]:
@@ -430,9 +401,10 @@ def _name(
                 continue
             A = np.column_stack([X, column])
             c = least(A, own.u)
-            if _sensible(name, c[-1], own.pack(c)):
+            why = _refused(name, c[-1], own.pack(c))
+            if why is None:
                 tried[name] = left_out(A)
-            elif (why := _impossible(name, c[-1], own.pack(c))) and left_out(A).sum() < (1 - SEARCH.least) * now.sum():
+            elif why and left_out(A).sum() < (1 - SEARCH.least) * now.sum():
                 impossible[name] = why
         if not tried:
             break
@@ -451,7 +423,7 @@ def _name(
     known = [n for n in chosen if _effect(n)]
     both = least(np.column_stack([own.X, *(mine[n] for n in known)]), own.u)
     for i, wrong in enumerate(known):
-        if _sensible(wrong, both[base + i], own.pack(both)) or not _impossible(wrong, both[base + i], own.pack(both)):
+        if not _refused(wrong, both[base + i], own.pack(both)):
             continue
         rest = {n: c for n, c in mine.items() if n != wrong}
         named, theta, more = _name(own, other, rest, theirs, rng)
@@ -489,16 +461,10 @@ def _kind(name: str) -> str:
     return name.split(" (")[0]
 
 
-def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Return whether a coefficient can be what it is called."""
-    kind = _kind(name)
-    return kind not in EFFECT or EFFECT[kind].possible_by_torque(c, theta, LEAST)
-
-
-def _impossible(name: str, c: float, theta: dict[str, float]) -> str:
-    """Return why a coefficient that is not sensible is a refusal that is told; empty where it is passed over."""
-    kind = _kind(name)
-    return EFFECT[kind].impossible_by_torque(c, theta) if kind in EFFECT else ""
+def _refused(name: str, c: float, theta: dict[str, float]) -> str | None:
+    """Return why a coefficient cannot be what it is called; empty where that is passed over, None where it can."""
+    effect = EFFECT.get(_kind(name))
+    return None if effect is None else effect.refused_by_torque(c, theta, LEAST)
 
 
 def _intervals(

@@ -18,7 +18,8 @@ from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.plant.case import intervals_of
 from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.read import Run
+from dexsim.gap.plant.mechanics import chain
+from dexsim.gap.read import Run, joined, pieces
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
@@ -285,11 +286,11 @@ def _alike(
     was refitted to."""
     whole = replace(case, plant=search.whole)
     windows = whole.plant.windows(None, test, span=span_test)
-    params, fixed = trial.fit.params, [f for m in trial.members for f in m.variant.fixed]
+    params = trial.fit.params
     told = np.array([ours.get(p.key, x) for p, x in zip(params, trial.fit.x, strict=True)])
     measured = whole.plant.q[windows.sample_row]
     error = [
-        float(np.sqrt(np.mean((measured - free_run(whole, params, x, windows, fixed, True)[0]) ** 2)))
+        float(np.sqrt(np.mean((measured - free_run(whole, params, x, windows, trial.fixed, True)[0]) ** 2)))
         for x in (trial.fit.x, told)
     ]
     return error[1] <= (1 + BELIEF.tolerance) * error[0] + 0.1 * case.sigma
@@ -425,15 +426,7 @@ QUIETEST = 0.05  # of a joint's samples: those by which it is told what is no ri
 def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) -> list[int]:
     """Return of `joints` the j-th and those before and behind it in the mechanism: what one accelerates asks a torque
     of the others."""
-
-    def chain(joint: str) -> set[int]:
-        dof, out = int(model.jnt_dofadr[model.joint(joint).id]), set()
-        while dof >= 0:
-            out.add(dof)
-            dof = int(model.dof_parentid[dof])
-        return out
-
-    chains = [chain(x) for x in joints]
+    chains = [{*chain(model, model.jnt_bodyid[model.joint(x).id])} for x in joints]
     return [k for k, c in enumerate(chains) if c <= chains[j] or chains[j] <= c]
 
 
@@ -532,8 +525,7 @@ def _size(
             continue
         count = max(int(AROUND / max(float(np.median(np.diff(t))), 1e-6)), 1) if len(t) > 1 else 1
         smooth = median_filter(r, count, mode="nearest")
-        edge = np.flatnonzero(np.diff(np.r_[0, (on if anywhere else np.ones(len(r), bool)).astype(int), 0]))
-        for a, b in zip(edge[::2], edge[1::2], strict=True):
+        for a, b in pieces(on if anywhere else np.ones(len(r), bool)):
             peak = float(smooth[a:b][np.argmax(np.abs(smooth[a:b]))])
             if best is None or abs(peak) > abs(best[0]):
                 best = peak, k, smooth[a:b], np.arange(a, b)
@@ -601,16 +593,8 @@ def _spans(
     nor a gap in it is shorter, so that the tops of a ripple are none."""
     out: dict[str, list[tuple[float, float]]] = {}
     for (t, on), run in zip(given, runs, strict=True):
-        edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
-        merged: list[list[float]] = []
-        for a, b in zip(edge[::2], edge[1::2], strict=True):
-            start, end = float(t[a] + run.t[0]), float(t[b - 1] + run.t[0])
-            if merged and start - merged[-1][1] < shortest:
-                merged[-1][1] = end
-            else:
-                merged.append([start, end])
-        spans = [(a, b) for a, b in merged if b - a >= shortest]
-        if spans:
+        found = joined([(float(t[a] + run.t[0]), float(t[b - 1] + run.t[0])) for a, b in pieces(on)], shortest)
+        if spans := [(a, b) for a, b in found if b - a >= shortest]:
             out[run.name] = out.get(run.name, []) + spans
     return out
 

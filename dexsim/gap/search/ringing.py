@@ -247,10 +247,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     won = np.argmin(np.stack(list(sums.values())), 0)
     share = {e: float(np.mean(won == k)) for k, e in enumerate(sums)}
     rivals = sorted(((e, s) for e, s in share.items() if e != name), key=lambda o: -o[1])
-    return Outcome(
-        found.joint, found.none, tries[name][1], {name: rivals}, {name: share[name]}, {name: float(gain)},
-        {name: 0.0}, found.scanned,
-    )  # fmt: skip
+    return Outcome(found.joint, found.none, tries[name][1], {name: rivals}, {name: share[name]}, found.scanned)
 
 
 def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict | None) -> float:

@@ -88,17 +88,14 @@ def cross_validated(search: JointSearch, trial: Trial) -> np.ndarray:
     _, s = mine.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
     res = mine.eliminated(mine.residuals(f.params, np.array(guesses)), s)
     a = huber_square(res, k)
-    chosen = []
     for n, number in enumerate(folds):
         test = fold == number
         on = ~test if len(folds) > 1 else test
         options = [0] if P == 0 else [0, *range(1 + n * len(lengths), 1 + (n + 1) * len(lengths))]
         best = min(options, key=lambda o: a[o][on].sum())
         trial.folds.append(np.array(guesses)[best])
-        chosen.append(best)
         out += np.bincount(search.blocks[test], a[best][test], len(out))
     trial.left_out = out
-    search.shadow.add(trial.members, f.loss, res[chosen])
     return out
 
 
@@ -107,7 +104,7 @@ def refolded(search: JointSearch, trial: Trial) -> Trial:
     limit, a sag, play), one step from the optimum of all lands anywhere."""
     f = trial.fit
     out = np.zeros(int(search.blocks.max()) + 1)
-    folds, parts, left = np.unique(search.fold_of), [], []
+    folds, parts = np.unique(search.fold_of), []
     if len(folds) < 2 or not len(f.params):
         return trial
     whole = search.fitter.given(trial.members)
@@ -119,12 +116,10 @@ def refolded(search: JointSearch, trial: Trial) -> Trial:
         x = part.given(trial.members).fit(
             f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False
         ).x
-        left.append(whole.evaluate(f.params, x))
-        a = huber_square(left[-1], search.r.huber)
+        a = huber_square(whole.evaluate(f.params, x), search.r.huber)
         out += np.bincount(search.blocks[~rows], a[~rows], len(out))
         parts.append(x)
-    search.shadow.add(trial.members, f.loss, np.array(left))
-    return replace(trial, left_out=out, folds=parts, refitted=True)
+    return replace(trial, left_out=out, folds=parts)
 
 
 def earns(search: JointSearch, new: Trial, old: Trial, further: bool = True) -> bool:

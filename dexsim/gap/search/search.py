@@ -38,10 +38,10 @@ from dexsim.gap.search.scan import (
     with_hinted,
 )
 
-Pool = dict[str, tuple[Member, np.ndarray]]
-"""By effect: what may stand in another's place, and where its fit begins."""
-Rivals = dict[str, tuple[list[tuple[str, float]], float, float]]
-"""By member: what else in its place would do with its share of bootstraps, its confidence, its gain."""
+Pool = dict[str, tuple[Member, np.ndarray, float]]
+"""By effect: what may stand in another's place, where its fit begins, and its price in the scan."""
+Rivals = dict[str, tuple[list[tuple[str, float]], float]]
+"""By member: what else in its place would do with its share of bootstraps, its confidence."""
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
 LISTED = 6  # effects of a short list
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
@@ -55,7 +55,6 @@ def search_joint(search: JointSearch) -> Outcome:
     aside = ", quiet" if search.none_loss.sum() < SEARCH.unsettled * len(search.blocks) else ""
     search.reached("begun", aside)
     current = none
-    price: dict[str, float] = {}
     scanned: list[tuple[str, float, float]] = []
     per = len(search.blocks)
     pool: Pool = {}
@@ -77,11 +76,11 @@ def search_joint(search: JointSearch) -> Outcome:
             listed = with_hinted(search, [] if enough else listed, current.members, SEARCH.apart)
         if not listed:
             break
-        drafts = drafts_of(search, listed, current, pool, price)
+        drafts = drafts_of(search, listed, current, pool)
         search.reached("drafted" + again)
         for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
             if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
-                pool[member.id], price[member.id] = (member, start), p
+                pool[member.id] = member, start, p
         trials = finished_drafts(search, drafts, current)
         follows = min(cv_loss(search, t).sum() for t in trials) < SEARCH.enough**2 * per
         search.reached("fitted" + again, ", enough" if follows else "")
@@ -117,26 +116,17 @@ def search_joint(search: JointSearch) -> Outcome:
             current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
         if len(current.members) > 1 and not search.deadline.over():
             current = swapped(search, current, pool)
-    current = from_plain(search, beside_alike(search, forks, current, pool, price))
+    current = from_plain(search, beside_alike(search, forks, current, pool))
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
     search.reached("ending", "" if current.members else ", nothing")
     current, final = settled(search, current, pool)
-    rivals = {e: x[0] for e, x in final.items()}
-    confidence, gains = {e: x[1] for e, x in final.items()}, {e: x[2] for e, x in final.items()}
-    for e in final:
-        price.setdefault(e, 0.0)
-    return Outcome(search.case.joint, none, current, rivals, confidence, gains, price, scanned, search.costs)
+    rivals, confidence = {e: x[0] for e, x in final.items()}, {e: x[1] for e, x in final.items()}
+    return Outcome(search.case.joint, none, current, rivals, confidence, scanned, search.costs)
 
 
-def beside_alike(
-    search: JointSearch,
-    forks: Sequence[Trial],
-    current: Trial,
-    pool: Pool,
-    price: dict[str, float],
-) -> Trial:
+def beside_alike(search: JointSearch, forks: Sequence[Trial], current: Trial, pool: Pool) -> Trial:
     """Return what one effect more makes of hypotheses with what is the same torque while the joint moves in the
     place of what was added (`nested`): which of them it is may show beside another effect only. `current` where
     none lasts better, or little is left."""
@@ -148,7 +138,7 @@ def beside_alike(
         listed = shortlisted(scan_catalogue(search, fork), LISTED, loss, fork.members)
         if not listed:
             continue
-        more = best_of(search, finished_drafts(search, drafts_of(search, listed, fork, pool, price), fork), fork)
+        more = best_of(search, finished_drafts(search, drafts_of(search, listed, fork, pool), fork), fork)
         lasts = earns(search, more, fork) and priced_loss(search, more) < priced_loss(search, best)
         if lasts and more.fit.loss < best.fit.loss:
             best = more
@@ -195,10 +185,10 @@ def drafts_of(
     listed: Sequence[tuple[float, float, Member, np.ndarray]],
     current: Trial,
     pool: Pool,
-    price: dict[str, float],
 ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
     """Return the hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted
-    on short windows: those that follow best, the best first. pool, price: by effect, are filled."""
+    on short windows: those that follow best, the best first.
+    pool: is filled."""
     drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
     followed: dict[str, float] = {}
     begin = lambda x: np.concatenate([*current.values, x])  # noqa: E731
@@ -215,13 +205,12 @@ def drafts_of(
     for (_, p, member, start), draft in zip(listed, map(drafted, range(len(listed))), strict=True):
         if draft is None:
             break
-        if member.id not in pool or price.get(member.id, 1.0) > p:
-            pool[member.id] = (member, start)
-        price[member.id] = p
+        known = pool.get(member.id)
+        pool[member.id] = (*((member, start) if known is None or known[2] > p else known[:2]), p)
         drafts.append(draft)
         if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
             if member.id in followed:
-                pool[member.id] = (member, start)
+                pool[member.id] = member, start, p
             followed[member.id] = drafts[-1][2].loss
         search.tell(None)
     drafts.sort(key=lambda d: d[2].loss)
@@ -392,7 +381,7 @@ def swapped(search: JointSearch, current: Trial, pool: Pool) -> Trial:
     best = current
     for i, member in enumerate(current.members[:-1]):
         rest, kept = current.but(i)
-        for key, (other, start) in list(pool.items()):
+        for key, (other, start, _) in list(pool.items()):
             if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
                 continue
             trial = search.fit((*rest, other), np.concatenate([kept, start]), current, quick=True)
@@ -536,7 +525,7 @@ def overtaken(
     None where each holds its own."""
     ahead = []
     for k, m in enumerate(current.members):
-        others, share, _ = final[m.id]
+        others, share = final[m.id]
         if others:
             rival = others[0][0]
             if rival in EFFECTS[m.id].nests:  # it had its turn (`more_general`)
@@ -558,7 +547,7 @@ def overtaken(
 def rivals_of(
     search: JointSearch, current: Trial, pool: Pool
 ) -> Rivals:
-    """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
+    """For each member: what else in its place would do (its share of bootstraps), and its confidence."""
     out = {}
     search.costs = {}
     mine = cv_loss(search, current)
@@ -569,7 +558,7 @@ def rivals_of(
         lost = cv_loss(search, without) if without else search.none_loss
         search.costs[member.id] = gain_by_condition(search, lost, mine)
         others: list[Trial] = []
-        for key, (other, start) in pool.items():
+        for key, (other, start, _) in pool.items():
             if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
                 continue
             known = search.fitted.get(frozenset((key, *(m.id for m in rest))))
@@ -600,7 +589,7 @@ def rivals_of(
             for t, s in zip(others, shares[1:-1], strict=True)
         ]
         rows.sort(key=lambda r: -r[1])
-        out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
+        out[member.id] = rows, float(shares[0])
     return out
 
 
@@ -609,7 +598,7 @@ def without_search(search: JointSearch) -> Outcome:
     search.fitted = {}
     none = search.start()
     search.none_loss = cv_loss(search, none)
-    return Outcome(search.case.joint, none, none, {}, {}, {}, {}, [])
+    return Outcome(search.case.joint, none, none, {}, {}, [])
 
 
 def _loss(fitter: Fitter, trial: Trial) -> float:

@@ -8,13 +8,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from dexsim.gap.effects import Fit, PadFacts, word
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.inquiry import PadCurve
-from dexsim.gap.judge.held_out import gain_interval
+from dexsim.gap.judge import confidence
+from dexsim.gap.judge.held_out import gain_interval, rms
 from dexsim.gap.read import spans
 from dexsim.gap.rules import JUDGE, SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, contact, readings
@@ -77,7 +79,7 @@ class PadAnswer:
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= JUDGE.level][:2]
         judged = np.isfinite(a)  # what nothing held out shows is doubted
-        earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if judged else JUDGE.doubted
+        earned = confidence.earned(b, a) if judged else JUDGE.doubted
         if earned <= TOUCH.earned:
             self.notes.append(
                 f"{e} on the {self.name}'s pad earned its place in training but not on what was held out; not claimed"
@@ -136,7 +138,8 @@ class PadAnswer:
         if sure.sum() < TOUCH.agree:
             return None
         # one barely known counts little
-        low, value, high = _quantiles(t.gains[sure], width[sure] ** -2.0, (0.05, 0.5, 0.95))
+        at = {"weights": width[sure] ** -2.0, "method": "inverted_cdf"}
+        low, value, high = (float(x) for x in np.quantile(t.gains[sure], (0.05, 0.5, 0.95), **at))
         return (value, low, high) if abs(value - 1) > TOUCH.law and high - low < abs(value - 1) else None
 
     def _chord(self) -> Fit | None:
@@ -202,25 +205,12 @@ class PadAnswer:
         return names, out
 
 
-def rms(squares: np.ndarray) -> float:
-    """Return root of the mean of squares; 0 for none."""
-    return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
-
-
 def held_out(pad: PadFit, trial: TouchTrial, stage: int = 0) -> tuple[float, np.ndarray, np.ndarray]:
     """Return (rms [N], squared errors, blocks) on residuals held out, of one stage, over taxels that feel something."""
     at = ~pad.train & (pad.stage_of() == stage)
     sigma = np.concatenate([s.sigma[s.mask] for s in pad.samples])
     e = (trial.res * sigma)[at] ** 2
     return (float(np.sqrt(e.mean())) if len(e) else float("nan")), e, pad.block[at]
-
-
-def _quantiles(x: np.ndarray, weight: np.ndarray, at: tuple[float, ...]) -> list[float]:
-    """Return quantiles of x [n], each counting by its weight: the least value below or at which that share of the
-    weights lies."""
-    order = np.argsort(x)
-    share = np.cumsum(weight[order]) / weight.sum()
-    return [float(x[order][min(int(np.searchsorted(share, q)), len(x) - 1)]) for q in at]
 
 
 def _stage(search: PadFit, effect: str) -> int:
@@ -302,7 +292,7 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
     said = []
     for what, parts in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
         x = np.concatenate(parts)
-        c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
+        c = float(spearmanr(x, y).statistic) if x.std() > 0 else 0.0
         if c**2 > SEARCH.least:
             said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
     return [x for _, x in sorted(said, reverse=True)[:2]]
@@ -376,10 +366,10 @@ def readings_of(recordings: list[Recording], taxels: Sequence[str]) -> dict[int,
     return out
 
 
-def constant_finding(names: list[str], regime: str, confidence: float) -> Finding:
+def constant_finding(names: list[str], regime: str, sure: float) -> Finding:
     """Return gains of 0 of taxels ("pad:k")."""
     sizes = {"gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"}, "taxels": word(", ".join(names))}
-    return Finding(TactileGain.id, confidence, regime, taxels=names, topics=[TACTILE], parameters=sizes)
+    return Finding(TactileGain.id, sure, regime, taxels=names, topics=[TACTILE], parameters=sizes)
 
 
 def pressed(silent: dict[int, float], pad: int) -> Finding | None:

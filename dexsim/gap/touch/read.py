@@ -8,6 +8,7 @@ geom.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from dexsim import yaml_text
 from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
+from dexsim.gap.plant.mechanics import chain
 from dexsim.gap.read import spans
 from dexsim.gap.read.noise import noise
 from dexsim.gap.rules import TOUCH
@@ -85,15 +87,11 @@ class PadRun:
         """[S] N, normal force of the taxels that `shear` sums."""
         return np.where(self.pressed, self.z, 0.0).sum(1)
 
-    @property
+    @cached_property
     def near(self) -> np.ndarray:
         """[n] grid points at which the object may touch."""
-        if "near" not in self.__dict__:
-            close = self.dist.min(1) < 2e-3 + 2 * self.doubt
-            self.__dict__["near"] = np.flatnonzero(
-                close if self.load is None else close | (self.load > 0.02 * self.load.max())
-            )
-        return self.__dict__["near"]
+        close = self.dist.min(1) < 2e-3 + 2 * self.doubt
+        return np.flatnonzero(close if self.load is None else close | (self.load > 0.02 * self.load.max()))
 
 
 @dataclass
@@ -113,13 +111,15 @@ class TouchData:
 
 @dataclass
 class _Thing:
-    """What presses: a shape led along poses, or a geom of the model. mass kept for nothing: touch is quasi-static."""
+    """What presses: a shape led along poses, or a geom of the model; its contact [N/m, 1] as it is believed."""
 
     kind: str
     size: np.ndarray
     grid: Grid | None
     body: str | None  # None: led along /object_pose
     geom: int = -1
+    stiffness: float = STIFFNESS
+    friction: float = FRICTION
 
 
 def newtons(r: Recording) -> tuple[np.ndarray, bool]:
@@ -207,7 +207,8 @@ def _things(r: Recording, model: mujoco.MjModel, sensors: Sensors) -> list[_Thin
                 shape = library().get(o["shape"])
                 grid = None if shape is None else shape.grid
             if o["kind"] != "grid" or grid is not None:
-                return [_Thing(o["kind"], np.asarray(o["size"], float), grid, None)]
+                contact = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
+                return [_Thing(o["kind"], np.asarray(o["size"], float), grid, None, -1, *contact)]
     out = []
     for g in range(model.ngeom):
         name = model.body(int(model.geom_bodyid[g])).name
@@ -277,7 +278,6 @@ def _pad_run(
         warm = np.interp(grid, r.temperature.t, np.nanmean(r.temperature.value, 1)) - coldest
     else:
         warm = grid + (r.start_ns - origin) * 1e-9
-    stiffness, friction = _believed_contact(r, thing)
     return PadRun(
         r.path.name,
         f,
@@ -298,9 +298,9 @@ def _pad_run(
         full,
         warm,
         lsb,
-        stiffness,
-        friction,
-        _doubt(model, layout.bodies[f], thing),
+        thing.stiffness,
+        thing.friction,
+        _doubt(model, layout.bodies[f]),
         counted,
     )
 
@@ -320,27 +320,16 @@ def _path(R: np.ndarray, p: np.ndarray, middle: np.ndarray, e1: np.ndarray, e2: 
     return -np.concatenate([np.zeros((1, 2)), np.cumsum(step @ np.stack([e1, e2], 1), 0)])
 
 
-def _believed_contact(r: Recording, thing: _Thing) -> tuple[float, float]:
-    """Return (stiffness N/m, friction) that is believed of what is touched."""
-    if thing.body is not None:
-        return STIFFNESS, FRICTION
-    assert r.config is not None  # `_things` has it from there
-    o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
-    return float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
-
-
-def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
+def _doubt(model: mujoco.MjModel, pad: str) -> float:
     """Return m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5
     mrad times its arm."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body, out = model.body(pad).id, 1.5e-4
-    at, b = data.xpos[body], body
-    while b > 0:
+    for b in chain(model, body):
         for i in range(int(model.body_jntadr[b]), int(model.body_jntadr[b]) + int(model.body_jntnum[b])):
             if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE:
-                out += 5e-3 * float(np.linalg.norm(at - data.xanchor[i]) + 0.02)
-        b = int(model.body_parentid[b])
+                out += 5e-3 * float(np.linalg.norm(data.xpos[body] - data.xanchor[i]) + 0.02)
     return out
 
 

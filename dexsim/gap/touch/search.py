@@ -4,7 +4,7 @@ left out."""
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -15,6 +15,7 @@ from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_c
 from dexsim.gap.read import BLOCK
 from dexsim.gap.read.noise import noise
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TOUCH
+from dexsim.gap.search.fit import huber_square
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
@@ -274,12 +275,17 @@ class PadFit:
         independent = 0.1
         return (independent * up + 1 / TOUCH.gain_prior**2) / (independent * down + 1 / TOUCH.gain_prior**2)
 
+    def mapped(self, trial: TouchTrial, where: np.ndarray | None = None) -> TouchTrial:
+        """Return a trial of single taxels' gains with those that residuals `where` (default: training) ask for."""
+        if trial.gains is None:
+            return trial
+        gains = self.gain_map(trial, self.train if where is None else where)
+        return replace(trial, gains=gains, res=self.residual(trial.values, gains, trial.order))
+
     def loss(self, res: np.ndarray) -> np.ndarray:
         """Return [B] squared (Huber) residuals by block, stages weighed so that each counts alike per residual."""
-        a = np.abs(res)
-        h = np.where(a <= 3, a * a, 6 * a - 9)
         _, b = np.unique(self.block[self.train], return_inverse=True)
-        return np.bincount(b, h[self.train])
+        return np.bincount(b, huber_square(res[self.train], 3.0))
 
     def cross(self, trial: TouchTrial) -> np.ndarray:
         """Return [B] losses of the training blocks when their fold is left out of the fit."""
@@ -291,18 +297,14 @@ class PadFit:
             if inside.sum() < 50:
                 inside = self.train
             again = self.fit(trial.ids, trial.values, inside, trial.gains, trial.order, 24)
-            if trial.gains is not None:
-                again.gains = self.gain_map(again, inside)
-                again.res = self.residual(again.values, again.gains, again.order)
             mine = self.train & (self.fold == f)
-            res[mine] = again.res[mine]
+            res[mine] = self.mapped(again, inside).res[mine]
             trial.folds.append(again.values)
         trial.left_out = self.loss(res)
         return trial.left_out
 
     def size(self, res: np.ndarray) -> float:
-        a = np.abs(res[self.train])
-        return float(np.where(a <= 3, a * a, 6 * a - 9).sum())
+        return float(huber_square(res[self.train], 3.0).sum())
 
     def _rounding(self, trial: TouchTrial) -> np.ndarray:
         """Return [P] rms by which the numbers come back wrong from their own readings in whole counts, at three
@@ -387,14 +389,13 @@ BOOTSTRAPS, STRETCH = 300, 3  # and of how many neighbouring blocks a stretch of
 
 @dataclass
 class PadOutcome:
-    """What the search of one pad ends with: the trials without and with what was found, rivals by effect, notes."""
+    """What the search of one pad ends with: the trials without and with what was found, rivals by effect."""
 
     pad: int
     none: TouchTrial
     best: TouchTrial
     rivals: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
     confidence: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
 
 class PadSearch(PadFit):
@@ -404,7 +405,6 @@ class PadSearch(PadFit):
         """Adds effects while they earn it; then what else would do in the place of each."""
         none = self.fit((), {})
         current = none
-        notes: list[str] = []
         trials: dict[frozenset, TouchTrial] = {frozenset(): none}
         for _ in range(SEARCH.most):
             if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < TOUCH.enough**2:
@@ -437,7 +437,7 @@ class PadSearch(PadFit):
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
             if self.size(full.res) < self.size(current.res):
                 current = full
-        out = PadOutcome(self.runs[0].pad, none, current, notes=notes)
+        out = PadOutcome(self.runs[0].pad, none, current)
         for e in current.ids:
             out.rivals[e], out.confidence[e] = self._rivals(current, e, trials)
         return out
@@ -481,11 +481,9 @@ class PadSearch(PadFit):
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """Return the hypothesis with one effect more; None where it cannot be there."""
-        e = effect.id
         if not self._possible(current, effect):
             return None
-        ids = (*current.ids, e)
-        tries = []
+        ids = (*current.ids, effect.id)
         if effect.by_taxel:
             # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against
             # the believed geometry
@@ -498,48 +496,23 @@ class PadSearch(PadFit):
             base = current if order is None else self.fit(current.ids, current.values, None, None, order, 24)
             base.values = base.values | believed
             for _ in range(2):
-                gains = self.gain_map(base, self.train)
-                base = self.fit(current.ids, base.values, None, gains, base.order, 24)
-            gains = self.gain_map(base, self.train)
-            tries.append(
-                TouchTrial(
-                    ids, base.values, gains, base.order, base.keys, None, self.residual(base.values, gains, base.order)
-                )
-            )
-            if self.scale_known:
-                tries.append(self._common(effect, current, 60))
+                base = self.fit(current.ids, base.values, None, self.gain_map(base, self.train), base.order, 24)
+            each = replace(self.mapped(base), ids=ids, jac=None)
             # a map where one number does not follow: nearer than this they follow alike
-            if len(tries) == 2 and JUDGE.within**2 * self.size(tries[0].res) > self.size(tries[1].res):
-                tries = tries[1:]
-            return tries[0]
+            common = self._common(effect, current, 60) if self.scale_known else each
+            return common if JUDGE.within**2 * self.size(each.res) > self.size(common.res) else each
         starts = sorted(
             effect.begin(self), key=lambda s: self.size(self.residual(current.values | s, current.gains, current.order))
         )
         tries = [self.fit(ids, current.values | s, None, current.gains, current.order, 50) for s in starts[:2]]
-        best = min(tries, key=lambda t: self.size(t.res))
-        if best.gains is not None:
-            best.gains = self.gain_map(best, self.train)
-            best.res = self.residual(best.values, best.gains, best.order)
-        return best
+        return self.mapped(min(tries, key=lambda t: self.size(t.res)))
 
     def _common(self, effect: TouchEffect, current: TouchTrial, evaluations: int) -> TouchTrial:
         """Return the hypothesis with one gain for all of the pad, of an effect that may be another on each taxel."""
-        ratio = float(
-            np.median(
-                [
-                    r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9)
-                    for r in self.runs
-                ]
-            )
-        )
-        return self.fit(
-            (*current.ids, effect.id),
-            current.values | dict.fromkeys(effect.fits, ratio),
-            None,
-            current.gains,
-            current.order,
-            evaluations,
-        )
+        predicted = [readings(r, current.values, current.gains, current.order).sum() for r in self.runs]
+        ratio = np.median([r.z.sum() / max(p, 1e-9) for r, p in zip(self.runs, predicted, strict=True)])
+        start = current.values | dict.fromkeys(effect.fits, float(ratio))
+        return self.fit((*current.ids, effect.id), start, None, current.gains, current.order, evaluations)
 
     def _swaps(self, values: dict[str, float]) -> np.ndarray | None:
         """Order of the taxels [K] in which exchanged pairs are put right, by what `values` predict; None where there
@@ -578,27 +551,19 @@ class PadSearch(PadFit):
         return x[intervals.stretches(len(x), STRETCH, self.rng, BOOTSTRAPS)].sum(1)
 
     def _drop(self, current: TouchTrial, trials: dict[frozenset[str], TouchTrial]) -> TouchTrial:
-        changed = True
-        while changed and len(current.ids) > 1:
-            changed = False
-            for e in current.ids:
-                rest = tuple(x for x in current.ids if x != e)
-                less = self.without(current, e)
-                if not self._earns(current, less):
-                    current, changed = less, True
-                    trials[frozenset(rest)] = less
-                    break
+        for e in current.ids if len(current.ids) > 1 else ():
+            less = self.without(current, e)
+            if not self._earns(current, less):
+                trials[frozenset(less.ids)] = less
+                return self._drop(less, trials)
         return current
 
     def without(self, current: TouchTrial, e: str) -> TouchTrial:
         rest = tuple(x for x in current.ids if x != e)
         start = {k: v for k, v in current.values.items() if k not in TOUCH_EFFECTS[e].fits}
         keep = not TOUCH_EFFECTS[e].by_taxel
-        less = self.fit(rest, start, None, current.gains if keep else None, current.order if keep else None, 40)
-        if less.gains is not None:
-            less.gains = self.gain_map(less, self.train)
-            less.res = self.residual(less.values, less.gains, less.order)
-        return less
+        gains, order = (current.gains, current.order) if keep else (None, None)
+        return self.mapped(self.fit(rest, start, None, gains, order, 40))
 
     def _rivals(
         self, current: TouchTrial, e: str, trials: dict[frozenset[str], TouchTrial]
