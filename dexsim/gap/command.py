@@ -227,7 +227,7 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
     if given.get("replay", "mujoco") not in REPLAY:
         raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
     known = tuple(dict.fromkeys((*EFFECTS, *TOUCH_EFFECTS)))
-    for e in given.get("effects", ()):
+    for e in given.get("effects") or ():
         if e not in known:
             raise UserError(
                 f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}"
@@ -240,8 +240,8 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
         held_out,
         device=device,
         next_recording=given.get("next", True),
-        allowed=set(given.get("effects", ())) or None,
-        joints=set(given.get("joints", ())) or None,
+        allowed=set(given.get("effects") or ()) or None,
+        joints=set(given.get("joints") or ()) or None,
         **{k: given[k] for k in same if k in given},
     )
 
