@@ -2,22 +2,23 @@
 
 Pads that share one force form a group, and each taxel's distance is measured once. Two variants share every line of
 the law (`taxel_force`, `spread_weight`, grids' distances): `serial`, one thread per (world, group), for the CPU; for
-CUDA a warp looks at a few pairs of world and group, then measures those that are pressed: each lane keeps the distances
-of every 32nd taxel, in registers up to 512 taxels, sums are shuffles, and there is no barrier and no shared memory. The
-hand's touch of itself, which few groups feel at a time, has its own launch. Both compose the two poses once a group and
-reduce in the frame of its body.
+CUDA 16 lanes measure a group in a world, two side by side in a warp: a lane keeps the distances of every 16th taxel in
+registers, sums are shuffles, and there is no barrier and no shared memory. Other warps of the same launch feel what the
+hand touches of itself, as few groups do at a time. Both compose the two poses once a group and reduce in the frame of
+its body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from math import gcd
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from dexsim.tactile.lanes import LANES, lane_ballot, lanes_min, lanes_sum, lanes_sum4, lowest_bit
+from dexsim.tactile.lanes import LANES, lane_ballot, lane_xor, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.sdf import (
     BOX,
     CYLINDER,
@@ -25,7 +26,7 @@ from dexsim.tactile.sdf import (
     SPHERE,
     Shapes,
     bound_radius,
-    boxes_apart,
+    boxes_gap,
     distance,
     in_box,
     load4,
@@ -33,14 +34,14 @@ from dexsim.tactile.sdf import (
     sd_grid,
 )
 
-ITEMS = 4
-"""Pairs of a world and a group that a warp looks at for the object's touch; those that nothing presses cost little."""
-HAND_ITEMS = 8
-"""The same for touch of the hand on itself."""
+WIDTH = 16
+"""Lanes that measure a group of pads in a world: a warp does 32 / WIDTH of them side by side."""
+HAND_WIDTH = 8
+"""Lanes that ask whether a group of pads in a world touches the hand itself, which a warp then measures."""
 MAX_UNROLL = 16
-"""Rounds of 32 taxels, a taxel a lane, whose distances are kept in registers; more go through a thread's memory."""
+"""Rounds of taxels, one a lane, whose distances are kept in registers; more go through a thread's memory."""
 CHUNK = 4
-"""Rounds of 32 taxels that are measured at a time: all their loads are under way before the first is used."""
+"""Rounds of taxels that are measured at a time: all their loads are under way before the first is used."""
 LINEAR = 0
 HERTZ = 1
 MOONEY_RIVLIN = 2
@@ -63,6 +64,18 @@ class Pads:
 
 
 @wp.struct
+class Unit:
+    """What `WIDTH` lanes measure of a world: a group, or half of its pads."""
+
+    group: int
+    round: int  # its first round, and how many
+    rounds: int
+    pad: int  # the first of its pads in `Groups.pads`, and how many
+    pads: int
+    half: int  # 1: the other half of the group is with the other lanes of the warp
+
+
+@wp.struct
 class Groups:
     """Pads of one body that the same forces press, as one: G groups of up to R rounds of 32 taxels, a round of one
     pad."""
@@ -71,8 +84,10 @@ class Groups:
     pads: wp.array(dtype=int)  # [F] pads, group by group
     first: wp.array(dtype=int)  # [G + 1] where each group begins in `pads`
     rounds: wp.array(dtype=int)  # [G]
+    unit: wp.array(dtype=Unit)  # [U]
     round: wp.array2d(dtype=wp.vec3i)  # [G, R] its pad, the number of its first taxel there, 1: the pad's last round
-    taxel: wp.array2d(dtype=wp.vec4)  # [G, 32 R] as in `Pads`; copies of the first without area where no taxel is
+    # [G + 1, 32 R] as in `Pads`; copies of the first without area where no taxel is
+    taxel: wp.array2d(dtype=wp.vec4)
     bound: wp.array(dtype=wp.vec4)  # [G] bounding sphere: centre, radius
     middle: wp.array(dtype=wp.vec3)  # [G] bounding box, body frame
     half: wp.array(dtype=wp.vec3)  # [G]
@@ -115,7 +130,7 @@ class Felt:
     force: wp.array2d(dtype=float)  # [N, F] N
     centre: wp.array2d(dtype=wp.vec3)  # [N, F] m, world frame
     force_other: wp.array2d(dtype=float)  # [N, F] N, of the rest of the hand
-    felt: wp.array3d(dtype=float)  # [N, F, T] N, where every taxel's force is asked for
+    readings: wp.array3d(dtype=float)  # [N, F, T] N, where every taxel's force is asked for
     distance: wp.array3d(dtype=float)  # [N, F, T] m: scratch, where the solver's force is spread
 
 
@@ -126,12 +141,12 @@ class FlatFelt:
     force: wp.array(dtype=float)
     centre: wp.array(dtype=wp.vec3)
     force_other: wp.array(dtype=float)
-    felt: wp.array(dtype=float)
+    readings: wp.array(dtype=float)
 
 
 @wp.func
 def taxel_force(kind: int, law: Law, stiffness: float, depth: float, area: float, threshold: float):
-    """Normal force [N] of a taxel pressed in by `depth` > 0 [m].
+    """Return the normal force [N] of a taxel pressed in by `depth` > 0 [m].
 
     Linear: stiffness * area * depth, an elastic foundation (paper, "Tactile Sensor Simulation": f = k d, weighted by
     the area a taxel stands for); its sum grows with about the square of the depth. Hertz: stiffness * area *
@@ -155,13 +170,13 @@ def taxel_force(kind: int, law: Law, stiffness: float, depth: float, area: float
 
 @wp.func
 def spread_level(nearest: float, reach: float):
-    """Distance under which taxels share the solver's force, given the nearest taxel's distance [m]."""
+    """Return the distance [m] under which taxels share the solver's force, given the nearest taxel's distance [m]."""
     return wp.max(nearest + reach, 0.0)
 
 
 @wp.func
 def spread_weight(d: float, area: float, level: float):
-    """A taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
+    """Return a taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
 
     Deeper than `reach` the level is 0, the object's surface. A shallower contact, or one that falls between the taxels,
     is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous in the distances,
@@ -174,7 +189,7 @@ def spread_weight(d: float, area: float, level: float):
 
 @wp.func
 def pose_in(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
-    """Position of a body's origin in another body's frame."""
+    """Return the position [m] of a body's origin in another body's frame."""
     return wp.transpose(xmat[w, frame]) * (xpos[w, body] - xpos[w, frame])
 
 
@@ -185,7 +200,7 @@ def turn_in(xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
 
 @wp.func
 def may_touch(shapes: Shapes, shape: int, size: wp.vec3, middle: wp.vec3, radius: float):
-    """Whether a pad inside a sphere can reach the shape: first by bounding spheres, then by the distance itself."""
+    """Return whether a pad in a sphere can reach the shape: first by bounding spheres, then by the distance itself."""
     near = wp.length(middle) < radius + bound_radius(shapes, shape, size)
     if near:
         # 1 mm covers the interpolation error of coarse grids
@@ -200,8 +215,8 @@ def xyz(v: wp.vec4):
 
 @wp.func
 def centre_of(pads: Pads, f: int, total: wp.vec4):
-    """Centre of pressure of pad f, body frame, of the sums (moment of force, force); the pad's centre where nothing
-    presses."""
+    """Return the centre of pressure of pad f [m, body frame], of its sums (moment of force, force); the pad's centre
+    where nothing presses."""
     at = pads.centre[f]
     if total[3] > 0.0:
         at = xyz(total) / total[3]
@@ -210,7 +225,7 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 @wp.func
 def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
-    """Whether group g may touch link j: another body, and pressed where the physics says so."""
+    """Return whether group g may touch link j: another body, and pressed where the physics says so."""
     near = here.link_body[j] != groups.body[g]
     if near and here.tip_column[g, j] >= 0:
         near = here.pair_normal[w, here.tip_column[g, j]] > 0.0
@@ -218,28 +233,19 @@ def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
 
 
 @wp.func
-def tips_apart(groups: Groups, tips: Shapes, g: int, j: int, a: wp.mat33, b: wp.vec3):
-    """Whether group g, whose body has rotation a and origin b in that of link j, surely does not touch it."""
-    return boxes_apart(a, b, groups.middle[g], groups.half[g], tips.middle[j], tips.half[j])
-
-
-@wp.func
 def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j: int):
-    """Return a distance [m] below which no taxel of group g is to link j; far where that is the group's own body."""
+    """Return a distance [m] below which no taxel of group g is to link j; far where that is the group's own body. A
+    millimetre is for coarse grids."""
     out = float(FAR)
-    if j < here.link_body.shape[0]:
-        body = groups.body[g]
-        other = here.link_body[j]
-        if other != body:
-            a = turn_in(here.xmat, w, body, other)
-            b = pose_in(here.xpos, here.xmat, w, body, other)
-            # along a way, distances change by no more than its length; a millimetre for coarse grids
-            out = sd_grid(tips, j, 1.0, a * xyz(groups.bound[g]) + b) - groups.bound[g][3] - 1.0e-3
+    if here.link_body[j] != groups.body[g]:
+        a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
+        b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
+        out = boxes_gap(a, b, groups.middle[g], groups.half[g], tips.middle[j], tips.half[j]) - 1.0e-3
     return out
 
 
 @cache
-def touch_kernels(
+def touch_kernel(
     lanes: bool,
     solver: bool,
     raw: bool,
@@ -254,40 +260,54 @@ def touch_kernels(
     feel_others: bool = False,
     links: int = 5,
     selves: bool = False,
+    most: int = 1,
+    units: int = 5,
+    unit_rounds: int = 4,
     registers: int = 0,
-) -> tuple[tuple[wp.Kernel, int], ...]:
-    """Return the kernels for one choice of options, to be launched in turn, each with the pairs of a world and a group
-    that go to a warp of 32 threads (lanes); serial: one, dimensions [N, G], and 0.
+) -> wp.Kernel:
+    """Return the kernel for one choice of options. Dimensions: serial [N, G]; lanes: see `spans`.
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
     the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the
-    solver's, spread. pads, groups, taxels, rounds, objects, links: the layout's sizes F, G, T and R (a multiple of
-    `CHUNK`, or less than it), the objects in each world, and links L. registers: CUDA, at most so many a thread (0: as
-    the compiler likes).
+    solver's, spread. pads, groups, taxels, rounds, most: the layout's sizes F, G, T and R (a multiple of `CHUNK`, or
+    less than it), and the most pads of a group. units, unit_rounds: U, and the most rounds of one. objects: in each
+    world. links: L. registers: CUDA, at most so many a thread (0: as the compiler likes).
     """
-    kind, sizes = LAWS[law], (pads, groups, taxels, rounds)
+    kind = LAWS[law]
     if not lanes:
-        made = [(_serial(solver, raw, others, kind, feel_others, selves), 0)]
+        kernel = _serial(solver, raw, others, kind, feel_others, selves)
     else:
-        made = [(_lanes(solver, raw, kind, *sizes, objects), ITEMS)]
-        if others:
-            made.append((_lanes_of_hand(raw, kind, *sizes, feel_others, links, selves), HAND_ITEMS))
+        of_object = _of_object(solver, raw, kind, pads, taxels, rounds, most, units, unit_rounds, objects)
+        of_hand = _of_hand(raw, kind, pads, groups, taxels, rounds, most, feel_others, links, selves)
+
+        def kernel(
+            here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt,
+            begin: int, hand: int,
+        ):  # fmt: skip
+            i = wp.tid() + begin
+            if i >= hand:
+                of_object(here, pads, groups, law, shapes, out, i - hand)
+            elif wp.static(others):
+                of_hand(here, groups, law, tips, out, i, hand // LANES)
+
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
     options = {"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK}
-    return tuple(
-        (
-            wp.kernel(
-                kernel,
-                enable_backward=False,
-                module="unique",
-                grid_stride=False,
-                cuda_max_registers=registers or None,
-                module_options=options,
-            ),
-            items,
-        )
-        for kernel, items in made
+    return wp.kernel(
+        kernel,
+        enable_backward=False,
+        module="unique",
+        grid_stride=False,
+        cuda_max_registers=registers or None,
+        module_options=options,
     )
+
+
+def spans(worlds: int, groups: int, units: int, others: bool, raw: bool) -> tuple[int, list[tuple[int, int]]]:
+    """Return the threads that feel the hand itself, and the spans of threads (first, count) to be launched in turn with
+    lanes: at once, the hand's first, as they wait longest; in two launches where both write the same readings."""
+    hand = LANES * -(-worlds * groups * HAND_WIDTH // LANES) if others else 0
+    of_object = LANES * -(-worlds * units * WIDTH // LANES)
+    return hand, [(hand, of_object), (0, hand)] if raw and others else [(0, hand + of_object)]
 
 
 @wp.func
@@ -315,8 +335,8 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
             if wp.static(others):
                 out.force_other[w, f] = 0.0
             if wp.static(raw):
-                for t in range(out.felt.shape[2]):
-                    out.felt[w, f, t] = 0.0
+                for t in range(out.readings.shape[2]):
+                    out.readings[w, f, t] = 0.0
         for o in range(here.object_body.shape[0]):
             shape = here.shape_id[w, o]
             size = here.shape_size[w, o]
@@ -359,7 +379,7 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                                     c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
                             s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                             if wp.static(raw):
-                                out.felt[w, f, t] = out.felt[w, f, t] + scale * c
+                                out.readings[w, f, t] = out.readings[w, f, t] + scale * c
                         out.force[w, f] = out.force[w, f] + pressed * (s[3] / share)  # of a pad alone, all of it
                         out.centre[w, f] = out.centre[w, f] + scale * xyz(s)
         for i in range(first, end):
@@ -403,13 +423,13 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                         c = scale * spread_weight(out.distance[w, f, t], pads.taxel[f, t][3], level)
                         out.force_other[w, f] = out.force_other[w, f] + c
                         if wp.static(raw and feel_others):
-                            out.felt[w, f, t] = out.felt[w, f, t] + c
+                            out.readings[w, f, t] = out.readings[w, f, t] + c
         elif wp.static(others):
             for j in range(here.link_body.shape[0]):
                 if may_meet(g, j, here, groups, w):
                     a = turn_in(here.xmat, w, body, here.link_body[j])
                     b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
-                    if not tips_apart(groups, tips, g, j, a, b):
+                    if link_gap(here, groups, tips, w, g, j) < 0.0:
                         for i in range(first, end):
                             f = groups.pads[i]
                             stiff = law.scale[w] * law.stiffness[f]
@@ -422,15 +442,15 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                                         c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
                                         out.force_other[w, f] = out.force_other[w, f] + c
                                         if wp.static(raw and feel_others):
-                                            out.felt[w, f, t] = out.felt[w, f, t] + c
+                                            out.readings[w, f, t] = out.readings[w, f, t] + c
 
     return serial
 
 
-def _measures(rounds: int) -> SimpleNamespace:
-    """Return functions of a warp that measures a group of up to so many rounds, a lane's taxels in its registers."""
+def _measures(rounds: int, width: int) -> SimpleNamespace:
+    """Return functions of `width` lanes that measure a group of up to so many rounds, its taxels in their registers."""
     Reals = wp.types.vector(length=rounds, dtype=float)
-    chunk = min(CHUNK, rounds)
+    chunk = rounds if rounds < CHUNK else gcd(CHUNK, rounds)
 
     @wp.func
     def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
@@ -446,7 +466,7 @@ def _measures(rounds: int) -> SimpleNamespace:
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
                         d[r] = sd_cells(s.data, offset, dims, origin, h, size[0], q)
         else:
             kind = s.kind[i]
@@ -458,7 +478,7 @@ def _measures(rounds: int) -> SimpleNamespace:
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                        q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
                         x = wp.where(box, wp.abs(q[0]) - size[0], wp.sqrt(q[0] * q[0] + q[1] * q[1]) - wide)
                         y = wp.where(box, wp.abs(q[1]) - size[1], -FAR)
                         z = wp.abs(q[2]) - tall
@@ -479,7 +499,7 @@ def _measures(rounds: int) -> SimpleNamespace:
             if wp.static(chunk) * c < n:
                 for k in range(wp.static(chunk)):
                     r = wp.static(chunk) * c + k
-                    q = a * xyz(load4(groups.taxel, at + 32 * r)) + b
+                    q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
                     # those that are far read one cell, all the same, without a branch that others would wait at
                     off = q - wp.max(low, wp.min(q, high))
                     near = wp.dot(off, off) <= level * level
@@ -489,38 +509,43 @@ def _measures(rounds: int) -> SimpleNamespace:
 
     @wp.func
     def least_of(d: Any):
+        """Return the least of this lane's distances."""
         least = d[0]
         for r in range(1, wp.static(rounds)):
             least = wp.min(least, d[r])
-        return lanes_min(least)
+        return least
 
     @wp.func
     def shares(d: Any, groups: Groups, at: int, reach: float, force: float):
         """Return what each taxel has of a force that is spread over its group, by its distance."""
-        level = spread_level(least_of(d), reach)
+        level = spread_level(lanes_min(least_of(d), wp.static(width)), reach)
         whole = float(0.0)
         for r in range(wp.static(rounds)):
             c = float(0.0)
             if d[r] < level:
-                c = spread_weight(d[r], load4(groups.taxel, at + 32 * r)[3], level)
+                c = spread_weight(d[r], load4(groups.taxel, at + wp.static(width) * r)[3], level)
             whole += c
             d[r] = c
-        return d * (force / lanes_sum(whole))
+        return d * (force / lanes_sum(whole, wp.static(width)))
 
     return SimpleNamespace(Reals=Reals, distances=distances, nearer=nearer, least_of=least_of, shares=shares)
 
 
-def _lanes(
-    solver: bool, raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, objects: int
-) -> Callable:
-    """A warp looks at `ITEMS` pairs of a world and a group, and measures, one after another, those that are pressed."""
-    do = _measures(rounds)
-    Reals, distances, shares = do.Reals, do.distances, do.shares
-    width = LANES // ITEMS
+def _of_object(
+    solver: bool, raw: bool, kind: int, pad_count: int, taxels: int, rounds: int, most: int, units: int,
+    unit_rounds: int, objects: int,
+) -> Callable:  # fmt: skip
+    """Return a function of `WIDTH` lanes that measures a unit in a world."""
+    split = LANES // WIDTH
+    all_rounds = unit_rounds * split
+    do = _measures(all_rounds, WIDTH)
+    Reals, distances, least_of = do.Reals, do.distances, do.least_of
+    slots = -(-most // WIDTH)
+    Totals = wp.types.matrix(shape=(slots, 4), dtype=float)
 
     @wp.func
     def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
-        """Whether object o may press group g."""
+        """Return whether object o may press group g."""
         shape = here.shape_id[w, o]
         near = shape >= 0
         if near:
@@ -534,123 +559,115 @@ def _lanes(
                 near = may_touch(shapes, shape, here.shape_size[w, o], a * xyz(bound) + b, bound[3])
         return near
 
-    def lanes(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt):
-        # Every branch around an exchange of lanes is the same for the whole warp.
-        i = wp.tid()
-        lane = i & 31
-        first = wp.static(ITEMS) * (i >> 5)
-        item = first + lane // wp.static(width)
-        w = item // wp.static(group_count)
-        g = item - w * wp.static(group_count)
-        inside = w < here.shape_id.shape[0]
-        busy = bool(False)
-        if inside:
-            for o in range(wp.static(objects)):
-                if presses(here, groups, shapes, w, g, o):
-                    busy = True
-            if not busy:
-                for j in range(groups.first[g] + lane % wp.static(width), groups.first[g + 1], wp.static(width)):
-                    f = groups.pads[j]
-                    pad = w * wp.static(pad_count) + f
-                    body = groups.body[g]
-                    out.force[pad] = 0.0
-                    out.centre[pad] = here.xmat[w, body] * pads.centre[f] + here.xpos[w, body]
-        if wp.static(raw):
-            left = lane_ballot(inside and not busy and lane % wp.static(width) == 0)
-            while left != 0:
-                one = first + lowest_bit(left) // wp.static(width)
-                left = left & (left - 1)
-                w = one // wp.static(group_count)
-                g = one - w * wp.static(group_count)
-                for j in range(groups.first[g], groups.first[g + 1]):
-                    for t in range(lane, wp.static(taxels), 32):
-                        out.felt[(w * wp.static(pad_count) + groups.pads[j]) * wp.static(taxels) + t] = 0.0
-        left = lane_ballot(busy and lane % wp.static(width) == 0)
-        while left != 0:
-            one = first + lowest_bit(left) // wp.static(width)
-            left = left & (left - 1)
-            w = one // wp.static(group_count)
-            g = one - w * wp.static(group_count)
-            body = groups.body[g]
-            rot = here.xmat[w, body]
-            pos = here.xpos[w, body]
-            n = groups.rounds[g]
-            at = g * wp.static(rounds * LANES) + lane
-            mine = Reals()  # N, on this lane's taxels
-            for o in range(wp.static(objects)):
-                near = bool(True)
-                if wp.static(objects > 1):
-                    near = presses(here, groups, shapes, w, g, o)
-                if near:
-                    shape = here.shape_id[w, o]
-                    turn = wp.transpose(here.xmat[w, here.object_body[o]])
-                    a = turn * rot
-                    b = turn * (pos - here.xpos[w, here.object_body[o]])
-                    d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
-                    if wp.static(solver):
-                        pressed = here.pair_normal[w, here.pair_column[g, o]]
-                        mine += shares(d, groups, at, law.reach, pressed)
-                    else:
-                        for r in range(wp.static(rounds)):
-                            if d[r] < 0.0:
-                                stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
-                                area = load4(groups.taxel, at + 32 * r)[3]
-                                mine[r] += taxel_force(wp.static(kind), law, stiff, -d[r], area, law.threshold[w])
-            s = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force: of a pad
-            for r in range(wp.static(rounds)):
-                if r < n:
-                    this = groups.round[g, r]
-                    pad = w * wp.static(pad_count) + this[0]
-                    c = mine[r]
-                    if c > 0.0:
-                        p = load4(groups.taxel, at + 32 * r)
-                        s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
-                    t = this[1] + lane
-                    if wp.static(raw):
-                        if t < wp.static(taxels):
-                            out.felt[pad * wp.static(taxels) + t] = c
-                    if this[2] != 0:
-                        if lane_ballot(s[3] > 0.0) != 0:
-                            s = lanes_sum4(s, lane)
-                        if lane == 0:
-                            out.force[pad] = s[3]
-                            out.centre[pad] = rot * centre_of(pads, this[0], s) + pos
-                        s = wp.vec4(0.0, 0.0, 0.0, 0.0)
-                        if wp.static(raw):
-                            for u in range(t + 32, wp.static(taxels), 32):
-                                out.felt[pad * wp.static(taxels) + u] = 0.0
-
-    return lanes
-
-
-def _lanes_of_hand(
-    raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, feel_others: bool, links: int,
-    selves: bool,
-) -> Callable:  # fmt: skip
-    """The same for what pads feel of the hand itself, which few do at a time."""
-    do = _measures(rounds)
-    Reals, nearer, least_of, shares = do.Reals, do.nearer, do.least_of, do.shares
-    blocks = max(-(-links // LANES), 1)
-    Gaps = wp.types.vector(length=blocks, dtype=float)
-    width = LANES // HAND_ITEMS
-
     @wp.func
-    def near_link(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j: int):
-        near = may_meet(g, j, here, groups, w)
-        if near:
-            a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
-            b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
-            near = not tips_apart(groups, tips, g, j, a, b)
-        return near
+    def of_object(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, out: FlatFelt, i: int):
+        # Every branch around an exchange of lanes is the same for the whole warp.
+        lane = i & wp.static(WIDTH - 1)
+        item = i // wp.static(WIDTH)
+        w = item // wp.static(units)
+        unit = groups.unit[item - w * wp.static(units)]
+        g = unit.group
+        inside = w < here.shape_id.shape[0]
+        w = wp.where(inside, w, 0)
+        body = groups.body[g]
+        rot = here.xmat[w, body]
+        pos = here.xpos[w, body]
+        at = (g * wp.static(rounds) + unit.round) * wp.static(LANES) + lane
+        mine = Reals()  # N, on this lane's taxels
+        totals = Totals()  # moment of force, force: of the pads that this lane reports
+        for o in range(wp.static(objects)):
+            near = inside and presses(here, groups, shapes, w, g, o)
+            if lane_ballot(near) != 0:
+                shape = wp.max(here.shape_id[w, o], 0)
+                turn = wp.transpose(here.xmat[w, here.object_body[o]])
+                a = turn * rot
+                b = turn * (pos - here.xpos[w, here.object_body[o]])
+                n = wp.where(near, unit.rounds * wp.static(split), 0)
+                d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
+                level = float(0.0)
+                if wp.static(solver):
+                    least = lanes_min(least_of(d), wp.static(WIDTH))
+                    other = lane_xor(least, wp.static(WIDTH % LANES))
+                    if unit.half != 0:
+                        least = wp.min(least, other)
+                    level = spread_level(least, law.reach)
+                whole = float(0.0)
+                found = Totals()
+                s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                k = int(0)
+                for r in range(wp.static(all_rounds)):
+                    c = float(0.0)
+                    if d[r] < level and (wp.static(most == 1) or r < n):  # behind them stands the other half
+                        p = load4(groups.taxel, at + wp.static(WIDTH) * r)
+                        if wp.static(solver):
+                            c = spread_weight(d[r], p[3], level)
+                        else:
+                            stiff = law.scale[w] * law.stiffness[groups.round[g, unit.round + r // wp.static(split)][0]]
+                            c = taxel_force(wp.static(kind), law, stiff, -d[r], p[3], law.threshold[w])
+                        s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
+                    whole += c
+                    d[r] = c
+                    if (r + 1) % wp.static(split) == 0:
+                        last = r + 1 == wp.static(all_rounds)
+                        if not wp.static(most == 1):
+                            last = r < n and groups.round[g, unit.round + r // wp.static(split)][2] != 0
+                        if lane_ballot(last and s[3] > 0.0) != 0:
+                            total = lanes_sum4(s, i & 31, wp.static(WIDTH))
+                            for q in range(wp.static(slots)):
+                                if last and k == wp.static(WIDTH) * q + lane:
+                                    found[q] = total
+                        if last:
+                            k += 1
+                            s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                scale = float(1.0)
+                if wp.static(solver):
+                    scale = 0.0
+                    whole = lanes_sum(whole, wp.static(WIDTH))
+                    other = lane_xor(whole, wp.static(WIDTH % LANES))
+                    if unit.half != 0:
+                        whole += other
+                    if near:
+                        scale = here.pair_normal[w, here.pair_column[g, o]] / whole
+                totals += scale * found
+                if wp.static(raw):
+                    mine += scale * d
+        if inside:
+            for q in range(wp.static(slots)):
+                k = wp.static(WIDTH) * q + lane
+                if k < unit.pads:
+                    f = groups.pads[unit.pad + k]
+                    pad = w * wp.static(pad_count) + f
+                    out.force[pad] = totals[q, 3]
+                    out.centre[pad] = rot * centre_of(pads, f, totals[q]) + pos
+            if wp.static(raw):
+                for r in range(wp.static(all_rounds)):
+                    if r < unit.rounds * wp.static(split):
+                        this = groups.round[g, unit.round + r // wp.static(split)]
+                        t = this[1] + wp.static(WIDTH) * (r % wp.static(split)) + lane
+                        if t < wp.static(taxels):
+                            out.readings[(w * wp.static(pad_count) + this[0]) * wp.static(taxels) + t] = mine[r]
+
+    return of_object
+
+
+def _of_hand(
+    raw: bool, kind: int, pad_count: int, group_count: int, taxels: int, rounds: int, most: int, feel_others: bool,
+    links: int, selves: bool,
+) -> Callable:  # fmt: skip
+    """Return a function of a warp for what pads touch of the hand itself, which few do at a time."""
+    do = _measures(rounds, LANES)
+    Reals, nearer, least_of, shares = do.Reals, do.nearer, do.least_of, do.shares
+    blocks, slots, asked = -(-links // LANES), -(-most // HAND_WIDTH), 1 if selves else links
+    Gaps, Sums = wp.types.vector(length=blocks, dtype=float), wp.types.vector(length=slots, dtype=float)
 
     @wp.func
     def to_links(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, at: int, lane: int, reach: float):
         """Return distances to the nearest of the hand's other links, exact where they are under the level. A lane asks
         how near its link may be; then the warp measures them, nearest first, until the rest cannot matter."""
-        body = groups.body[g]
-        gap = Gaps()
+        gap = Gaps(FAR)
         for k in range(wp.static(blocks)):
-            gap[k] = link_gap(here, groups, tips, w, g, 32 * k + lane)
+            if 32 * k + lane < wp.static(links):
+                gap[k] = link_gap(here, groups, tips, w, g, 32 * k + lane)
         d = Reals(FAR)
         level = float(FAR)
         more = bool(True)
@@ -658,7 +675,7 @@ def _lanes_of_hand(
             least = gap[0]
             for k in range(1, wp.static(blocks)):
                 least = wp.min(least, gap[k])
-            least = lanes_min(least)
+            least = lanes_min(least, LANES)
             more = least < level
             if more:
                 j = int(0)
@@ -669,77 +686,82 @@ def _lanes_of_hand(
                 for k in range(wp.static(blocks)):
                     if j == 32 * k + lane:
                         gap[k] = FAR
-                a = turn_in(here.xmat, w, body, here.link_body[j])
-                b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
+                a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
+                b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
                 d = nearer(d, tips, j, a, b, groups, groups.rounds[g], at, level)
-                level = spread_level(least_of(d), reach)
+                level = spread_level(lanes_min(least_of(d), LANES), reach)
         return d
 
-    def lanes_of_hand(
-        here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, tips: Shapes, out: FlatFelt
-    ):
-        i = wp.tid()
+    @wp.func
+    def of_hand(here: Surroundings, groups: Groups, law: Law, tips: Shapes, out: FlatFelt, i: int, warps: int):
         lane = i & 31
-        first = wp.static(HAND_ITEMS) * (i >> 5)
-        item = first + lane // wp.static(width)
+        # Pairs of a world and a group that are far from each other: those of one world are busy at the same time.
+        item = (i >> 5) + lane // wp.static(HAND_WIDTH) * warps
         w = item // wp.static(group_count)
         g = item - w * wp.static(group_count)
-        busy = bool(False)
-        if w < here.shape_id.shape[0]:
-            if wp.static(selves):
-                busy = here.pair_normal[w, here.self_column[g]] > 0.0
-            else:
-                for j in range(lane % wp.static(width), wp.static(links), wp.static(width)):
-                    if not busy:
-                        busy = near_link(here, groups, tips, w, g, j)
-            for j in range(groups.first[g] + lane % wp.static(width), groups.first[g + 1], wp.static(width)):
-                out.force_other[w * wp.static(pad_count) + groups.pads[j]] = 0.0
-        left = lane_ballot(busy)
-        while left != 0:
-            part = lowest_bit(left) // wp.static(width)
-            left = left & ~(wp.static((1 << width) - 1 if width < 32 else -1) << (part * wp.static(width)))
-            w = (first + part) // wp.static(group_count)
-            g = first + part - w * wp.static(group_count)
-            n = groups.rounds[g]
-            at = g * wp.static(rounds * LANES) + lane
-            theirs = Reals()  # N, on this lane's taxels
-            if wp.static(selves):
-                d = to_links(here, groups, tips, w, g, at, lane, law.reach)
-                theirs = shares(d, groups, at, law.reach, here.pair_normal[w, here.self_column[g]])
-            else:
-                # Lane j asks whether link j is near, all at once; then the warp feels the links that are.
-                for block in range(wp.static(blocks)):
-                    near = 32 * block + lane < wp.static(links)
-                    if near:
-                        near = near_link(here, groups, tips, w, g, 32 * block + lane)
-                    these = lane_ballot(near)
-                    while these != 0:
-                        j = 32 * block + lowest_bit(these)
-                        these = these & (these - 1)
-                        a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
-                        b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
-                        for r in range(wp.static(rounds)):
-                            p = load4(groups.taxel, at + 32 * r)
-                            q = a * xyz(p) + b
-                            if in_box(q, tips.middle[j], tips.half[j]):
-                                gap = sd_grid(tips, j, 1.0, q)
-                                if gap < 0.0:
-                                    stiff = law.scale[w] * law.stiffness[groups.round[g, r][0]]
-                                    theirs[r] += taxel_force(wp.static(kind), law, stiff, -gap, p[3], law.threshold[w])
-            other = float(0.0)
-            for r in range(wp.static(rounds)):
-                if r < n:
-                    this = groups.round[g, r]
-                    pad = w * wp.static(pad_count) + this[0]
-                    other += theirs[r]
-                    if wp.static(raw and feel_others):
-                        if theirs[r] > 0.0:
-                            t = pad * wp.static(taxels) + this[1] + lane
-                            out.felt[t] = out.felt[t] + theirs[r]
-                    if this[2] != 0:
-                        other = lanes_sum(other)
-                        if lane == 0:
-                            out.force_other[pad] = other
-                        other = 0.0
+        k = lane % wp.static(HAND_WIDTH)
+        inside = w < here.shape_id.shape[0]
+        sums = Sums()  # N, on the pads that this lane reports
+        # A lane asks for a group, or a group and a link; then the warp feels those that are pressed, or near.
+        for first in range(0, wp.static(asked), wp.static(HAND_WIDTH)):
+            busy = inside and first + k < wp.static(asked)
+            if busy:
+                if wp.static(selves):
+                    busy = here.pair_normal[w, here.self_column[g]] > 0.0
+                else:
+                    busy = may_meet(g, first + k, here, groups, w)
+                    if busy:
+                        busy = link_gap(here, groups, tips, w, g, first + k) < 0.0
+            these = lane_ballot(busy)
+            while these != 0:
+                bit = lowest_bit(these)
+                these = these & (these - 1)
+                item = (i >> 5) + bit // wp.static(HAND_WIDTH) * warps
+                w1 = item // wp.static(group_count)
+                g1 = item - w1 * wp.static(group_count)
+                n = groups.rounds[g1]
+                at = g1 * wp.static(rounds * LANES) + lane
+                d = Reals(FAR)  # m, then N, of this lane's taxels
+                if wp.static(selves):
+                    d = to_links(here, groups, tips, w1, g1, at, lane, law.reach)
+                    d = shares(d, groups, at, law.reach, here.pair_normal[w1, here.self_column[g1]])
+                else:
+                    j = first + bit % wp.static(HAND_WIDTH)
+                    a = turn_in(here.xmat, w1, groups.body[g1], here.link_body[j])
+                    b = pose_in(here.xpos, here.xmat, w1, groups.body[g1], here.link_body[j])
+                    d = nearer(d, tips, j, a, b, groups, n, at, 0.0)
+                    if lane_ballot(least_of(d) < 0.0) == 0:
+                        n = 0
+                other = float(0.0)
+                its = lane // wp.static(HAND_WIDTH) == bit // wp.static(HAND_WIDTH)
+                c = int(0)  # pads so far
+                for r in range(wp.static(rounds)):
+                    if r < n:
+                        this = groups.round[g1, r]
+                        force = d[r]
+                        if wp.static(not selves):
+                            force = 0.0
+                            if d[r] < 0.0:
+                                stiff = law.scale[w1] * law.stiffness[this[0]]
+                                area = load4(groups.taxel, at + 32 * r)[3]
+                                force = taxel_force(wp.static(kind), law, stiff, -d[r], area, law.threshold[w1])
+                        other += force
+                        if wp.static(raw and feel_others):
+                            if force > 0.0:
+                                t = (w1 * wp.static(pad_count) + this[0]) * wp.static(taxels) + this[1] + lane
+                                out.readings[t] = out.readings[t] + force
+                        if this[2] != 0:
+                            if lane_ballot(other > 0.0) != 0:
+                                other = lanes_sum(other, LANES)
+                                for q in range(wp.static(slots)):
+                                    if its and c == wp.static(HAND_WIDTH) * q + k:
+                                        sums[q] += other
+                            other = 0.0
+                            c += 1
+        if inside:
+            for q in range(wp.static(slots)):
+                j = groups.first[g] + wp.static(HAND_WIDTH) * q + k
+                if j < groups.first[g + 1]:
+                    out.force_other[w * wp.static(pad_count) + groups.pads[j]] = sums[q]
 
-    return lanes_of_hand
+    return of_hand

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-LANES = 32
+LANES = wp.constant(32)
 
 _EXCHANGE = """
 #if defined(__CUDA_ARCH__)
@@ -75,33 +75,37 @@ def lowest_bit(bits: int) -> int:  # type: ignore[empty-body]
 
 
 @wp.func
-def lanes_min(v: float):
-    """Return the least value of all lanes, in all lanes."""
+def lanes_min(v: float, width: int):
+    """Return the least value of each `width` lanes (8, 16 or 32), in all of them."""
     for k in range(5):
-        v = wp.min(v, lane_xor(v, 1 << k))
+        if (1 << k) < width:
+            v = wp.min(v, lane_xor(v, 1 << k))
     return v
 
 
 @wp.func
-def lanes_sum(v: float):
-    """Return the sum of all lanes, in all lanes."""
+def lanes_sum(v: float, width: int):
+    """Return the sum of each `width` lanes, in all of them."""
     for k in range(5):
-        v += lane_xor(v, 1 << k)
+        if (1 << k) < width:
+            v += lane_xor(v, 1 << k)
     return v
 
 
 @wp.func
-def lanes_sum4(v: wp.vec4, lane: int):
-    """Return the sum of all lanes, in all lanes; 10 shuffles instead of 20.
+def lanes_sum4(v: wp.vec4, lane: int, width: int):
+    """Return the sum of each `width` lanes, in all of them; half the shuffles of four sums.
 
-    Two halvings leave each lane one component, summed over 4 lanes; three exchanges complete it; lane 8 c then holds
-    component c.
+    Two halvings leave each lane one component, summed over 4 lanes; exchanges complete it; every quarter's first lane
+    then holds one component.
     """
-    upper = (lane & 16) != 0
-    a = wp.where(upper, v[2], v[0]) + lane_xor(wp.where(upper, v[0], v[2]), 16)
-    b = wp.where(upper, v[3], v[1]) + lane_xor(wp.where(upper, v[1], v[3]), 16)
-    odd = (lane & 8) != 0
-    c = wp.where(odd, b, a) + lane_xor(wp.where(odd, a, b), 8)
-    for k in range(3):
-        c += lane_xor(c, 1 << k)
-    return wp.vec4(lane_from(c, 0), lane_from(c, 8), lane_from(c, 16), lane_from(c, 24))
+    quarter = width // 4
+    upper = (lane & (2 * quarter)) != 0
+    a = wp.where(upper, v[2], v[0]) + lane_xor(wp.where(upper, v[0], v[2]), 2 * quarter)
+    b = wp.where(upper, v[3], v[1]) + lane_xor(wp.where(upper, v[1], v[3]), 2 * quarter)
+    odd = (lane & quarter) != 0
+    c = lanes_sum(wp.where(odd, b, a) + lane_xor(wp.where(odd, a, b), quarter), quarter)
+    at = lane & (LANES - width)
+    return wp.vec4(
+        lane_from(c, at), lane_from(c, at + quarter), lane_from(c, at + 2 * quarter), lane_from(c, at + 3 * quarter)
+    )

@@ -65,7 +65,7 @@ def rubber_force(elastic: float, state: float, fraction: float):
 
 @wp.func
 def cap(f: wp.vec2, limit: float):
-    """Cap a friction force by Coulomb: the same direction, no longer than the limit."""
+    """Return a friction force no longer than Coulomb's limit, in the same direction."""
     size = wp.length(f)
     if size > limit:
         f = f * (limit / size)

@@ -167,20 +167,18 @@ def bound_radius(s: Shapes, i: int, size: wp.vec3):
 
 
 @wp.func
-def boxes_apart(a: wp.mat33, b: wp.vec3, middle: wp.vec3, half: wp.vec3, other_middle: wp.vec3, other_half: wp.vec3):
-    """Return whether a face of one of two boxes separates them; the first box's frame has rotation a and origin b in
-    the second's. Boxes that only edges separate count as not apart."""
+def boxes_gap(a: wp.mat33, b: wp.vec3, middle: wp.vec3, half: wp.vec3, other_middle: wp.vec3, other_half: wp.vec3):
+    """Return how far [m] a face of one of two boxes separates them, at most; negative where none does. The first box's
+    frame has rotation a and origin b in the second's. No point of one is nearer to the other."""
     d = a * middle + b - other_middle
     e = wp.transpose(a) * d
-    clear = bool(False)
+    gap = float(-1.0e9)
     for k in range(3):
         reach = wp.abs(a[k, 0]) * half[0] + wp.abs(a[k, 1]) * half[1] + wp.abs(a[k, 2]) * half[2]
-        if wp.abs(d[k]) > other_half[k] + reach:
-            clear = True
+        gap = wp.max(gap, wp.abs(d[k]) - other_half[k] - reach)
         reach = wp.abs(a[0, k]) * other_half[0] + wp.abs(a[1, k]) * other_half[1] + wp.abs(a[2, k]) * other_half[2]
-        if wp.abs(e[k]) > half[k] + reach:
-            clear = True
-    return clear
+        gap = wp.max(gap, wp.abs(e[k]) - half[k] - reach)
+    return gap
 
 
 @wp.func

@@ -15,14 +15,26 @@ from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import CHUNK, Felt, FlatFelt, Groups, Law, Pads, Surroundings, touch_kernels
+from dexsim.tactile.kernel import (
+    CHUNK,
+    WIDTH,
+    Felt,
+    FlatFelt,
+    Groups,
+    Law,
+    Pads,
+    Surroundings,
+    Unit,
+    spans,
+    touch_kernel,
+)
 from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, Measured, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
 from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 BLOCK_DIM = 128
-"""Threads a block of the touch kernel on CUDA: 4 warps, each a group of pads of its own."""
+"""Threads a block of the touch kernels on CUDA: 4 warps."""
 REGISTERS = 80
 """Most registers of its threads: 3 to 10 % faster on an H200 than as many as the compiler likes."""
 
@@ -128,6 +140,8 @@ class Tactile:
             raised = layout.lifted(tips) if cfg.lift and tips is not None else layout
             self._pads = _pads(engine, layout, raised)
             self._groups = _groups(engine, layout, raised, members, rounds)
+            units = _units(layout, members)
+            self._groups.unit = wp.array(units, dtype=Unit)
             self._law = _law(cfg, layout, needed=not solver or (others and selves is None))
             self.tips = ShapeSet(_link_shapes(near), self.device)
             a = SimpleNamespace(
@@ -142,7 +156,7 @@ class Tactile:
                 force=wp.zeros((n, f), dtype=float),
                 centre=wp.zeros((n, f), dtype=wp.vec3),
                 force_other=wp.zeros((n, f), dtype=float),
-                felt=wp.zeros((n, f, t) if store else (1, 1, 1), dtype=float),
+                readings=wp.zeros((n, f, t) if store else (1, 1, 1), dtype=float),
                 distance=wp.zeros((n, f, t) if solver and not self.lanes else (1, 1, 1), dtype=float),
             )
         self._a = a
@@ -152,7 +166,7 @@ class Tactile:
         self.force_clean, self.centre_clean = wp.to_torch(a.force), wp.to_torch(a.centre)
         self.force_other = wp.to_torch(a.force_other)
         self.force, self.centre = self.force_clean, self.centre_clean
-        self.raw_clean = self.raw = wp.to_torch(a.felt) if store else None
+        self.raw_clean = self.raw = wp.to_torch(a.readings) if store else None
         self.raw3 = None
         self._m: SimpleNamespace | None = None
         self.by_pad: ByPad | None = None
@@ -162,7 +176,9 @@ class Tactile:
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
         options |= {"links": len(near), "selves": selves is not None, "groups": len(members), "rounds": rounds}
-        self._kernels = touch_kernels(self.lanes, solver, store, others, **options, registers=registers)
+        options |= {"most": max(map(len, members)), "units": len(units), "unit_rounds": max(x.rounds for x in units)}
+        self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
+        self._hand, self._spans = spans(n, len(members), len(units), others, store and cfg.feel_others)
         kind: Any = FlatFelt if self.lanes else Felt
         self._out = kind()
         for name in kind.vars:
@@ -197,7 +213,7 @@ class Tactile:
         return self._m
 
     def _measure(self, seed: int) -> None:
-        """Arrays and kernels of the imperfect sensor."""
+        """Make the arrays and kernels of the imperfect sensor."""
         cfg, (n, f, t) = self.cfg, (self.engine.n, self.layout.pads, self.layout.taxels)
         pad = self.by_pad
         longest = max(cfg.range("delay")[1], 0.0 if pad is None else pad.longest)
@@ -297,23 +313,22 @@ class Tactile:
             )
 
     def launch(self) -> None:
-        """Feel: only launches, so it can be recorded in a graph."""
+        """Measure what all pads feel: only launches, so it can be recorded in a graph."""
         a, n = self._a, self.engine.n
         args = [self._around, self._pads, self._groups, self._law, self.shapes.wp, self.tips.wp, self._out]
-        g = self._groups.body.shape[0]
-        for kernel, items in self._kernels:
-            if items:
-                dim, block = LANES * -(-n * g // items), self.block_dim
-                wp.launch(kernel, dim=dim, inputs=args, block_dim=block, device=self.device)
-            else:
-                wp.launch(kernel, dim=(n, g), inputs=args, device=self.device)
+        if self.lanes:
+            for begin, count in self._spans:
+                more = [*args, begin, self._hand]
+                wp.launch(self._kernel, dim=count, inputs=more, block_dim=self.block_dim, device=self.device)
+        else:
+            wp.launch(self._kernel, dim=(n, self._groups.body.shape[0]), inputs=args, device=self.device)
         m = self._m
         if m is None:
             return
         xpos, xmat = self.engine.wp.xpos, self.engine.wp.xmat
         wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
         pad = self.by_pad
-        readings = a.felt if pad is None else pad.launch_skin(self, a.felt)
+        readings = a.readings if pad is None else pad.launch_skin(self, a.readings)
         args = [readings, self._around, self._pads, m.effects, m.measured]
         wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
         if pad is not None:
@@ -365,7 +380,7 @@ def _pads(engine: Posed, layout: TaxelLayout, raised: TaxelLayout) -> Pads:
 
 def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: list[list[int]], most: int) -> Groups:
     """Return groups of pads on the device, up to `most` rounds each."""
-    taxel = np.zeros((len(members), LANES * most, 4), dtype=np.float32)
+    taxel = np.zeros((len(members) + 1, LANES * most, 4), dtype=np.float32)
     round_ = np.zeros((len(members), most, 3), dtype=np.int32)
     box, bound, rounds = np.zeros((len(members), 2, 3)), np.zeros((len(members), 4)), []
     for g, pads in enumerate(members):
@@ -390,6 +405,30 @@ def _groups(engine: Posed, layout: TaxelLayout, raised: TaxelLayout, members: li
     out.half = wp.array((0.5 * (box[:, 1] - box[:, 0]) + 1e-6).astype(np.float32), dtype=wp.vec3)
     out.bound = wp.array(bound.astype(np.float32), dtype=wp.vec4)
     return out
+
+
+def _units(layout: TaxelLayout, members: list[list[int]]) -> list[Unit]:
+    """Return the units that share a world's lanes: those of a long group of several pads measure half of it each."""
+    out: list[tuple[int, int, int, int, int, int]] = []
+    ends = [(-(-layout.count[m] // LANES)).cumsum() for m in members]
+    halved = [WIDTH < LANES and len(m) > 1 and e[-1] > CHUNK for m, e in zip(members, ends, strict=True)]
+    for g in sorted(range(len(members)), key=lambda g: not halved[g]):  # halves stand side by side
+        pads, first, end = len(members[g]), sum(map(len, members[:g])), int(ends[g][-1])
+        if halved[g]:
+            middle = 1 + int(np.abs(ends[g][:-1] - end / 2).argmin())
+            rounds = int(ends[g][middle - 1])
+            out.append((g, 0, rounds, first, middle, 1))
+            out.append((g, rounds, end - rounds, first + middle, pads - middle, 1))
+        else:
+            out.append((g, 0, end, first, pads, 0))
+    if len(out) % 2 and any(halved):
+        out.append((0, 0, 0, 0, 0, 0))
+    units = []
+    for values in out:
+        units.append(Unit())
+        for name, x in zip(Unit.vars, values, strict=True):  # type: ignore[attr-defined]  # wp.struct adds it
+            setattr(units[-1], name, x)
+    return units
 
 
 def _law(cfg: TactileConfig, layout: TaxelLayout, needed: bool) -> Law:
