@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from math import gcd
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -447,10 +446,16 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
     return serial
 
 
-def _measures(rounds: int, width: int) -> SimpleNamespace:
-    """Return functions of `width` lanes that measure a group of up to so many rounds, its taxels in their registers."""
-    Reals = wp.types.vector(length=rounds, dtype=float)
-    chunk = rounds if rounds < CHUNK else gcd(CHUNK, rounds)
+def _of_object(
+    solver: bool, raw: bool, kind: int, pad_count: int, taxels: int, rounds: int, most: int, units: int,
+    unit_rounds: int, objects: int,
+) -> Callable:  # fmt: skip
+    """Return a function of `WIDTH` lanes that measures a unit in a world."""
+    split = LANES // WIDTH
+    all_rounds = unit_rounds * split
+    slots, chunk = -(-most // WIDTH), all_rounds if all_rounds < CHUNK else gcd(CHUNK, all_rounds)
+    Reals = wp.types.vector(length=all_rounds, dtype=float)
+    Totals = wp.types.matrix(shape=(slots, 4), dtype=float)
 
     @wp.func
     def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int):
@@ -462,11 +467,11 @@ def _measures(rounds: int, width: int) -> SimpleNamespace:
             dims = s.dims[i]
             origin = s.origin[i]
             h = s.spacing[i]
-            for c in range(wp.static(rounds // chunk)):
+            for c in range(wp.static(all_rounds // chunk)):
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
+                        q = a * xyz(load4(groups.taxel, at + wp.static(WIDTH) * r)) + b
                         d[r] = sd_cells(s.data, offset, dims, origin, h, size[0], q)
         else:
             kind = s.kind[i]
@@ -474,11 +479,11 @@ def _measures(rounds: int, width: int) -> SimpleNamespace:
             wide = wp.where(kind == wp.static(CYLINDER), size[0], 0.0)
             round = wp.where(box or kind == wp.static(CYLINDER), 0.0, size[0])
             tall = wp.where(box, size[2], wp.where(kind == wp.static(SPHERE), 0.0, size[1]))
-            for c in range(wp.static(rounds // chunk)):
+            for c in range(wp.static(all_rounds // chunk)):
                 if wp.static(chunk) * c < n:
                     for k in range(wp.static(chunk)):
                         r = wp.static(chunk) * c + k
-                        q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
+                        q = a * xyz(load4(groups.taxel, at + wp.static(WIDTH) * r)) + b
                         x = wp.where(box, wp.abs(q[0]) - size[0], wp.sqrt(q[0] * q[0] + q[1] * q[1]) - wide)
                         y = wp.where(box, wp.abs(q[1]) - size[1], -FAR)
                         z = wp.abs(q[2]) - tall
@@ -486,62 +491,6 @@ def _measures(rounds: int, width: int) -> SimpleNamespace:
                         out = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0))
                         d[r] = wp.length(out) + wp.min(most, 0.0) - round
         return d
-
-    @wp.func
-    def nearer(d: Any, s: Shapes, i: int, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float):
-        """Return the lesser of the distances d and those to a grid, of taxels less than `level` [m] from its box."""
-        offset = s.offset[i]
-        dims = s.dims[i]
-        low = s.origin[i]
-        h = s.spacing[i]
-        high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
-        for c in range(wp.static(rounds // chunk)):
-            if wp.static(chunk) * c < n:
-                for k in range(wp.static(chunk)):
-                    r = wp.static(chunk) * c + k
-                    q = a * xyz(load4(groups.taxel, at + wp.static(width) * r)) + b
-                    # those that are far read one cell, all the same, without a branch that others would wait at
-                    off = q - wp.max(low, wp.min(q, high))
-                    near = wp.dot(off, off) <= level * level
-                    e = sd_cells(s.data, offset, dims, low, h, 1.0, wp.where(near, q, low))
-                    d[r] = wp.min(d[r], wp.where(near, e, FAR))
-        return d
-
-    @wp.func
-    def least_of(d: Any):
-        """Return the least of this lane's distances."""
-        least = d[0]
-        for r in range(1, wp.static(rounds)):
-            least = wp.min(least, d[r])
-        return least
-
-    @wp.func
-    def shares(d: Any, groups: Groups, at: int, reach: float, force: float):
-        """Return what each taxel has of a force that is spread over its group, by its distance."""
-        level = spread_level(lanes_min(least_of(d), wp.static(width)), reach)
-        whole = float(0.0)
-        for r in range(wp.static(rounds)):
-            c = float(0.0)
-            if d[r] < level:
-                c = spread_weight(d[r], load4(groups.taxel, at + wp.static(width) * r)[3], level)
-            whole += c
-            d[r] = c
-        return d * (force / lanes_sum(whole, wp.static(width)))
-
-    return SimpleNamespace(Reals=Reals, distances=distances, nearer=nearer, least_of=least_of, shares=shares)
-
-
-def _of_object(
-    solver: bool, raw: bool, kind: int, pad_count: int, taxels: int, rounds: int, most: int, units: int,
-    unit_rounds: int, objects: int,
-) -> Callable:  # fmt: skip
-    """Return a function of `WIDTH` lanes that measures a unit in a world."""
-    split = LANES // WIDTH
-    all_rounds = unit_rounds * split
-    do = _measures(all_rounds, WIDTH)
-    Reals, distances, least_of = do.Reals, do.distances, do.least_of
-    slots = -(-most // WIDTH)
-    Totals = wp.types.matrix(shape=(slots, 4), dtype=float)
 
     @wp.func
     def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
@@ -586,7 +535,7 @@ def _of_object(
                 d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
                 level = float(0.0)
                 if wp.static(solver):
-                    least = lanes_min(least_of(d), wp.static(WIDTH))
+                    least = lanes_min(wp.min(d), wp.static(WIDTH))
                     other = lane_xor(least, wp.static(WIDTH % LANES))
                     if unit.half != 0:
                         least = wp.min(least, other)
@@ -655,10 +604,42 @@ def _of_hand(
     links: int, selves: bool,
 ) -> Callable:  # fmt: skip
     """Return a function of a warp for what pads touch of the hand itself, which few do at a time."""
-    do = _measures(rounds, LANES)
-    Reals, nearer, least_of, shares = do.Reals, do.nearer, do.least_of, do.shares
     blocks, slots, asked = -(-links // LANES), -(-most // HAND_WIDTH), 1 if selves else links
-    Gaps, Sums = wp.types.vector(length=blocks, dtype=float), wp.types.vector(length=slots, dtype=float)
+    chunk = min(CHUNK, rounds)
+    Reals, Gaps, Sums = (wp.types.vector(length=n, dtype=float) for n in (rounds, max(blocks, 1), slots))
+
+    @wp.func
+    def nearer(d: Any, s: Shapes, i: int, a: wp.mat33, b: wp.vec3, groups: Groups, n: int, at: int, level: float):
+        """Return the lesser of the distances d and those to a grid, of taxels less than `level` [m] from its box."""
+        offset = s.offset[i]
+        dims = s.dims[i]
+        low = s.origin[i]
+        h = s.spacing[i]
+        high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
+        for c in range(wp.static(rounds // chunk)):
+            if wp.static(chunk) * c < n:
+                for k in range(wp.static(chunk)):
+                    r = wp.static(chunk) * c + k
+                    q = a * xyz(load4(groups.taxel, at + LANES * r)) + b
+                    # those that are far read one cell, all the same, without a branch that others would wait at
+                    off = q - wp.max(low, wp.min(q, high))
+                    near = wp.dot(off, off) <= level * level
+                    e = sd_cells(s.data, offset, dims, low, h, 1.0, wp.where(near, q, low))
+                    d[r] = wp.min(d[r], wp.where(near, e, FAR))
+        return d
+
+    @wp.func
+    def shares(d: Any, groups: Groups, at: int, reach: float, force: float):
+        """Return what each taxel has of a force that is spread over its group, by its distance."""
+        level = spread_level(lanes_min(wp.min(d), LANES), reach)
+        whole = float(0.0)
+        for r in range(wp.static(rounds)):
+            c = float(0.0)
+            if d[r] < level:
+                c = spread_weight(d[r], load4(groups.taxel, at + LANES * r)[3], level)
+            whole += c
+            d[r] = c
+        return d * (force / lanes_sum(whole, LANES))
 
     @wp.func
     def to_links(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, at: int, lane: int, reach: float):
@@ -689,7 +670,7 @@ def _of_hand(
                 a = turn_in(here.xmat, w, groups.body[g], here.link_body[j])
                 b = pose_in(here.xpos, here.xmat, w, groups.body[g], here.link_body[j])
                 d = nearer(d, tips, j, a, b, groups, groups.rounds[g], at, level)
-                level = spread_level(lanes_min(least_of(d), LANES), reach)
+                level = spread_level(lanes_min(wp.min(d), LANES), reach)
         return d
 
     @wp.func
@@ -730,7 +711,7 @@ def _of_hand(
                     a = turn_in(here.xmat, w1, groups.body[g1], here.link_body[j])
                     b = pose_in(here.xpos, here.xmat, w1, groups.body[g1], here.link_body[j])
                     d = nearer(d, tips, j, a, b, groups, n, at, 0.0)
-                    if lane_ballot(least_of(d) < 0.0) == 0:
+                    if lane_ballot(wp.min(d) < 0.0) == 0:
                         n = 0
                 other = float(0.0)
                 its = lane // wp.static(HAND_WIDTH) == bit // wp.static(HAND_WIDTH)
