@@ -186,6 +186,24 @@ def spread_weight(d: float, area: float, level: float):
     return area * depth * depth
 
 
+@wp.func_native("return x.data[i];")
+def mat_at(x: wp.array2d(dtype=wp.mat33), i: int) -> wp.mat33:
+    """Return element i of a contiguous array: half the instructions of an index a dimension."""
+    ...
+
+
+@wp.func_native("return x.data[i];")
+def vec_at(x: wp.array2d(dtype=wp.vec3), i: int) -> wp.vec3: ...
+
+
+@wp.func_native("return x.data[i];")
+def float_at(x: wp.array2d(dtype=float), i: int) -> float: ...
+
+
+@wp.func_native("return x.data[i];")
+def int_at(x: wp.array2d(dtype=int), i: int) -> int: ...
+
+
 @wp.func
 def pose_in(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
     """Return the position [m] of a body's origin in another body's frame."""
@@ -493,13 +511,19 @@ def _of_object(
         return d
 
     @wp.func
+    def force_on(here: Surroundings, w: int, g: int, o: int):
+        """Return the force [N] of object o on group g."""
+        column = int_at(here.pair_column, g * wp.static(objects) + o)
+        return float_at(here.pair_normal, w * here.pair_normal.shape[1] + column)
+
+    @wp.func
     def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
         """Return whether object o may press group g."""
-        shape = here.shape_id[w, o]
+        shape = int_at(here.shape_id, w * wp.static(objects) + o)
         near = shape >= 0
         if near:
             if wp.static(solver):
-                near = here.pair_normal[w, here.pair_column[g, o]] > 0.0
+                near = force_on(here, w, g, o) > 0.0
             else:
                 body = groups.body[g]
                 bound = groups.bound[g]
@@ -519,20 +543,22 @@ def _of_object(
         inside = w < here.shape_id.shape[0]
         w = wp.where(inside, w, 0)
         body = groups.body[g]
-        rot = here.xmat[w, body]
-        pos = here.xpos[w, body]
+        bodies = here.xpos.shape[1]
+        rot = mat_at(here.xmat, w * bodies + body)
+        pos = vec_at(here.xpos, w * bodies + body)
         at = (g * wp.static(rounds) + unit.round) * wp.static(LANES) + lane
         mine = Reals()  # N, on this lane's taxels
         totals = Totals()  # moment of force, force: of the pads that this lane reports
         for o in range(wp.static(objects)):
             near = inside and presses(here, groups, shapes, w, g, o)
             if lane_ballot(near) != 0:
-                shape = wp.max(here.shape_id[w, o], 0)
-                turn = wp.transpose(here.xmat[w, here.object_body[o]])
+                shape = wp.max(int_at(here.shape_id, w * wp.static(objects) + o), 0)
+                place = w * bodies + here.object_body[o]
+                turn = wp.transpose(mat_at(here.xmat, place))
                 a = turn * rot
-                b = turn * (pos - here.xpos[w, here.object_body[o]])
+                b = turn * (pos - vec_at(here.xpos, place))
                 n = wp.where(near, unit.rounds * wp.static(split), 0)
-                d = distances(shapes, shape, here.shape_size[w, o], a, b, groups, n, at)
+                d = distances(shapes, shape, vec_at(here.shape_size, w * wp.static(objects) + o), a, b, groups, n, at)
                 level = float(0.0)
                 if wp.static(solver):
                     least = lanes_min(wp.min(d), wp.static(WIDTH))
@@ -576,7 +602,7 @@ def _of_object(
                     if unit.half != 0:
                         whole += other
                     if near:
-                        scale = here.pair_normal[w, here.pair_column[g, o]] / whole
+                        scale = force_on(here, w, g, o) / whole
                 totals += scale * found
                 if wp.static(raw):
                     mine += scale * d
@@ -592,9 +618,13 @@ def _of_object(
                 for r in range(wp.static(all_rounds)):
                     if r < unit.rounds * wp.static(split):
                         this = groups.round[g, unit.round + r // wp.static(split)]
+                        at = (w * wp.static(pad_count) + this[0]) * wp.static(taxels)
                         t = this[1] + wp.static(WIDTH) * (r % wp.static(split)) + lane
                         if t < wp.static(taxels):
-                            out.readings[(w * wp.static(pad_count) + this[0]) * wp.static(taxels) + t] = mine[r]
+                            out.readings[at + t] = mine[r]
+                        if this[2] != 0 and (r + 1) % wp.static(split) == 0:
+                            for u in range(t + wp.static(WIDTH), wp.static(taxels), wp.static(WIDTH)):
+                                out.readings[at + u] = 0.0
 
     return of_object
 

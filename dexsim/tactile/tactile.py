@@ -35,8 +35,8 @@ from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 BLOCK_DIM = 128
 """Threads a block of the touch kernels on CUDA: 4 warps."""
-REGISTERS = 80
-"""Most registers of its threads: 3 to 10 % faster on an H200 than as many as the compiler likes."""
+REGISTERS = 64
+"""Most registers of its threads: 1 to 2 % faster on an H200 than 80, so than as many as the compiler likes."""
 
 
 class Posed(Protocol):
@@ -190,6 +190,7 @@ class Tactile:
         here.pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
         for name in ("object_body", "shape_id", "shape_size", "pair_column", "link_body", "tip_column", "self_column"):
             setattr(here, name, getattr(a, name))
+        assert all(x.is_contiguous for x in (here.xpos, here.xmat, here.pair_normal))  # kernels count on it
         if measured:
             if cfg.shear and o != 1:
                 raise UserError(f"tactile.shear=true: works with one object, {o} were given")
