@@ -634,7 +634,7 @@ def _of_hand(
     links: int, selves: bool,
 ) -> Callable:  # fmt: skip
     """Return a function of a warp for what pads touch of the hand itself, which few do at a time."""
-    blocks, slots, asked = -(-links // LANES), -(-most // HAND_WIDTH), 1 if selves else links
+    blocks, slots, tested = -(-links // LANES), -(-most // HAND_WIDTH), 1 if selves else links
     chunk = min(CHUNK, rounds)
     Reals, Gaps, Sums = (wp.types.vector(length=n, dtype=float) for n in (rounds, max(blocks, 1), slots))
 
@@ -714,8 +714,8 @@ def _of_hand(
         inside = w < here.shape_id.shape[0]
         sums = Sums()  # N, on the pads that this lane reports
         # A lane asks for a group, or a group and a link; then the warp feels those that are pressed, or near.
-        for first in range(0, wp.static(asked), wp.static(HAND_WIDTH)):
-            busy = inside and first + k < wp.static(asked)
+        for first in range(0, wp.static(tested), wp.static(HAND_WIDTH)):
+            busy = inside and first + k < wp.static(tested)
             if busy:
                 if wp.static(selves):
                     busy = here.pair_normal[w, here.self_column[g]] > 0.0
