@@ -23,7 +23,7 @@ from dexsim.gap.read import Run, channels, inputs
 from dexsim.hand import load_hand
 from dexsim.import_hand import source
 from dexsim.paths import CONFIGS
-from dexsim.recording import metadata, read, write
+from dexsim.recording import attached, metadata, read, write
 from dexsim.recording.mechanism import Mechanism, mechanism
 from dexsim.recording.readers import expanded
 from dexsim.recording.schema import COMMANDS, STATES, Recording
@@ -131,9 +131,7 @@ def beside(path: Path) -> str:
 
 
 def config(path: Path) -> str:
-    from dexsim.recording.attached import fault
-
-    assert "\n" not in fault(path.read_bytes().decode("utf-8", "replace"), "case config")
+    attached.config(path.read_bytes().decode("utf-8", "replace"), "case")
     return ""
 
 
