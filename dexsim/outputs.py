@@ -70,10 +70,11 @@ def ours(folder: Path, name: str) -> bool:
 
 
 @contextmanager
-def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
+def staged(folder: Path, setting: str = "out=", instead: Iterable[str] = ()) -> Iterator[Path]:
     """Yield a folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and
-    noted as ours. Where the block raises, `folder` stays as it was. Raises UserError where a file would go over one
-    that is not ours, or the disk is full."""
+    noted as ours. Of the names `instead`, what an earlier run wrote and this one did not is removed: it would be taken
+    for a result of this one. Where the block raises, `folder` stays as it was. Raises UserError where a file would go
+    over one that is not ours, or the disk is full."""
     make(folder, setting)
     recover(folder)
     stage = _stage(folder)
@@ -86,7 +87,10 @@ def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
         sums = {p.relative_to(stage).as_posix(): _sum(p) for p in made}
         _write_note(folder, _known(folder), {"stage": stage.name, "files": sums})
         _move(folder, stage, sums)
-        _write_note(folder, _known(folder) | sums)
+        gone = [name for name in instead if name not in sums and ours(folder, name)]
+        for name in gone:
+            (folder / name).unlink()
+        _write_note(folder, {name: sum for name, sum in (_known(folder) | sums).items() if name not in gone})
     except OSError as error:
         raise UserError(
             f"cannot write into {folder}: {error.strerror or error}; choose another place with {setting}"

@@ -70,6 +70,16 @@ def test_links_lead_nowhere(tmp_path):
     assert (other / "a").read_text() == "mine"
 
 
+def test_what_this_diagnosis_does_not_write_no_earlier_one_leaves(tmp_path):
+    with outputs.staged(tmp_path) as stage:
+        for name in ("tactile.yaml", "model.xml", "other"):
+            (stage / name).write_text("of an earlier one")
+    (tmp_path / "model.xml").write_text("changed by hand")
+    save(result(), tmp_path)
+    assert not (tmp_path / "tactile.yaml").exists() and "tactile.yaml" not in (tmp_path / outputs.WRITTEN).read_text()
+    assert (tmp_path / "model.xml").read_text() == "changed by hand" and (tmp_path / "other").exists()
+
+
 def test_what_fails_half_way_leaves_what_was(tmp_path):
     save(result(), tmp_path)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}

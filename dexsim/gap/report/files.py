@@ -31,14 +31,17 @@ from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
 from dexsim.gap.touch.diagnosis import handed, save_tactile
 
+MAYBE = ("servo.yaml", "tactile.yaml", "servo_standin.yaml", "model.xml", "evidence.json")
+"""Files of a diagnosis that are written where there is something in them."""
+
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
     """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and
-    tactile.yaml, all of them or none; returns what was written. Raises UserError where one would go over a file that is
-    not ours."""
+    tactile.yaml, all of them or none; returns what was written. Of MAYBE, what only an earlier diagnosis wrote there
+    goes. Raises UserError where one would go over a file that is not ours."""
     d.notes = grouped(d.notes)
     names = []
-    with outputs.staged(out) as stage:
+    with outputs.staged(out, instead=MAYBE) as stage:
         if d.servo is not None:
             d.servo.save(stage / "servo.yaml")
             names.append("servo.yaml")

@@ -277,19 +277,14 @@ def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
 
 
 def save_tactile(h: Handed, path: Path) -> bool:
-    """Writes the file, whole or not at all. Where there is nothing to hand on, returns False, and an earlier
-    diagnosis's file goes."""
+    """Writes the file. Returns False where there is nothing to hand on."""
     content = {k: v for k, v in (("tactile", h.tactile), ("randomize", h.randomize)) if v}
     if not content:
-        if path.is_file() and path.read_text(encoding="utf-8").startswith(HEAD):
-            path.unlink()
         return False
     text = (
         HEAD
         + "".join(f"# {line}\n" for line in h.said)
         + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130)
     )
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    path.write_text(text, encoding="utf-8")
     return True
