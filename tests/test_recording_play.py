@@ -467,12 +467,15 @@ def test_recording_ends_with_the_episode(played):
 def test_the_object_of_a_real_recording_is_placed(played, tmp_path, monkeypatch):
     """A recording that knows only the object's path: a mark that touches nothing, or the object as it is stated to
     be."""
-    # seconds, and drawn by another test
-    monkeypatch.setattr("dexsim.recording.compare._panels", lambda path, *rest: path)
     from dataclasses import replace
 
     from dexsim.recording import led_object
 
+    def panels(path, *rest):  # they take seconds, and are drawn by another test
+        path.touch()
+        return path
+
+    monkeypatch.setattr("dexsim.recording.compare._panels", panels)
     env, seen, paths, _ = played
     real = replace(read(paths[0]), config=None, meta=read(paths[0]).meta | {"source": "real"})
     write(tmp_path / "real.mcap", real)
