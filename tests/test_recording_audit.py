@@ -408,6 +408,27 @@ def test_times_of_two_units_are_said(unit):
     assert r.commands.topic in [f.topic for f in said]
 
 
+def test_commands_after_the_last_state_are_said(tmp_path):
+    """Of 4 s the states end after 3: so `dexsim audit` says, and `diagnose` in its notes."""
+    from dexsim.gap import inquiry
+    from dexsim.gap.audit import begin
+    from dexsim.gap.compute import TimeLimit
+
+    r = recordings.signal(4.0)
+    assert not list(audit_time.between_topics(r))
+    r.states.position = r.states.position.take(r.states.position.t <= 3.0)
+    (f,) = audit_time.between_topics(r)
+    assert (f.kind, f.topic, f.severity) == ("gap", COMMANDS, "warning") and 2.99 < f.time < f.end
+    assert f.text.startswith("commands go on for 0.9") and f"{f.count} of {len(r.commands)} are left out" in f.text
+    write(tmp_path / "a.mcap", r)
+    begin(tmp_path / "rig", r.joints, own := {})
+    s = inquiry.Settings([tmp_path / "a.mcap"], tmp_path / "out", None, own["model"], own["servo"])
+    w = inquiry.Inquiry(s, print, None, TimeLimit(None))
+    inquiry.read_files(w)
+    inquiry.to_runs(w)
+    assert f"a.mcap: {f.text}" in w.notes
+
+
 @pytest.mark.parametrize(("sign", "lag"), [(1, 0.05), (1, 0.17), (-1, 0.05)])
 def test_a_narrow_band_is_no_other_clock(sign, lag):
     """Of a sweep from 4 to 5 Hz three quarters of a period behind is a quarter before, and so is half of one with the

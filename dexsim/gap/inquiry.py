@@ -309,7 +309,7 @@ def to_runs(w: Inquiry) -> None:
         f"{r.path.name}: {f.text}"
         for r in readable
         for f in r.findings
-        if f.kind == "joint_names" and "left out" in f.text
+        if f.kind in ("joint_names", "gap") and "left out" in f.text
     ]
     guesses: dict[str, list[str]] = {}
     for r in readable:

@@ -100,10 +100,15 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
 
 def between_topics(r: Recording) -> Iterator[Finding]:
     """Yield topics whose host times cannot be of one clock: one is shifted as a whole, or answers come before
-    commands."""
+    commands; and commands that go on after the last state."""
     state = r.states.position
     if len(state) < 20:
         return
+    late = r.commands.t > state.t[-1]
+    if late.any() and not late.all() and r.commands.t[-1] > state.t[-1] + SHIFT_S:
+        text = (f"commands go on for {r.commands.t[-1] - state.t[-1]:.3g} s after the last sample of {state.topic}:"
+                f" without states, {late.sum()} of {len(late)} are left out")  # fmt: skip
+        yield r.commands.finding("gap", text, "warning", at=np.flatnonzero(late))
     for other in (r.commands, r.tactile, r.external_force, r.object_pose, r.imu, r.temperature, r.duty):
         if other is None or len(other) < 20:
             continue

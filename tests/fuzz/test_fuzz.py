@@ -109,6 +109,7 @@ FOUND = [
     ("overrides", 9004328),
     ("recording", 10004427),
     ("calibration", 10004780),
+    ("recording", 775265925),
 ]
 """Cases of long runs that once broke something."""
 
