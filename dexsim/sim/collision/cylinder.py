@@ -72,9 +72,8 @@ def stands_off(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.ma
 
 @wp.func
 def none() -> Nearest:
-    s = Nearest()
-    s.g = wp.vec3(FAR, 0.0, 0.0)
-    return s
+    z = wp.vec3()
+    return Nearest(0, z, z, z, 0, 0, 0, z, wp.vec3(FAR, 0.0, 0.0))
 
 
 @wp.func
@@ -86,13 +85,7 @@ def nearer(s: Nearest, t: Nearest) -> Nearest:
 
 @wp.func
 def on_corner(half: wp.vec3, a: wp.vec3, i: int) -> Nearest:
-    s = Nearest()
-    s.n = 1
-    s.p0 = a
-    s.i0 = i
-    s.x = a
-    s.g = off(half, a)
-    return s
+    return Nearest(1, a, wp.vec3(), wp.vec3(), i, 0, 0, a, off(half, a))
 
 
 @wp.func
@@ -132,24 +125,18 @@ def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
             side = 1
         if high - low < 2.0e-7:
             break
-    s = Nearest()
-    s.n = 2
-    s.p0 = a
-    s.p1 = b
-    s.i0 = ia
-    s.i1 = ib
-    s.x = a + t * e
-    g = off(half, s.x)
-    s.g = g - (wp.dot(g, e) / wp.dot(e, e)) * e  # exactly across the edge
+    x = a + t * e
+    g = off(half, x)
+    across = g - (wp.dot(g, e) / wp.dot(e, e)) * e  # exactly across the edge
     if g[0] != 0.0 or g[1] != 0.0:
         # and across the line of the side, or the rim's tangent: these tell the direction better than a small difference
         beside = wp.vec3(0.0, 0.0, 1.0)
         if g[2] != 0.0:
-            beside = wp.normalize(wp.vec3(-s.x[1], s.x[0], 0.0))
+            beside = wp.normalize(wp.vec3(-x[1], x[0], 0.0))
         c = wp.cross(e, beside)
         if wp.dot(c, c) > 1.0e-3 * wp.dot(e, e):
-            s.g = (wp.dot(g, c) / wp.dot(c, c)) * c
-    return s
+            across = (wp.dot(g, c) / wp.dot(c, c)) * c
+    return Nearest(2, a, b, wp.vec3(), ia, ib, 0, x, across)
 
 
 @wp.func
@@ -188,17 +175,7 @@ def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int,
         or wp.dot(m, wp.cross(a - x, b - x)) <= 0.0
     ):
         return none()
-    s = Nearest()
-    s.n = 3
-    s.p0 = a
-    s.p1 = b
-    s.p2 = c
-    s.i0 = ia
-    s.i1 = ib
-    s.i2 = ic
-    s.x = x
-    s.g = gap * n
-    return s
+    return Nearest(3, a, b, c, ia, ib, ic, x, gap * n)
 
 
 @wp.func
@@ -321,11 +298,7 @@ class Way:
 @wp.func
 def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
     """Return the along u for a feature with the point a, where the rim is furthest along it."""
-    w = Way()
-    w.found = 1
-    w.u = u
-    w.depth = wp.dot(u, furthest(half, u) - a)
-    return w
+    return Way(1, u, wp.dot(u, furthest(half, u) - a))
 
 
 @wp.func

@@ -97,10 +97,7 @@ def grown(
     at = wp.zeros(shape=(FACES,), dtype=wp.vec4)
     edge = wp.zeros(shape=(EDGES,), dtype=int)
     none = Facet()
-    out = Facet()
-    out.found = 1
-    out.depth = FAR
-    out.l0 = 1.0
+    out = Facet(1, 0, wp.vec3(), FAR, 0, 0, 0, 1.0, 0.0, 0.0)
     for j in range(4):
         name[j] = names[j]
         pos[j] = difference(a, b, vertex, R, p, names[j])
@@ -204,17 +201,9 @@ def grown(
                 most = least
                 best = j
     t = three(face[best])
-    out.sure = 1
-    out.normal = wp.vec3(at[best][0], at[best][1], at[best][2])
-    out.depth = at[best][3]
-    l = weights(out.normal, pos[t[0]], pos[t[1]], pos[t[2]])
-    out.i0 = name[t[0]]
-    out.i1 = name[t[1]]
-    out.i2 = name[t[2]]
-    out.l0 = l[0]
-    out.l1 = l[1]
-    out.l2 = l[2]
-    return out
+    n = wp.vec3(at[best][0], at[best][1], at[best][2])
+    l = weights(n, pos[t[0]], pos[t[1]], pos[t[2]])
+    return Facet(1, 1, n, at[best][3], name[t[0]], name[t[1]], name[t[2]], l[0], l[1], l[2])
 
 
 @wp.func

@@ -59,13 +59,7 @@ class Simplex:
 
 @wp.func
 def point(p: wp.vec3, i: int) -> Simplex:
-    s = Simplex()
-    s.n = 1
-    s.p0 = p
-    s.i0 = i
-    s.l0 = 1.0
-    s.v = p
-    return s
+    return Simplex(1, p, wp.vec3(), wp.vec3(), i, 0, 0, 1.0, 0.0, 0.0, p, 0, 0)
 
 
 @wp.func
@@ -79,17 +73,9 @@ def segment(a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Simplex:
     if t >= ee:
         return point(b, ib)
     t = t / ee
-    s = Simplex()
-    s.n = 2
-    s.p0 = a
-    s.p1 = b
-    s.i0 = ia
-    s.i1 = ib
-    s.l0 = 1.0 - t
-    s.l1 = t
     v = a + t * e
-    s.v = v - (wp.dot(v, e) / ee) * e  # exactly across the edge
-    return s
+    v = v - (wp.dot(v, e) / ee) * e  # exactly across the edge
+    return Simplex(2, a, b, wp.vec3(), ia, ib, 0, 1.0 - t, t, 0.0, v, 0, 0)
 
 
 @wp.func
@@ -113,17 +99,7 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> S
     if la <= 0.0 or lb <= 0.0 or lc <= 0.0:
         return nearer(nearer(segment(a, b, ia, ib), segment(b, c, ib, ic)), segment(c, a, ic, ia))
     total = la + lb + lc
-    s = Simplex()
-    s.n = 3
-    s.p0 = a
-    s.p1 = b
-    s.p2 = c
-    s.i0 = ia
-    s.i1 = ib
-    s.i2 = ic
-    s.l0 = la / total
-    s.l1 = lb / total
-    s.l2 = lc / total
+    s = Simplex(3, a, b, c, ia, ib, ic, la / total, lb / total, lc / total, wp.vec3(), 0, 0)
     v = s.l0 * a + s.l1 * b + s.l2 * c
     # the face tells the direction better than v, unless it is a sliver
     if nn > wp.dot(v, v) * wp.max(wp.dot(ab, ab), wp.dot(ac, ac)):

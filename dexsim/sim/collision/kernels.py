@@ -6,10 +6,11 @@ materials, friction, explicit pairs and what a contact is are decided where they
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 from mujoco_warp._src.collision_core import contact_margin_gap, contact_material_params, write_contact
 from mujoco_warp._src.math import make_frame
-from mujoco_warp._src.types import vec5
 
 from dexsim.sim.collision.cylinder import FAR, beside_side, from_cylinder, furthest, rounder, stands_off
 from dexsim.sim.collision.epa import Facet, penetration
@@ -45,131 +46,48 @@ SHALLOW = wp.constant(3.0e-6)
 _ROUNDED = {"fuse_fp": False}
 
 
-@wp.struct
-class Materials:
-    """MuJoCo-Warp's model fields that decide a contact's parameters; shapes as there."""
-
-    geom_condim: wp.array(dtype=int)
-    geom_priority: wp.array(dtype=int)
-    geom_solmix: wp.array2d(dtype=float)
-    geom_solref: wp.array2d(dtype=wp.vec2)
-    geom_solimp: wp.array2d(dtype=vec5)
-    geom_friction: wp.array2d(dtype=wp.vec3)
-    geom_margin: wp.array2d(dtype=float)
-    geom_gap: wp.array2d(dtype=float)
-    geom_adhesion: wp.array2d(dtype=float)
-    pair_dim: wp.array(dtype=int)
-    pair_solref: wp.array2d(dtype=wp.vec2)
-    pair_solreffriction: wp.array2d(dtype=wp.vec2)
-    pair_solimp: wp.array2d(dtype=vec5)
-    pair_margin: wp.array2d(dtype=float)
-    pair_gap: wp.array2d(dtype=float)
-    pair_adhesion: wp.array2d(dtype=float)
-    pair_friction: wp.array2d(dtype=vec5)
+def _arrays(name: str, about: str, fields: dict[str, Any]) -> Any:
+    """Return a struct of the arrays among MuJoCo-Warp's parameters, by its names for them."""
+    arrays = {k: kind for k, kind in fields.items() if isinstance(kind, type(wp.array[int]))}
+    return wp.struct(type(name, (), {"__annotations__": arrays, "__doc__": about, "__module__": __name__}))
 
 
-@wp.struct
-class Contacts:
-    """MuJoCo-Warp's contact list, and how many contacts are in it."""
-
-    dist: wp.array(dtype=float)
-    pos: wp.array(dtype=wp.vec3)
-    frame: wp.array(dtype=wp.mat33)
-    includemargin: wp.array(dtype=float)
-    friction: wp.array(dtype=vec5)
-    solref: wp.array(dtype=wp.vec2)
-    solreffriction: wp.array(dtype=wp.vec2)
-    solimp: wp.array(dtype=vec5)
-    dim: wp.array(dtype=int)
-    geom: wp.array(dtype=wp.vec2i)
-    efc_address: wp.array2d(dtype=int)
-    worldid: wp.array(dtype=int)
-    type: wp.array(dtype=int)
-    geomcollisionid: wp.array(dtype=int)
-    adhesion: wp.array(dtype=float)
-    nacon: wp.array(dtype=int)
+_MARGIN, _MATERIAL, _WRITE = (
+    f.func.__annotations__ for f in (contact_margin_gap, contact_material_params, write_contact)
+)
+Materials = _arrays("Materials", "MuJoCo-Warp's model fields that decide a contact's parameters.", _MARGIN | _MATERIAL)
+Contacts = _arrays(
+    "Contacts", "MuJoCo-Warp's contact list, and how many contacts are in it.",
+    {k.removeprefix("contact_").removesuffix("_out"): kind for k, kind in _WRITE.items()},
+)  # fmt: skip
 
 
 @wp.func
 def write(
-    mat: Materials,
-    out: Contacts,
-    room: int,
-    geoms: wp.vec2i,
-    pairid: wp.vec2i,
-    world: int,
-    margin: float,
-    gap: float,
-    dist: float,
-    pos: wp.vec3,
-    normal: wp.vec3,
-):
+    mat: Materials, out: Contacts, room: int, geoms: wp.vec2i, pairid: wp.vec2i, world: int, margin: float, gap: float,
+    dist: float, pos: wp.vec3, normal: wp.vec3,
+):  # fmt: skip
     """Write one contact. dist [m]: of the surfaces, without margin; normal: from geoms[0] to geoms[1], world frame."""
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        mat.geom_condim,
-        mat.geom_priority,
-        mat.geom_solmix,
-        mat.geom_solref,
-        mat.geom_solimp,
-        mat.geom_friction,
-        mat.geom_adhesion,
-        mat.pair_dim,
-        mat.pair_solref,
-        mat.pair_solreffriction,
-        mat.pair_solimp,
-        mat.pair_adhesion,
-        mat.pair_friction,
-        geoms,
-        pairid[0],
-        world,
-    )
+        mat.geom_condim, mat.geom_priority, mat.geom_solmix, mat.geom_solref, mat.geom_solimp, mat.geom_friction,
+        mat.geom_adhesion, mat.pair_dim, mat.pair_solref, mat.pair_solreffriction, mat.pair_solimp, mat.pair_adhesion,
+        mat.pair_friction, geoms, pairid[0], world,
+    )  # fmt: skip
     write_contact(
-        room,
-        0,
-        dist,
-        pos,
-        make_frame(normal),
-        margin,
-        gap,
-        condim,
-        friction,
-        solref,
-        solreffriction,
-        solimp,
-        adhesion,
-        geoms,
-        pairid,
-        world,
-        out.dist,
-        out.pos,
-        out.frame,
-        out.includemargin,
-        out.friction,
-        out.solref,
-        out.solreffriction,
-        out.solimp,
-        out.dim,
-        out.geom,
-        out.efc_address,
-        out.worldid,
-        out.type,
-        out.geomcollisionid,
-        out.adhesion,
-        out.nacon,
-    )
+        room, 0, dist, pos, make_frame(normal), margin, gap, condim, friction, solref, solreffriction, solimp, adhesion,
+        geoms, pairid, world, out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref,
+        out.solreffriction, out.solimp, out.dim, out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid,
+        out.adhesion, out.nacon,
+    )  # fmt: skip
 
 
 @wp.func
 def core_of(
     kind: int, size: wp.vec3, dataid: int, hull_first: wp.array(dtype=int), hull_count: wp.array(dtype=int)
 ) -> Core:
-    c = Core()
-    c.kind = kind
-    c.half = size
     if kind == HULL and dataid >= 0:
-        c.first = hull_first[dataid]
-        c.count = hull_count[dataid]
-    return c
+        return Core(kind, size, hull_first[dataid], hull_count[dataid])
+    return Core(kind, size, 0, 0)
 
 
 @wp.func
@@ -221,22 +139,17 @@ class Two:
 def two(pairs: Pairs, mat: Materials, k: int) -> Two:
     geoms = pairs.geom[k]
     world = pairs.world[k]
-    t = Two()
     margin, gap = contact_margin_gap(
         mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world
     )
     size = pairs.geom_size[world % pairs.geom_size.shape[0], geoms[0]]
     kind = pairs.geom_type[geoms[0]]
     meshes = world % pairs.geom_dataid.shape[0]
-    t.a = core_of(kind, size, pairs.geom_dataid[meshes, geoms[0]], pairs.hull_first, pairs.hull_count)
-    t.b = core_of(HULL, size, pairs.geom_dataid[meshes, geoms[1]], pairs.hull_first, pairs.hull_count)
+    a = core_of(kind, size, pairs.geom_dataid[meshes, geoms[0]], pairs.hull_first, pairs.hull_count)
+    b = core_of(HULL, size, pairs.geom_dataid[meshes, geoms[1]], pairs.hull_first, pairs.hull_count)
     to_b = wp.transpose(pairs.geom_xmat[world, geoms[1]])
-    t.R = to_b * pairs.geom_xmat[world, geoms[0]]
-    t.p = to_b * (pairs.geom_xpos[world, geoms[0]] - pairs.geom_xpos[world, geoms[1]])
-    t.margin = margin
-    t.gap = gap
-    t.radius = radius_of(kind, size)
-    return t
+    p = to_b * (pairs.geom_xpos[world, geoms[0]] - pairs.geom_xpos[world, geoms[1]])
+    return Two(a, b, to_b * pairs.geom_xmat[world, geoms[0]], p, margin, gap, radius_of(kind, size))
 
 
 @wp.func
@@ -397,8 +310,7 @@ def beside_cylinder(
                 done = int(1)
             else:
                 # they overlap, or nearly: the prism and the body, in the body's frame
-                a = Prism()
-                a.half = half
+                a = Prism(half)
                 to_b = wp.transpose(R)
                 f = Facet()
                 t = distance(a, b, pairs.hull, to_b, -(to_b * p), wp.vec3i(-1, -1, -1), cutoff)
