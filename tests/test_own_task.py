@@ -532,6 +532,14 @@ def test_further_objects_and_imported_machines():
         made(Twice, worlds=1)
 
 
+def test_a_scene_takes_lists_of_things():
+    assert Scene(things=[Thing("ball")]).things[0].name == "ball"
+    with pytest.raises(UserError, match=r"Scene: things=Thing\(.*must be a list of Thing"):
+        Scene(things=Thing("ball"))
+    with pytest.raises(UserError, match=r"Scene: trees=\('desk.xml',\): must be a list of Tree"):
+        Scene(trees=("desk.xml",))
+
+
 # -- the tasks of before
 GOLDEN = json.loads((ROOT / "tests" / "golden" / "tasks.json").read_text())
 

@@ -9,6 +9,7 @@ the palm. A hand on a `Base` begins with its palm's centre in the origin, and z 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -148,8 +149,14 @@ class Scene:
     object: Free | Jointed | None = Free()
     base: Base | None = None
     table: Table | None = None
-    things: tuple[Thing, ...] = ()
-    trees: tuple[Tree, ...] = ()
+    things: Sequence[Thing] = ()
+    trees: Sequence[Tree] = ()
+
+    def __post_init__(self) -> None:
+        for name, kind in (("things", Thing), ("trees", Tree)):
+            value = getattr(self, name)
+            if not isinstance(value, (list, tuple)) or not all(isinstance(x, kind) for x in value):
+                raise UserError(f"Scene: {name}={value!r}: must be a list of {kind.__name__}(...)")
 
     @property
     def free(self) -> bool:
