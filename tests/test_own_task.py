@@ -518,6 +518,7 @@ def test_further_objects_and_imported_machines():
     env = made(Room, worlds=2)
     assert [p.body for p in env.furniture.parts] == ["ball", "desk/box", "desk/drawer"]
     assert env.touch.shape_id.shape == (2, 4) and env.furniture.joints == {"desk": ["desk/pull"]}
+    assert env.drawn_model(0).stat.extent < 2.0  # m: a film's near plane is a hundredth of it
     before = env.thing_pose("ball")[:, 2].clone()
     stepped(env, 20)
     env.check()

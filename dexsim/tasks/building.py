@@ -150,6 +150,7 @@ class Built(VecEnv):
         table = None
         if self.scene.object is None:
             spec.worldbody.add_body(name=OBJECT, pos=[0.0, 0.0, -1e3])  # what pairs and touch name; nothing is there
+            spec.stat.extent = 0.5  # m: by it a film is cut off near and far, and that body would make it 2 km
         else:
             scales = [x * self.unit for x in self.task["objects"]["baked_scales"]]
             table = hand_object_scene(spec, [shapes[s] for s in self.shape_names], scales, sim["timestep"])
