@@ -72,6 +72,7 @@ class Unit:
     pad: int  # the first of its pads in `Groups.pads`, and how many
     pads: int
     half: int  # 1: the other half of the group is with the other lanes of the warp
+    ends: int  # bit k, of its first 31 rounds: a pad ends with round k
 
 
 @wp.struct
@@ -207,12 +208,14 @@ def int_at(x: wp.array2d(dtype=int), i: int) -> int: ...
 @wp.func
 def pose_in(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
     """Return the position [m] of a body's origin in another body's frame."""
-    return wp.transpose(xmat[w, frame]) * (xpos[w, body] - xpos[w, frame])
+    at = w * xpos.shape[1]
+    return wp.transpose(mat_at(xmat, at + frame)) * (vec_at(xpos, at + body) - vec_at(xpos, at + frame))
 
 
 @wp.func
 def turn_in(xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
-    return wp.transpose(xmat[w, frame]) * xmat[w, body]
+    at = w * xmat.shape[1]
+    return wp.transpose(mat_at(xmat, at + frame)) * mat_at(xmat, at + body)
 
 
 @wp.func
@@ -511,28 +514,6 @@ def _of_object(
         return d
 
     @wp.func
-    def force_on(here: Surroundings, w: int, g: int, o: int):
-        """Return the force [N] of object o on group g."""
-        column = int_at(here.pair_column, g * wp.static(objects) + o)
-        return float_at(here.pair_normal, w * here.pair_normal.shape[1] + column)
-
-    @wp.func
-    def presses(here: Surroundings, groups: Groups, shapes: Shapes, w: int, g: int, o: int):
-        """Return whether object o may press group g."""
-        shape = int_at(here.shape_id, w * wp.static(objects) + o)
-        near = shape >= 0
-        if near:
-            if wp.static(solver):
-                near = force_on(here, w, g, o) > 0.0
-            else:
-                body = groups.body[g]
-                bound = groups.bound[g]
-                a = turn_in(here.xmat, w, body, here.object_body[o])
-                b = pose_in(here.xpos, here.xmat, w, body, here.object_body[o])
-                near = may_touch(shapes, shape, here.shape_size[w, o], a * xyz(bound) + b, bound[3])
-        return near
-
-    @wp.func
     def of_object(here: Surroundings, pads: Pads, groups: Groups, law: Law, shapes: Shapes, out: FlatFelt, i: int):
         # Every branch around an exchange of lanes is the same for the whole warp.
         lane = i & wp.static(WIDTH - 1)
@@ -550,15 +531,25 @@ def _of_object(
         mine = Reals()  # N, on this lane's taxels
         totals = Totals()  # moment of force, force: of the pads that this lane reports
         for o in range(wp.static(objects)):
-            near = inside and presses(here, groups, shapes, w, g, o)
+            # all that is loaded here is under way while the lanes ask
+            shape = int_at(here.shape_id, w * wp.static(objects) + o)
+            size = vec_at(here.shape_size, w * wp.static(objects) + o)
+            place = w * bodies + here.object_body[o]
+            turn = wp.transpose(mat_at(here.xmat, place))
+            a = turn * rot
+            b = turn * (pos - vec_at(here.xpos, place))
+            near = inside and shape >= 0
+            force = float(1.0)
+            if wp.static(solver):
+                column = int_at(here.pair_column, g * wp.static(objects) + o)
+                force = float_at(here.pair_normal, w * here.pair_normal.shape[1] + column)
+                near = near and force > 0.0
+            elif near:
+                near = may_touch(shapes, shape, size, a * xyz(groups.bound[g]) + b, groups.bound[g][3])
             if lane_ballot(near) != 0:
-                shape = wp.max(int_at(here.shape_id, w * wp.static(objects) + o), 0)
-                place = w * bodies + here.object_body[o]
-                turn = wp.transpose(mat_at(here.xmat, place))
-                a = turn * rot
-                b = turn * (pos - vec_at(here.xpos, place))
+                shape = wp.max(shape, 0)
                 n = wp.where(near, unit.rounds * wp.static(split), 0)
-                d = distances(shapes, shape, vec_at(here.shape_size, w * wp.static(objects) + o), a, b, groups, n, at)
+                d = distances(shapes, shape, size, a, b, groups, n, at)
                 level = float(0.0)
                 if wp.static(solver):
                     least = lanes_min(wp.min(d), wp.static(WIDTH))
@@ -585,7 +576,10 @@ def _of_object(
                     if (r + 1) % wp.static(split) == 0:
                         last = r + 1 == wp.static(all_rounds)
                         if not wp.static(most == 1):
-                            last = r < n and groups.round[g, unit.round + r // wp.static(split)][2] != 0
+                            bits = unit.ends >> (r // wp.static(split))
+                            if wp.static(unit_rounds > 31):
+                                bits = groups.round[g, unit.round + r // wp.static(split)][2]
+                            last = r < n and (bits & 1) != 0
                         if lane_ballot(last and s[3] > 0.0) != 0:
                             total = lanes_sum4(s, i & 31, wp.static(WIDTH))
                             for q in range(wp.static(slots)):
@@ -602,7 +596,7 @@ def _of_object(
                     if unit.half != 0:
                         whole += other
                     if near:
-                        scale = force_on(here, w, g, o) / whole
+                        scale = force / whole
                 totals += scale * found
                 if wp.static(raw):
                     mine += scale * d

@@ -427,7 +427,9 @@ def _units(layout: TaxelLayout, members: list[list[int]]) -> list[Unit]:
     units = []
     for values in out:
         units.append(Unit())
-        for name, x in zip(Unit.vars, values, strict=True):  # type: ignore[attr-defined]  # wp.struct adds it
+        g, first, n = values[:3]
+        last = sum(1 << int(e - first - 1) for e in ends[g] if first < e <= first + min(n, 31))
+        for name, x in zip(Unit.vars, (*values, last), strict=True):  # type: ignore[attr-defined]  # wp.struct adds it
             setattr(units[-1], name, x)
     return units
 
