@@ -22,7 +22,7 @@ from dexsim.console import jobs
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
-LEFT = re.compile(r"([0-9.]+) % done, (?:about |([0-9.]+) to )([0-9.]+) s left")
+LEFT = re.compile(r"([0-9.]+) % done, about ([0-9.]+) s left")
 SURE = 0.8  # a name is confident from here, when it stands alone
 OVER = 1.5
 """x its limit, after which a diagnosis that has not ended itself is ended."""
@@ -162,13 +162,13 @@ def sure_and_wrong(said: Row, hidden: Sequence[str]) -> bool:
     return any(f[2] >= SURE and len(f[3]) < 2 and f[0] not in hidden for f in said["findings"])
 
 
-def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, float, float, float]]:
-    """Return of each line that tells the time left of a search or of replays (s since the start, share done, s left at
-    least and at most as said, s that were left); none of what did not end. lines: (s since the start, text)."""
-    out, said = [], list[tuple[float, float, float, float]]()
+def times_of(lines: Sequence[tuple[float, str]]) -> list[tuple[float, float, float, float]]:
+    """Return of each line that tells the time left of replays (s since the start, share done, s left as said, s that
+    were left); none of what did not end. lines: (s since the start, text)."""
+    out, said = [], list[tuple[float, float, float]]()
     for t, line in lines:
         if m := LEFT.search(line):
-            said.append((t, 0.01 * float(m[1]), float(m[2] or m[3]), float(m[3])))
+            said.append((t, 0.01 * float(m[1]), float(m[2])))
         elif line.strip().startswith(("searched ", "replayed ")):
             out += [(*x, t - x[0]) for x in said]
             said = []

@@ -51,14 +51,14 @@ def test_right_and_sure():
 
 
 def test_the_time_left_is_held_against_what_was_left():
-    lines = [(2.0, "  searching elbow (1/1), 20 % done, about 9 s left"),
-             (8.0, "  searching elbow (1/1), 50 % done, 3 to 9 s left"), (12.0, "  searched 1 in 12 s"),
-             (15.0, "  replaying what may be written, 40 % done, about 6 s left"),
-             (18.0, "  replayed what may be written")]  # fmt: skip
+    lines = [(2.0, "  searching elbow (1/1): effect 1, 2 s so far, at most 50 s left of all"),
+             (12.0, "  searched 1 in 12 s"), (15.0, "  replaying what may be written, 40 % done, about 4.5 s left"),
+             (17.0, "  replaying what may be written, 60 % done, about 2.5 s left"),
+             (20.0, "  replayed what may be written")]  # fmt: skip
     times = answers.times_of(lines)
-    assert times == [(2.0, 0.2, 9.0, 9.0, 10.0), (8.0, 0.5, 3.0, 9.0, 4.0), (15.0, 0.4, 6.0, 6.0, 3.0)]
-    assert same_names.told_right([row(said(times=times), said())], "before") == "1 of 2, spans 1 of 1"
-    assert answers.times_of(lines[:2]) == []  # nobody knows how long it would have taken
+    assert times == [(15.0, 0.4, 4.5, 5.0), (17.0, 0.6, 2.5, 3.0)]
+    assert same_names.told_right([row(said(times=[*times, (1.0, 0.1, 9.0, 5.0)]), said())], "before") == "2 of 3"
+    assert answers.times_of(lines[:3]) == []  # nobody knows how long it would have taken
 
 
 def test_each_case_is_a_job_of_its_own(tmp_path):

@@ -278,11 +278,12 @@ def available(device: str) -> str:
 
 
 class Progress:
-    """Which joint is searched or what is replayed, and the time left of that. limit: of the whole."""
+    """Which joint is searched or what is replayed, and how far that is. limit: of the whole.
+
+    A search says what it is at, in counts, and no time left: how long it takes is not known before it is known what is
+    hidden. A replay's steps are counted: it says a time."""
 
     EVERY = 3.0  # s between lines while none is done, where they are not written over each other
-    WIDE = 8.0  # x its lower end, beyond which a span of time says nothing
-    SURE = 2.0  # x its lower end, up to which one number stands for a span: it is within a third of both its ends
 
     def __init__(self, limit: TimeLimit | None = None) -> None:
         self.start, self.limit = time.perf_counter(), limit
@@ -290,33 +291,25 @@ class Progress:
         self.said, self.searched = 0.0, -1
 
     def __call__(
-        self, done: float, total: int, name: str, left: tuple[float, float] | None = None, doing: str = "search"
+        self, done: float, total: int, name: str, stage: str = "", left: float | None = None, doing: str = "search"
     ) -> None:
-        """done of total are searched (doing: a verb), the one under way in part; left: s, at least and at most, where
-        that is known."""
+        """done of total are searched (doing: a verb); stage: of the one under way; left: s, where that is known."""
         now = time.perf_counter()
-        if not done:  # what was before says nothing of how long it takes
+        if not done and not stage:  # what was before says nothing of how long it takes
             self.start = now
         if int(done) == self.searched < total and not self.live and now - self.said < self.EVERY:
             return
         self.said, self.searched, spent = now, int(done), now - self.start
-        part = f", {100 * done / total:.0f} % done" if 0.0 < done < total else ""
-        tail = self.left(left, f"left to {doing}") or (f", {spent:.0f} s so far" if part else "")
-        if done < total:
-            text = f"  {doing}ing {name}" + (f" ({int(done) + 1}/{total})" if doing == "search" else "") + part + tail
-        else:
+        if done >= total:
             text = f"  {doing}ed {name}" if name else f"  {doing}ed {total} in {spent:.0f} s"
-        print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
-
-    def left(self, span: tuple[float, float] | None, words: str = "left") -> str:
-        """Return the time left in words: one number only where it is within a third of both ends of the span."""
-        most = float("inf") if self.limit is None else max(self.limit.until(1.0), 0.0)
-        if span is None or span[1] > self.WIDE * max(span[0], 1.0):
-            return f", at most {most:.0f} s left of all" if most < float("inf") else ""
-        low, high = span[0], min(span[1], max(most, span[0]))
-        if high <= self.SURE * low or high < 1.5:
-            return f", about {(high + 2 * low) / 3:.0f} s {words}"
-        return f", {low:.0f} to {high:.0f} s {words}"
+        elif left is not None:
+            text = f"  {doing}ing {name}, {100 * done / total:.0f} % done, "
+            text += f"about {left:.{int(left < 10)}f} s left to {doing}"
+        else:
+            text = f"  {doing}ing {name} ({done + 1}/{total})" + (f": {stage}, {spent:.0f} s so far" if stage else "")
+            if self.limit is not None and self.limit.seconds is not None:
+                text += f", at most {max(self.limit.until(1.0), 0.0):.0f} s left of all"
+        print(f"\r{text:<79}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 
 def verdict(d: Diagnosis) -> str:

@@ -106,8 +106,9 @@ def each(count: int, work: Callable[[int], T]) -> list[T]:
 def forked(count: int, prepared: Callable[[int], Callable[[], T]], at_once: int) -> list[T]:
     """Return prepared(k)() for k below `count`, in order: side by side in forks of this process, for what is Python
     itself; without such a fork here, one after the other. Nothing of it may touch a GPU."""
+    works = [prepared(k) for k in range(count)]
     if min(at_once, count) <= 1 or system.start_method() != "fork":
-        return [prepared(k)() for k in range(count)]
+        return [work() for work in works]
 
     def one(work: Callable[[], T]) -> T:
         try:
@@ -116,7 +117,7 @@ def forked(count: int, prepared: Callable[[int], Callable[[], T]], at_once: int)
             return work()
 
     with ThreadPoolExecutor(at_once) as pool:
-        return list(pool.map(one, [prepared(k) for k in range(count)]))
+        return list(pool.map(one, works))
 
 
 @contextmanager
@@ -137,11 +138,11 @@ def watched(
         said = False
         while not over.wait(LONG):
             share, left = so_far(size, seen[: len(size)], lanes)
-            if left is not None and share < 1:
-                say(share, 1, what, (left, left), "replay")
+            if left is not None and left > 1:
+                say(share, 1, what, "", left, "replay")
                 said = True
         if said:
-            say(1, 1, what, None, "replay")
+            say(1, 1, what, "", None, "replay")
 
     thread = threading.Thread(target=watch, args=(progress,)) if progress else None
     if thread:
@@ -175,78 +176,22 @@ def last(begun: Sequence[float], waiting: Sequence[float], lanes: int) -> float:
     return max(ends)
 
 
-Span = tuple[float, float]  # s, in which what is left of a work ends four times in five
-
-
-class Pace:
-    """How long searches of `count` joints take yet, `lanes` at a time: those under way by what they tell, those that
-    wait by the others."""
-
-    SPREAD, PRIOR = 0.7, 3  # of their mean, by which searches differ as a rule, and how many it counts for
-    TENTH = 1.28  # standard deviations beyond which a tenth lies
-
-    def __init__(self, count: int, lanes: int):
-        self._count, self._lanes = count, lanes
-        self._begun, self._took = dict[int, float](), dict[int, float]()
-        self._ahead = dict[int, tuple[float, Span]]()
-
-    def tell(self, k: int, ahead: Span | None) -> float:
-        """Search k has begun or is under way (None), takes so long yet, or has ended (0, 0). Return the share that is
-        over."""
-        now = time.monotonic()
-        over = now - self._begun.setdefault(k, now)
-        if ahead is not None and ahead[1] > 0:
-            self._ahead[k] = now, ahead
-        elif ahead is not None:
-            self._took[k] = over
-            self._ahead.pop(k, None)
-            return 1.0
-        if k not in self._ahead:
-            return 0.0
-        at, (low, high) = self._ahead[k]
-        return over / max(over + max(0.5 * (low + high) - now + at, 0.5 * (now - at)), 1e-9)
-
-    def left(self) -> Span | None:
-        """Return s that are left, at least and at most; None where they are not known."""
-        now, waiting = time.monotonic(), self._count - len(self._took) - len(self._ahead)  # some may have begun
-        since = {k: now - at for k, (at, _) in self._ahead.items()}
-        # of one that takes longer than others half of that is to come
-        spans = [
-            (max(low - since[k], 0.0), max(high - since[k], 0.5 * since[k]))
-            for k, (_, (low, high)) in self._ahead.items()
-        ]
-        if not waiting:
-            return max((low for low, _ in spans), default=0.0), max((high for _, high in spans), default=0.0)
-        if waiting == self._count:
-            return None
-        known = [*self._took.values(), *(at - self._begun[k] + 0.5 * sum(x) for k, (at, x) in self._ahead.items())]
-        mean, n = max(float(np.mean(known)), 1e-9), len(known)
-        spread = mean * ((self.PRIOR * self.SPREAD**2 + n * float(np.var(known)) / mean**2) / (self.PRIOR + n)) ** 0.5
-        uneven = spread * (1 - 1 / self._lanes)  # side by side, one ends after the others
-        middle = last([0.5 * sum(x) for x in spans], [mean] * waiting, self._lanes) + 0.5 * uneven
-        own = sum(((high - low) / 2 / self.TENTH) ** 2 for low, high in spans)
-        off = (own + waiting * spread**2 * (1 + waiting / n)) ** 0.5 / self._lanes
-        off = self.TENTH * float(np.hypot(off, uneven))
-        return max(middle - off, *(low for low, _ in spans), 0.0), middle + off
-
-
-def map_joints(names: Sequence[str], work: Callable[[int, Callable[[Span | None], None]], T], device: str,
-             progress: Callable[..., None] | None = None) -> list[T]:
-    """work(k, tell) for each name, in their order; tell(ahead) says how long it takes yet, tell(None) that it is under
-    way; progress(done, of, which is worked on, s that are left, at least and at most, or None)."""
-    parts, lock, at_once = [0.0] * len(names), threading.Lock(), workers(device, len(names))
-    pace = Pace(len(names), at_once)
+def map_joints(names: Sequence[str], work: Callable[[int, Callable[[str], None]], T], device: str,
+               progress: Callable[..., None] | None = None) -> list[T]:
+    """work(k, tell) for each name, in their order; tell(stage) says in words what it is at; progress(how many are done,
+    of how many, which is worked on, its stage)."""
+    lock, at_once, done = threading.Lock(), workers(device, len(names)), [0]
 
     def one(k: int) -> T:
-        def tell(ahead: Span | None) -> None:
+        def tell(stage: str) -> None:
             with lock:
-                parts[k] = max(parts[k], pace.tell(k, ahead))
-                if progress and (ahead is None or ahead[1] > 0):
-                    progress(sum(parts), len(names), names[k], pace.left())
+                if progress:
+                    progress(done[0], len(names), names[k], stage)
 
-        tell(None)
+        tell("")
         out = work(k, tell)
-        tell((0.0, 0.0))
+        with lock:
+            done[0] += 1
         return out
 
     if at_once <= 1:

@@ -17,7 +17,7 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.gap import compute
-from dexsim.gap.compute import LONGER, Span, TimeLimit, map_joints, workers
+from dexsim.gap.compute import LONGER, TimeLimit, map_joints, workers
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import (
     Diagnosis,
@@ -345,7 +345,7 @@ class Drives(Steps):
         )
         self.searched = [replace(x, outcome=a.outcome) for x, a in zip(self.searched, self.answers, strict=True)]
 
-    def _begun(self, k: int, tell: Callable[[Span | None], None]) -> JointSearch:
+    def _begun(self, k: int, tell: Callable[[str], None]) -> JointSearch:
         """Return the search of one joint, not yet run."""
         w, case = self.w, self.cases[k]
         deadline = w.limit.share(case.joint, min(1.0, workers(w.settings.device, len(self.cases)) / max(self._left, 1)))
@@ -360,13 +360,13 @@ class Drives(Steps):
             deadline=deadline,
         )
 
-    def _start(self, k: int, tell: Callable[[Span | None], None]) -> Trial | None:
+    def _start(self, k: int, tell: Callable[[str], None]) -> Trial | None:
         """Return the joint as believed, its uncertain figures refitted; None where nothing is long enough to be
         simulated."""
         search = self._begun(k, tell)
         return search.start() if len(search.long.window) else None
 
-    def _search_of(self, k: int, tell: Callable[[Span | None], None]) -> tuple[JointSearch, Outcome | None]:
+    def _search_of(self, k: int, tell: Callable[[str], None]) -> tuple[JointSearch, Outcome | None]:
         """Return the search of one joint and its answer; None where nothing is long enough to be simulated."""
         begun = time.monotonic()
         search, case = self._begun(k, tell), self.cases[k]

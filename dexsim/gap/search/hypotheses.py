@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -10,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from dexsim.gap.compute import Deadline, Span
+from dexsim.gap.compute import Deadline
 from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, compatible
 from dexsim.gap.effects.friction import give
@@ -259,15 +258,6 @@ def _of_the_sensors(case: Case) -> list[Param]:
     return out
 
 
-# s that a search takes yet, at least and at most, for each that it took until here: four in five of 55 searches (two on
-# each of twenty hands, and of the own set). quiet: nothing seems to be missing; enough: what was found explains it
-AHEAD = {
-    "begun": (6.0, 30.0), "begun, quiet": (2.5, 11.0), "scanned": (1.5, 7.0), "scanned, quiet": (0.4, 2.0),
-    "drafted": (0.4, 3.5), "fitted": (0.35, 2.8), "fitted, enough": (0.2, 1.0),
-    "scanned again": (0.35, 1.6), "drafted again": (0.25, 1.3), "fitted again": (0.15, 1.0),
-    "fitted again, enough": (0.1, 0.5), "ending": (0.2, 0.75), "ending, nothing": (0.02, 0.75),
-    "settling": (0.03, 0.36), "settling, nothing": (0.02, 0.75),
-}  # fmt: skip
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate
 SHARE, MOST = 0.16, 2.0  # of recordings that are longer as much is simulated, up to so many times the budget
@@ -295,7 +285,7 @@ class JointSearch:
         conditions: list[int],
         seed: int = 0,
         allowed: set[str] | None = None,
-        tell: Callable[[Span | None], None] | None = None,
+        tell: Callable[[str], None] | None = None,
         deadline: Deadline | None = None,
     ):
         self.case, self.train, self.span = case, train, span
@@ -304,7 +294,7 @@ class JointSearch:
         self.deadline = deadline or Deadline()
         self.took = 0.0  # s that the search took
         self.unasked: set[str] = set()  # effects whose stand-ins the deadline left untried
-        self.tell, self.begun = tell or (lambda _: None), time.monotonic()
+        self.tell = tell or (lambda _: None)
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
         self.long = plant.windows(LONG, train, span=span)
@@ -362,14 +352,6 @@ class JointSearch:
     def fitted_whole(self) -> Windows:
         """What is fitted, whole recordings: made once, with what is known of them."""
         return self.case.plant.windows(None, self.train, span=self.span)
-
-    def reached(self, stage: str, aside: str = "") -> None:
-        """Tells how long the search takes yet, now that it has come to a stage of `AHEAD`: by how long it took so far.
-        aside: what is known beside, where the table has it."""
-        now = time.monotonic()
-        low, high = (x * (now - self.begun) for x in AHEAD[stage + aside if stage + aside in AHEAD else stage])
-        last = max(self.deadline.until - now, 0.0)
-        self.tell((min(low, last), max(min(high, last), 1e-3)))
 
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
         """Return block of each residual [m]: half-second stretches of one window."""

@@ -52,8 +52,6 @@ def search_joint(search: JointSearch) -> Outcome:
     search.fitted, search.first_laws = {}, {}
     none = search.start()
     search.none_loss = cv_loss(search, none)
-    aside = ", quiet" if search.none_loss.sum() < SEARCH.unsettled * len(search.blocks) else ""
-    search.reached("begun", aside)
     current = none
     scanned: list[tuple[str, float, float]] = []
     per = len(search.blocks)
@@ -64,9 +62,8 @@ def search_joint(search: JointSearch) -> Outcome:
         enough = loss < SEARCH.enough**2
         if (enough and current.members) or search.deadline.over():
             break
+        search.tell(f"effect {len(current.members) + 1}, all of the catalogue")
         scan = scan_catalogue(search, current)
-        again = " again" if current.members else ""
-        search.reached("scanned" + again, aside)
         if not scanned:
             scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
         if not scan:
@@ -77,13 +74,10 @@ def search_joint(search: JointSearch) -> Outcome:
         if not listed:
             break
         drafts = drafts_of(search, listed, current, pool)
-        search.reached("drafted" + again)
         for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
             if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
                 pool[member.id] = member, start, p
         trials = finished_drafts(search, drafts, current)
-        follows = min(cv_loss(search, t).sum() for t in trials) < SEARCH.enough**2 * per
-        search.reached("fitted" + again, ", enough" if follows else "")
         best = best_of(search, trials, current)
         less = begun_again(search, current, trials)
         if less is not current:
@@ -116,11 +110,11 @@ def search_joint(search: JointSearch) -> Outcome:
             current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
         if len(current.members) > 1 and not search.deadline.over():
             current = swapped(search, current, pool)
+    search.tell("what explains as much otherwise, and what is not needed")
     current = from_plain(search, beside_alike(search, forks, current, pool))
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
-    search.reached("ending", "" if current.members else ", nothing")
     current, final = settled(search, current, pool)
     rivals, confidence = {e: x[0] for e, x in final.items()}, {e: x[1] for e, x in final.items()}
     return Outcome(search.case.joint, none, current, rivals, confidence, scanned, search.costs)
@@ -197,6 +191,7 @@ def drafts_of(
         _, _, member, start = listed[k]
         if k and search.deadline.over():
             return None
+        search.tell(f"effect {len(current.members) + 1}, candidate {k + 1} of {len(listed)}")
         tries = [search.draft((*current.members, member), begin(start), current)]
         if k < 4 and member.id in search.other_start and len(start) == len(search.other_start[member.id]):
             tries.append(search.draft((*current.members, member), begin(search.other_start[member.id]), current))
@@ -212,7 +207,6 @@ def drafts_of(
             if member.id in followed:
                 pool[member.id] = member, start, p
             followed[member.id] = drafts[-1][2].loss
-        search.tell(None)
     drafts.sort(key=lambda d: d[2].loss)
     # how many are looked at: two, and others that may still win when they are fitted on long windows
     return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
@@ -224,6 +218,7 @@ def finished_drafts(
     """Return the drafts fitted on long windows, and judged on what was left out."""
 
     def finished(k: int) -> Trial | None:
+        search.tell(f"effect {len(current.members) + 1}, candidate {k + 1} of {len(drafts)} in full")
         return search.finish(*drafts[k], current) if k == 0 or not search.deadline.over() else None
 
     each = map(finished, range(len(drafts)))
@@ -237,7 +232,6 @@ def finished_drafts(
         for k, t in enumerate(trials)
     ]
     for trial in trials:
-        search.tell(None)
         known = search.fitted.get(frozenset(trial.ids))
         if known is None or trial.fit.loss < known.fit.loss:
             search.fitted[frozenset(trial.ids)] = trial
@@ -558,9 +552,10 @@ def rivals_of(
         lost = cv_loss(search, without) if without else search.none_loss
         search.costs[member.id] = gain_by_condition(search, lost, mine)
         others: list[Trial] = []
-        for key, (other, start, _) in pool.items():
+        for n, (key, (other, start, _)) in enumerate(pool.items(), 1):
             if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
                 continue
+            search.tell(f"in the place of effect {i + 1} of {len(current.members)}, rival {n} of {len(pool)}")
             known = search.fitted.get(frozenset((key, *(m.id for m in rest))))
             if known is None and len(others) >= 3 and not confusable(key, member.id):
                 continue
@@ -574,7 +569,6 @@ def rivals_of(
                 if draft[2].loss > SEARCH.rival * max(short, 1.0):
                     continue
                 trial = search.finish(*draft, current, quick=True)
-            search.tell(None)
             search.fitted[frozenset(trial.ids)] = trial
             # one that cannot follow even what it was fitted to is no rival
             if trial.fit.loss < SEARCH.rival * max(current.fit.loss, 1.0):
@@ -651,7 +645,7 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
         if not search.deadline.over():
             found.best = simpler(search, found.best)
         search.whole = search.case.plant.refined(FINER)
-    search.reached("settling", "" if found.best.members else ", nothing")
+    search.tell("what was found, on whole recordings")
     polished(search, found.best), polished(search, found.none)  # kept for the judgement
 
 
