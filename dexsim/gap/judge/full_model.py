@@ -65,6 +65,8 @@ REPLAYED, TOLD = "what may be written", 500  # steps from one word on it to the 
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 LOOK = 20  # steps from one look to the next at whether anything touches, where contacts are not simulated
+GLANCE = 0.05  # s from one look to the next at whether anything touches in a recording
+TOUCHED = 1.5  # x the time without contacts that a step with them takes
 BELIEVED = "believed"  # candidate: nothing is changed
 WHOLE = ", as fitted"  # of a fit's candidate: with the figures that else only absorb the search's plant's inaccuracy
 # of candidates that follow alike the first is written
@@ -98,7 +100,8 @@ class World:
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
     from where a joint that drags another is counted (None: q); setpoint: None or of `setpoints_at`; led: joints that
     follow their recording, in every world of a batch the same; figures [3, J]: `FIELDS` of the joints in the world's
-    own model (None: as in the batch's); spec: of its batch (None: everybody's)."""
+    own model (None: as in the batch's); spec: of its batch (None: everybody's); touch: when something first touches in
+    its recording [s from the start]."""
 
     rows: np.ndarray
     table: ServoTable
@@ -116,6 +119,12 @@ class World:
     led: Led | None = None
     figures: np.ndarray | None = None
     spec: mujoco.MjSpec | None = None
+    touch: float = math.inf
+
+    @property
+    def touches(self) -> bool:
+        """Whether something touches in its recording: then it will here."""
+        return self.touch < self.duration
 
 
 @dataclass
@@ -279,8 +288,9 @@ def worlds_of(
         q, home = scale * rest + offset, scale * rest + offset
         place = [m.joints.index(j) for j in run.joints]
         if w not in begins:
-            begins[w] = begun(recordings[run.name], m, start)
-        initial, v, paths = begins[w]
+            initial, v, paths = begun(recordings[run.name], m, start)
+            begins[w] = initial, v, paths, first_touch(model, m.joints, paths)
+        initial, v, paths, touch = begins[w]
         q = np.where(np.isfinite(initial), initial, q)
         sent = max(int(np.searchsorted(run.cmd_t, start - BEFORE)) - 1, 0)
         targets = np.full((len(run.cmd_t) - sent, len(m.joints)), np.nan)
@@ -318,9 +328,27 @@ def worlds_of(
                 setpoints_at(recordings[run.name], mine, rows, Series(run.cmd_t, run.cmd), run.joints, start, STEP),
                 led if held else None,
                 figures,
+                touch=touch,
             )
         )
     return out
+
+
+def first_touch(model: mujoco.MjModel, joints: Sequence[str], paths: Mapping[str, tuple[np.ndarray, ...]]) -> float:
+    """Return when anything of a model first touches along recorded positions [s]; infinite where nothing does. paths:
+    of `mechanism.begun`."""
+    t = np.arange(0.0, max((p[0][-1] for p in paths.values()), default=0.0), GLANCE)
+    qpos = np.tile(model.qpos0, (len(t), 1))
+    for joint, (at, x, *_) in paths.items():
+        qpos[:, model.joint(joint).qposadr[0]] = np.interp(t, at, x)
+    ties, data = Couplings(model, joints), mujoco.MjData(model)
+    qpos = ties.complete(torch.as_tensor(qpos)).numpy() if ties.tied else qpos
+    for now, q in zip(t, qpos, strict=True):
+        try:
+            _apart(model, data, q[None])
+        except Touching:
+            return float(now)
+    return math.inf
 
 
 def frame_of(m: Mechanism, spec: mujoco.MjSpec) -> str:
@@ -353,15 +381,19 @@ def free_runs(
     whole = sum(w.duration for w in worlds)
     for members in groups.values():
         together = [worlds[i] for i in members]
-        count = math.ceil(cores * sum(w.duration for w in together) / whole)
-        longest = sorted(members, key=lambda i: -worlds[i].duration)
-        parts += [(together, longest[k::count]) for k in range(min(count, len(members)))]
+        for touch in (True, False):
+            some = [i for i in members if worlds[i].touches is touch]
+            count = math.ceil(cores * sum(worlds[i].duration for i in some) / whole)
+            longest = sorted(some, key=lambda i: -worlds[i].duration)
+            parts += [(together, longest[k::count]) for k in range(min(count, len(some)))]
     parts.sort(key=lambda x: -max(worlds[i].duration for i in x[1]))
 
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
         given = [worlds[i] for i in mine]
         batch = partial(_batch, spec, joints, given, together, device, timestep, engine, partial(tell, k))
+        if given[0].touches:
+            return batch(True)
         in_air = batch(False)
 
         def moved() -> list:
@@ -373,7 +405,10 @@ def free_runs(
         return moved
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
-    sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
+    sizes = [
+        max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) * (TOUCHED if worlds[mine[0]].touches else 1.0)
+        for _, mine in parts
+    ]
     with compute.watched(sizes, cores, REPLAYED, progress) as tell:
         for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores), strict=True):
             for i, q in zip(mine, moved, strict=True):
