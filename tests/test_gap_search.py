@@ -230,7 +230,7 @@ def test_replays_tell_the_time_left(capsys, monkeypatch):
         def of_it():
             for part in np.linspace(0, 1, 11):
                 tell(k, part)
-                time.sleep(0.12)
+                time.sleep(0.3)
 
         return of_it
 

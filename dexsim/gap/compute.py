@@ -31,6 +31,7 @@ SWITCH = 2e-4
 WORTH = 20_000  # steps of guesses that a part has at least: about 2 ms, beside the tenth of one that a launch takes
 
 LONG = 4.0  # s between two words on work that is watched; what takes less goes by without one
+KNOWN, SOON = 0.05, 2.0  # share done before which its rate is not known, and s left of which nothing is said
 
 ENDLESS = 1 << 36  # bytes of the file that a reader with a fork's limits would read: days, a TiB
 
@@ -138,7 +139,7 @@ def watched(
         said = False
         while not over.wait(LONG):
             share, left = so_far(size, seen[: len(size)], lanes)
-            if left is not None and left > 1:
+            if left is not None and left > SOON and share > KNOWN:
                 say(share, 1, what, "", left, "replay")
                 said = True
         if said:
