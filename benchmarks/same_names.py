@@ -113,8 +113,8 @@ def right(row: dict[str, Any], version: str) -> bool:
 
 def told_right(rows: Sequence[dict[str, Any]], version: str) -> str:
     """Return how many numbers told for the time left were right within a third."""
-    told = [x for r in rows for x in r[version].get("times", ())]
-    return f"{sum(abs(said - was) <= THIRD * was for *_, said, was in told)} of {len(told)}"
+    times = [x for r in rows for x in r[version].get("times", ())]
+    return f"{sum(abs(said - was) <= THIRD * was for *_, said, was in times)} of {len(times)}"
 
 
 def text_of(rows: Sequence[dict[str, Any]]) -> str:

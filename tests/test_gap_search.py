@@ -234,10 +234,10 @@ def test_replays_tell_the_time_left(capsys, monkeypatch):
 
         return of_it
 
-    told, say = [], Progress()
+    numbers, say = [], Progress()
 
     def heard(share, *rest):
-        told.append((time.monotonic(), rest[3]))
+        numbers.append((time.monotonic(), rest[3]))
         say(share, *rest)
 
     with compute.watched([1.0, 1.0, 1.0], 2, "the files", heard) as tell:
@@ -245,17 +245,17 @@ def test_replays_tell_the_time_left(capsys, monkeypatch):
     *said, end = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert end == "replayed the files" and len(said) > 2
     assert all(re.fullmatch(r"replaying the files, \d+ % done, about \d\.\d s left to replay", line) for line in said)
-    right = [abs(told[-1][0] - at - left) < max(left / 3, 0.5) for at, left in told[:-1]]
+    right = [abs(numbers[-1][0] - at - left) < max(left / 3, 0.5) for at, left in numbers[:-1]]
     assert np.mean(right) > 0.8
 
 
 def test_a_search_tells_how_far_it_is():
-    told = []
+    stages = []
     s = searched({"torque_limit": 0.12})
-    s.tell, s.allowed = told.append, {"torque_limit", "lag"}
+    s.tell, s.allowed = stages.append, {"torque_limit", "lag"}
     settle_found(s, search_joint(s))
-    counts = [tuple(map(int, x)) for x in re.findall(r"(?:candidate|rival) (\d+) of (\d+)", "; ".join(told))]
-    assert told[0] == "effect 1, all of the catalogue" and told[-1] == "what was found, on whole recordings"
+    counts = [tuple(map(int, x)) for x in re.findall(r"(?:candidate|rival) (\d+) of (\d+)", "; ".join(stages))]
+    assert stages[0] == "effect 1, all of the catalogue" and stages[-1] == "what was found, on whole recordings"
     assert counts and all(1 <= k <= of for k, of in counts)
 
 
