@@ -14,10 +14,8 @@ import warp as wp
 import yaml
 
 from dexsim import outputs, yaml_text
-from dexsim.actuator.columns import COLUMNS, INDEX, MEMORY, NAMES
-from dexsim.actuator.kernel import EXTENDED, FRESH
-from dexsim.actuator.laws import encoder_error, encoder_line
-from dexsim.actuator.servo import Servo
+from dexsim.actuator.columns import COLUMNS, NAMES
+from dexsim.actuator.reference import measured_position
 from dexsim.actuator.table import ServoTable
 from dexsim.console.folders import make
 from dexsim.errors import UserError
@@ -26,89 +24,32 @@ from dexsim.recording.schema import COMMANDS, DEFAULTS, IMU, OBJECT_POSE, STATES
 from dexsim.recording.writer import write
 from dexsim.sim.scene import OBJECT
 
-SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
-
 
 @cache
-def copy_kernel(real: type, features: frozenset[str] = frozenset()) -> tuple[wp.Kernel, Any]:
-    """Return one row of each chosen world: time, then reported position, speed and motor torque of every joint, then
-    the object's pose and the angles of measured joints without a drive. The slot written goes round, and is kept on the
-    device so that the launch can be part of a graph. features: of the servo, those of `columns.FEATURES`. The kernel,
-    and the struct that it takes, shapes and units as in `servo.Servo`."""
-    encoder, Memory = encoder_error(features), wp.types.vector(len(MEMORY), real)
-    remembers = bool(features & EXTENDED)
-
-    @wp.struct
-    class Tapped:
-        q_index: wp.array(dtype=int)  # [J] addresses
-        v_index: wp.array(dtype=int)
-        object_q: int
-        sensed_q: wp.array(dtype=int)  # [S] of joints without a drive that are measured
-        time: wp.array(dtype=real)
-        qpos: wp.array2d(dtype=real)
-        qvel: wp.array2d(dtype=real)
-        torque: wp.array2d(dtype=real)
-        params: wp.array3d(dtype=real)
-        state: wp.array3d(dtype=real)
-        first_memory: int  # of the state's slots
-
-    @wp.func
-    def remembered(w: int, j: int, first: int, state: wp.array3d(dtype=real)):
-        """Return (what a joint's drive remembers, whether that is nothing yet)."""
-        memory = Memory()
-        fresh = bool(True)
-        if wp.static(remembers):
-            for k in range(wp.static(len(MEMORY))):
-                memory[k] = state[w, j, first + k]
-            fresh = state[w, j, first + FRESH] != real(0.0)
-        return memory, fresh
+def copy_kernel(real: type) -> wp.Kernel:
+    """Return the kernel that copies a row of each chosen world: time, then positions, speeds and motor torques. The
+    slot written goes round, and is kept on the device so that the launch can be part of a graph."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_rows(
-        worlds: wp.array(dtype=int),
-        x: Tapped,
-        slot: wp.array(dtype=int),
-        rows: wp.array3d(dtype=real),
-    ):
+        worlds: wp.array(dtype=int), at_q: wp.array(dtype=int), at_v: wp.array(dtype=int), time: wp.array(dtype=real),
+        qpos: wp.array2d(dtype=real), qvel: wp.array2d(dtype=real), torque: wp.array2d(dtype=real),
+        slot: wp.array(dtype=int), rows: wp.array3d(dtype=real),
+    ):  # fmt: skip
         s, c = wp.tid()
         w = worlds[s]
-        joints = x.q_index.shape[0]
-        value = x.time[w]
-        if c >= 1 and c <= joints:
-            j = c - 1
-            memory, fresh = remembered(w, j, x.first_memory, x.state)
-            error = encoder(x.params[w, j], x.qpos[w, x.q_index[j]], memory, fresh)
-            value = encoder_line(x.qpos[w, x.q_index[j]], x.params[w, j, SCALE], x.params[w, j, OFFSET])
-            value += error[0] + error[1]
-        elif c > joints and c <= 2 * joints:
-            j = c - 1 - joints
-            memory, fresh = remembered(w, j, x.first_memory, x.state)
-            slope = x.params[w, j, SCALE] + encoder(x.params[w, j], x.qpos[w, x.q_index[j]], memory, fresh)[2]
-            value = slope * x.qvel[w, x.v_index[j]]
-        elif c > 2 * joints and c <= 3 * joints:
-            value = x.torque[w, c - 1 - 2 * joints]
-        elif c > 3 * joints + 7:
-            value = x.qpos[w, x.sensed_q[c - 8 - 3 * joints]]
-        elif c > 3 * joints:
-            value = x.qpos[w, x.object_q + c - 1 - 3 * joints]
+        q = at_q.shape[0]
+        v = q + at_v.shape[0]
+        value = time[w]
+        if c > v:
+            value = torque[w, c - 1 - v]
+        elif c > q:
+            value = qvel[w, at_v[c - 1 - q]]
+        elif c > 0:
+            value = qpos[w, at_q[c - 1]]
         rows[slot[0], s, c] = value
 
-    return copy_rows, Tapped
-
-
-def tap(
-    kind: Any, engine: Any, servo: Servo, q_index: np.ndarray, v_index: np.ndarray, object_q: int,
-    sensed_q: np.ndarray,
-) -> Any:  # fmt: skip
-    """Return the struct of a `copy_kernel` with an engine's and its servo's arrays; where joints, object and joints
-    without a drive are in the state."""
-    made = kind()
-    made.sensed_q = wp.array(sensed_q, dtype=int)
-    made.q_index, made.v_index, made.object_q = wp.array(q_index, dtype=int), wp.array(v_index, dtype=int), object_q
-    made.time, made.qpos, made.qvel = engine.wp.time, engine.wp.qpos, engine.wp.qvel
-    made.torque, made.params, made.state = servo._torque, servo._params, servo._state
-    made.first_memory = servo.first_memory
-    return made
+    return copy_rows
 
 
 @wp.kernel(enable_backward=False)
@@ -150,13 +91,13 @@ class PlayRecorder:
         self.joints = tuple(servo.joints)
         J, K, count = len(self.joints), env.decimation, len(chosen)
         with wp.ScopedDevice(engine.device):
-            at = int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")])
-            self._kernel, kind = copy_kernel(engine.real, servo.features)
-            of = tap(kind, engine, servo, engine.qpos_index(self.joints), engine.dof_index(self.joints), at,
-                     engine.qpos_index(env.hand.sensed))  # fmt: skip
+            at = int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]) + np.arange(7)
+            self._kernel, e = copy_kernel(engine.real), engine.wp
+            at_q = np.concatenate([engine.qpos_index(self.joints), at, engine.qpos_index(env.hand.sensed)])
             self._slot = wp.zeros(1, dtype=int)
-            self._rows = wp.zeros((K, count, 1 + 3 * J + 7 + len(env.hand.sensed)), dtype=engine.real)
-            self._args = [wp.array(chosen, dtype=int), of, self._slot, self._rows]
+            self._rows = wp.zeros((K, count, 1 + len(at_q) + 2 * J), dtype=engine.real)
+            where: list[wp.array] = [wp.array(x, dtype=int) for x in (chosen, at_q, engine.dof_index(self.joints))]
+            self._args = [*where, e.time, e.qpos, e.qvel, servo._torque, self._slot, self._rows]
         self._rows_t = wp.to_torch(self._rows)
         self._servo_before, self._step = servo.before_each, env.step
         self._imu = env.task.get("perception") == "imu"  # an IMU in the object
@@ -181,15 +122,8 @@ class PlayRecorder:
         self._slot.zero_()
         o = env.objects
         # what an episode is about, as it is before a step may end it; copies
-        about = [
-            env.servo.params[w],
-            o.variant[w],
-            o.size[w],
-            o.mass[w],
-            o.friction[w],
-            o.stiffness[w],
-            o.damping_ratio[w],
-        ]
+        things = (o.variant, o.size, o.mass, o.friction, o.stiffness, o.damping_ratio)
+        about = [env.servo.params[w], *(x[w] for x in things)]
         about += [env.object_velocity[w, 3:], *([env.seen[w]] if self._imu else [])]
         out = self._step(actions)
         raw = env.touch.raw3 if env.touch.raw3 is not None else env.touch.raw
@@ -261,8 +195,11 @@ class PlayRecorder:
         t = rows[:, 0] - rows[0, 0]
         start = float(rows[0, 0])
         command_t = np.array(e.times) - start
-        parts = [Series(t, rows[:, 1 + k * J : 1 + (k + 1) * J], STATES, t.copy()) for k in range(3)]
-        pose = Series(t, rows[:, 1 + 3 * J : 8 + 3 * J], OBJECT_POSE, t.copy(), "palm")
+        sensed = len(self.env.hand.sensed)
+        q, pose, follower, v, torque = np.split(rows[:, 1:], np.cumsum([J, 7, sensed, J]), 1)
+        # as the encoders show it: with what the drives are in this episode
+        q, slope = measured_position(dict(zip(NAMES, e.about[0].T, strict=True)), q, self.env.servo.features)
+        parts = [Series(t, x, STATES, t.copy()) for x in (q, slope * v, torque)]
         world, servo = self._world(track.world, e.about)
         assert e.gravity is not None  # set with the first row
         gravity = " ".join(f"{g:g}" for g in e.gravity)
@@ -301,11 +238,11 @@ class PlayRecorder:
             Series(command_t, np.stack(e.targets), COMMANDS, command_t.copy()),
             States(*parts),
             tactile=tactile,
-            object_pose=pose,
+            object_pose=Series(t, pose, OBJECT_POSE, t.copy(), "palm"),
             imu=imu,
             config=config,
             start_ns=1_000_000_000,
-        ).with_followers(self.env.hand.sensed, rows[:, 8 + 3 * J :])
+        ).with_followers(self.env.hand.sensed, follower)
 
     def _believed(self) -> dict[str, Any] | None:
         """Return the drives as the policy believes them, where it plays in another world (reality=), which does not
