@@ -31,7 +31,7 @@ from dexsim.tactile.kernel import (
     xyz,
 )
 from dexsim.tactile.layout import TaxelLayout
-from dexsim.tactile.measure import NEVER, counts, relax, rubber_force
+from dexsim.tactile.measure import NEVER, Effects, Measured, counts, relax, rubber_force
 from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS, check
 from dexsim.tactile.sdf import Shapes, distance
 
@@ -47,6 +47,25 @@ THE_PADS = -1.0
 """Gain of a taxel that has none of its own."""
 LEFT = 1.0e-4
 """N: what other fingers press on a taxel counts from here; under it is rounding."""
+
+
+@wp.struct
+class Own:
+    """What F pads of T taxels have of their own in N worlds, and the readings between which their delays lie."""
+
+    gain: wp.array2d(dtype=float)  # [N, F]
+    hysteresis: wp.array2d(dtype=float)
+    hysteresis_time: wp.array2d(dtype=float)  # s
+    crosstalk: wp.array2d(dtype=float)
+    delay: wp.array2d(dtype=float)  # s
+    ends: wp.array2d(dtype=wp.vec2)  # [F, T] range of a taxel's gain; THE_PADS: its pad's
+    order: wp.array2d(dtype=int)  # [F, T] the taxel that a wire carries
+    beside: wp.array3d(dtype=int)  # [F, T, BESIDE] -1: none
+    stuck: wp.array2d(dtype=int)  # [S, 2] pad, taxel
+    stuck_at: wp.array(dtype=float)  # [S] N
+    older: wp.array2d(dtype=int)  # [N, F] slot of the ring; -1: none is as old yet
+    newer: wp.array2d(dtype=int)
+    part: wp.array2d(dtype=float)  # how far along from the older one
 
 
 class ByPad:
@@ -89,35 +108,34 @@ class ByPad:
             for row in np.flatnonzero(high[COLUMNS.index("crosstalk")]):
                 beside[row, : layout.count[row]] = layout.beside(int(row))
         tensor = lambda x, kind=torch.float32: torch.as_tensor(x, dtype=kind, device=device)  # noqa: E731
-        self._low, self._wide, self._own = (
-            tensor(low)[:, None],
-            tensor(high - low)[:, None],
-            tensor(own, torch.bool)[:, None],
-        )
+        self._low, self._wide = tensor(low)[:, None], tensor(high - low)[:, None]
+        self._own = tensor(own, torch.bool)[:, None]
         with wp.ScopedDevice(device):
             self._skins = skins = Skins()
             skins.known = wp.array(rubber.astype(np.int32), dtype=int)
             skins.thickness = wp.array(thickness.astype(np.float32), dtype=float)
             skins.distance = wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float)
-            self._m = SimpleNamespace(
-                values=wp.zeros((len(COLUMNS), n, f), dtype=float),
-                gain=wp.array(gain.astype(np.float32), dtype=wp.vec2),
-                order=wp.array(order.astype(np.int32), dtype=int),
-                beside=wp.array(beside.astype(np.int32), dtype=int),
-                stuck=wp.array(np.array([s[:2] for s in stuck], dtype=np.int32).reshape(-1, 2), dtype=int),
-                stuck_at=wp.array(np.array([s[2] for s in stuck], dtype=np.float32), dtype=float),
-                spread=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
-                skin=wp.zeros((n, f, t) if self.hysteresis else (1, 1, 1), dtype=float),
-                mixed=wp.zeros((n, f, t) if self.mixes else (1, 1, 1), dtype=float),
-                older=wp.zeros((n, f), dtype=int),
-                newer=wp.zeros((n, f), dtype=int),
-                part=wp.zeros((n, f), dtype=float),
-                ring=wp.zeros((1, n, f, t) if self.delayed else (1, 1, 1, 1), dtype=float),
-                ring_shear=wp.zeros((1, n, f, t) if self.delayed and cfg.shear else (1, 1, 1, 1), dtype=wp.vec2),
-                chosen=wp.zeros(n, dtype=int),
+            values = wp.zeros((len(COLUMNS), n, f), dtype=float)
+            self._m = m = Own()
+            m.ends, m.order = wp.array(gain.astype(np.float32), dtype=wp.vec2), wp.array(order.astype(np.int32))
+            m.beside = wp.array(beside.astype(np.int32))
+            m.stuck = wp.array(np.array([s[:2] for s in stuck], dtype=np.int32).reshape(-1, 2))
+            m.stuck_at = wp.array(np.array([s[2] for s in stuck], dtype=np.float32))
+            m.older, m.newer = wp.zeros((n, f), dtype=int), wp.zeros((n, f), dtype=int)
+            m.part = wp.zeros((n, f), dtype=float)
+            spread, skin, mixed = (
+                wp.zeros((n, f, t) if used else (1, 1, 1), dtype=float)
+                for used in (self.rubber, self.hysteresis, self.mixes)
             )
-        self.values: torch.Tensor = wp.to_torch(self._m.values)
-        self._row = {name: self._m.values[i] for i, name in enumerate(COLUMNS)}
+            self._felt = SimpleNamespace(spread=spread, skin=skin, mixed=mixed)
+            self._ring = wp.zeros((1, n, f, t) if self.delayed else (1, 1, 1, 1), dtype=float)
+            sheared = self.delayed and cfg.shear
+            self._ring_shear = wp.zeros((1, n, f, t) if sheared else (1, 1, 1, 1), dtype=wp.vec2)
+            self._chosen = wp.zeros(n, dtype=int)
+        self.values: torch.Tensor = wp.to_torch(values)
+        self._row = {name: values[i] for i, name in enumerate(COLUMNS)}
+        for name in ("gain", "hysteresis", "hysteresis_time", "crosstalk", "delay"):
+            setattr(m, name, self._row[name])
         skins.c10, skins.c01 = self._row["c10"], self._row["c01"]
 
     def column(self, name: str) -> torch.Tensor:
@@ -142,73 +160,44 @@ class ByPad:
             j = COLUMNS.index(name)
             drawn[j] = torch.where(self._own[j], drawn[j], self._world[name][:, None])
         self.values.copy_(torch.where(mask[None, :, None], drawn, self.values))
-        args = [wp.from_torch(mask), self._row["gain"], self._m.gain, episode, self.seed, gain]
+        args = [wp.from_torch(mask), self._m, episode, self.seed, gain]
         wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
 
     def launch_skin(self, touch: Tactile, forces: wp.array) -> wp.array:
         """Return felt forces [N, F, T] N as they reach each taxel's wire; `forces` itself where nothing lies between.
         touch: `Tactile`."""
-        m, n, f = self._m, self.shape[0], self.shape[1]
+        felt = self._felt
         if self.rubber:
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
-            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, forces, m.spread]
-            wp.launch(kernel, dim=(n, f), inputs=args, device=self.device)
-            forces = m.spread
+            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, forces, felt.spread]
+            wp.launch(kernel, dim=self.shape[:2], inputs=args, device=self.device)
+            forces = felt.spread
         if self.hysteresis:
-            args = [
-                forces,
-                self._row["hysteresis"],
-                self._row["hysteresis_time"],
-                touch.imperfect.now,
-                touch.imperfect.last,
-                touch.imperfect.state,
-                m.skin,
-            ]
+            args = [forces, self._m, touch.imperfect.measured, felt.skin]
             wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
-            forces = m.skin
+            forces = felt.skin
         if self.mixes:
-            wp.launch(
-                mix,
-                dim=self.shape,
-                inputs=[forces, self._row["crosstalk"], m.order, m.beside, m.mixed],
-                device=self.device,
-            )
-            forces = m.mixed
+            wp.launch(mix, dim=self.shape, inputs=[forces, self._m, felt.mixed], device=self.device)
+            forces = felt.mixed
         return forces
 
     def launch_stuck(self, touch: Tactile) -> None:
         """Write readings that never change over those that were just written into the ring."""
-        m = touch.imperfect
-        if self._m.stuck_at.shape[0]:
-            args = [self._m.stuck, self._m.stuck_at, m.effects.lsb, m.tick, float(self.cfg.full_scale), m.ring]
-            wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
+        if many := self._m.stuck_at.shape[0]:
+            args = [self._m, touch.imperfect.effects, touch.imperfect.measured]
+            wp.launch(stick, dim=(self.shape[0], many), inputs=args, device=self.device)
 
     def launch_choice(self, touch: Tactile) -> tuple[wp.array, wp.array, wp.array]:
         """Return (ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads
         have delays."""
-        m, own = touch.imperfect, self._m
+        m = touch.imperfect
         if not self.delayed:
             return m.ring, m.ring_shear, m.chosen
-        n, f, _ = self.shape
-        wp.launch(
-            choose,
-            dim=(n, f),
-            inputs=[m.stamps, m.now, self._row["delay"], own.older, own.newer, own.part, m.late],
-            device=self.device,
-        )
-        args = [
-            m.ring,
-            m.ring_shear,
-            own.older,
-            own.newer,
-            own.part,
-            m.effects.threshold,
-            m.effects.lsb,
-            float(self.cfg.full_scale),
-            self.cfg.shear,
-        ]
-        wp.launch(pick, dim=self.shape, inputs=[*args, own.ring, own.ring_shear], device=self.device)
-        return own.ring, own.ring_shear, own.chosen
+        args = [self._m, m.measured, m.stamps, m.late]
+        wp.launch(choose, dim=self.shape[:2], inputs=args, device=self.device)
+        args = [self._m, m.effects, m.measured, self.cfg.shear, self._ring, self._ring_shear]
+        wp.launch(pick, dim=self.shape, inputs=args, device=self.device)
+        return self._ring, self._ring_shear, self._chosen
 
 
 @wp.func
@@ -301,51 +290,34 @@ def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def relax_pads(
-    forces: wp.array3d(dtype=float),
-    fraction: wp.array2d(dtype=float),
-    time_constant: wp.array2d(dtype=float),
-    time: wp.array(dtype=float),
-    last: wp.array(dtype=float),
-    # in and out
-    state: wp.array3d(dtype=float),
-    # out
-    out: wp.array3d(dtype=float),
-):
+def relax_pads(forces: wp.array3d(dtype=float), own: Own, m: Measured, out: wp.array3d(dtype=float)):
     """Apply the standard linear solid of `dexsim.tactile.measure`, its constants by pad."""
     w, f, t = wp.tid()
     dt = float(0.0)
-    if last[w] >= 0.0:
-        dt = time[w] - last[w]
+    if m.last[w] >= 0.0:
+        dt = m.now[w] - m.last[w]
     z = forces[w, f, t]
-    s = relax(state[w, f, t], z, dt, time_constant[w, f])
-    state[w, f, t] = s
-    out[w, f, t] = rubber_force(z, s, fraction[w, f])
+    s = relax(m.state[w, f, t], z, dt, own.hysteresis_time[w, f])
+    m.state[w, f, t] = s
+    out[w, f, t] = rubber_force(z, s, own.hysteresis[w, f])
 
 
 @wp.kernel(enable_backward=False)
-def mix(
-    forces: wp.array3d(dtype=float),
-    crosstalk: wp.array2d(dtype=float),
-    order: wp.array2d(dtype=int),
-    beside: wp.array3d(dtype=int),
-    # out
-    out: wp.array3d(dtype=float),
-):
+def mix(forces: wp.array3d(dtype=float), own: Own, out: wp.array3d(dtype=float)):
     """Mix forces: a taxel keeps 1 - c of its own and gives c in equal parts to those beside it: the pad's sum stays.
     Then each wire carries the taxel at order[t]."""
     w, f, t = wp.tid()
-    k = order[f, t]
-    c = crosstalk[w, f]
+    k = own.order[f, t]
+    c = own.crosstalk[w, f]
     z = forces[w, f, k]
     if c > 0.0:
         got = float(0.0)
-        for i in range(beside.shape[2]):
-            j = beside[f, k, i]
+        for i in range(own.beside.shape[2]):
+            j = own.beside[f, k, i]
             if j >= 0:
                 many = float(0.0)
-                for h in range(beside.shape[2]):
-                    if beside[f, j, h] >= 0:
+                for h in range(own.beside.shape[2]):
+                    if own.beside[f, j, h] >= 0:
                         many += 1.0
                 got += forces[w, f, j] / many
         z = (1.0 - c) * z + c * got
@@ -354,19 +326,13 @@ def mix(
 
 @wp.kernel(enable_backward=False)
 def lay_gains(
-    mask: wp.array(dtype=bool),
-    of_pad: wp.array2d(dtype=float),
-    of_taxel: wp.array2d(dtype=wp.vec2),
-    episode: wp.array(dtype=int),
-    seed: int,
-    # in and out
-    gain: wp.array3d(dtype=float),
+    mask: wp.array(dtype=bool), own: Own, episode: wp.array(dtype=int), seed: int, gain: wp.array3d(dtype=float)
 ):
     """Set the gains: those that were drawn, times the taxel's own (uniform in its range), or the pad's."""
     w, f, t = wp.tid()
     if mask[w]:
-        g = of_pad[w, f]
-        ends = of_taxel[f, t]
+        g = own.gain[w, f]
+        ends = own.ends[f, t]
         if ends[0] >= 0.0:
             rng = wp.rand_init(seed + 104729 * episode[w], (w * gain.shape[1] + f) * gain.shape[2] + t)
             g = ends[0] + (ends[1] - ends[0]) * wp.randf(rng)
@@ -374,36 +340,20 @@ def lay_gains(
 
 
 @wp.kernel(enable_backward=False)
-def stick(
-    where: wp.array2d(dtype=int),
-    value: wp.array(dtype=float),
-    lsb: wp.array(dtype=float),
-    tick: wp.array(dtype=int),
-    full_scale: float,
-    # out
-    ring: wp.array4d(dtype=float),
-):
+def stick(own: Own, effects: Effects, m: Measured):
     """Let taxels [S, 2] (pad, taxel) read what they always read, in whole counts where there are counts."""
     w, i = wp.tid()
-    ring[tick[0] % ring.shape[0], w, where[i, 0], where[i, 1]] = counts(value[i], lsb[w], 0.0, full_scale)
+    slot = m.tick[0] % m.ring.shape[0]
+    m.ring[slot, w, own.stuck[i, 0], own.stuck[i, 1]] = counts(own.stuck_at[i], effects.lsb[w], 0.0, m.full_scale)
 
 
 @wp.kernel(enable_backward=False)
-def choose(
-    stamps: wp.array2d(dtype=float),
-    time: wp.array(dtype=float),
-    delay: wp.array2d(dtype=float),
-    # out
-    older: wp.array2d(dtype=int),
-    newer: wp.array2d(dtype=int),
-    part: wp.array2d(dtype=float),
-    late: wp.array(dtype=int),
-):
+def choose(own: Own, m: Measured, stamps: wp.array2d(dtype=float), late: wp.array(dtype=int)):
     """Find the two readings between which each pad's delayed moment lies, and how far along;
-    `dexsim.tactile.measure.stamp` has noted the times. older -1: none is as old yet."""
+    `dexsim.tactile.measure.stamp` has noted the times."""
     w, f = wp.tid()
     n = stamps.shape[1]
-    wanted = time[w] - delay[w, f]
+    wanted = m.now[w] - own.delay[w, f]
     a = int(-1)
     b = int(-1)
     oldest = int(0)
@@ -432,43 +382,34 @@ def choose(
             x = 1.0
     if b < 0:
         b = a
-    older[w, f] = a
-    newer[w, f] = b
-    part[w, f] = x
+    own.older[w, f] = a
+    own.newer[w, f] = b
+    own.part[w, f] = x
 
 
 @wp.kernel(enable_backward=False)
 def pick(
-    ring: wp.array4d(dtype=float),
-    ring_shear: wp.array4d(dtype=wp.vec2),
-    older: wp.array2d(dtype=int),
-    newer: wp.array2d(dtype=int),
-    part: wp.array2d(dtype=float),
-    threshold: wp.array(dtype=float),
-    lsb: wp.array(dtype=float),
-    full_scale: float,
-    shear: bool,
-    # out
-    out: wp.array4d(dtype=float),
+    own: Own, effects: Effects, m: Measured, shear: bool, out: wp.array4d(dtype=float),
     out_shear: wp.array4d(dtype=wp.vec2),
-):
+):  # fmt: skip
     """Write each pad's delayed reading into one slot, interpolated and again in whole counts; 0 where there is none
     yet."""
     w, f, t = wp.tid()
-    a = older[w, f]
-    b = newer[w, f]
-    x = part[w, f]
+    a = own.older[w, f]
+    b = own.newer[w, f]
+    x = own.part[w, f]
     z = float(0.0)
     xy = wp.vec2(0.0, 0.0)
     if a >= 0:
-        z = (1.0 - x) * ring[a, w, f, t] + x * ring[b, w, f, t]
-        if z <= threshold[w]:
+        lsb = effects.lsb[w]
+        z = (1.0 - x) * m.ring[a, w, f, t] + x * m.ring[b, w, f, t]
+        if z <= effects.threshold[w]:
             z = 0.0
-        z = counts(z, lsb[w], 0.0, full_scale)
+        z = counts(z, lsb, 0.0, m.full_scale)
         if shear:
-            half = wp.floor(0.5 * full_scale)
-            xy = (1.0 - x) * ring_shear[a, w, f, t] + x * ring_shear[b, w, f, t]
-            xy = wp.vec2(counts(xy[0], lsb[w], -half, half), counts(xy[1], lsb[w], -half, half))
+            half = wp.floor(0.5 * m.full_scale)
+            xy = (1.0 - x) * m.ring_shear[a, w, f, t] + x * m.ring_shear[b, w, f, t]
+            xy = wp.vec2(counts(xy[0], lsb, -half, half), counts(xy[1], lsb, -half, half))
     out[0, w, f, t] = z
     if shear:
         out_shear[0, w, f, t] = xy

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.tactile.kernel import Pads, Surroundings, pose_in, turn_in, xyz
+from dexsim.tactile.kernel import Pads, Surroundings, centre_of, pose_in, turn_in, xyz
 
 NO_ANCHOR = 1.0e9  # m, x of an anchor that is not there
 NEVER = 1.0e30  # s, stamp of a slot that holds no reading
@@ -220,18 +220,10 @@ def report_kernel(block: bool, shear: bool, raw: bool) -> wp.Kernel:
     """Reduce each world's chosen reading to force and centre per pad; [N, F] threads (serial) or tiles (block)."""
 
     def serial(
-        ring: wp.array4d(dtype=float),
-        ring_shear: wp.array4d(dtype=wp.vec2),
-        chosen: wp.array(dtype=int),
-        pads: Pads,
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        # out
-        force: wp.array2d(dtype=float),
-        centre: wp.array2d(dtype=wp.vec3),
-        out: wp.array3d(dtype=float),
-        out3: wp.array3d(dtype=wp.vec3),
-    ):
+        ring: wp.array4d(dtype=float), ring_shear: wp.array4d(dtype=wp.vec2), chosen: wp.array(dtype=int), pads: Pads,
+        here: Surroundings, force: wp.array2d(dtype=float), centre: wp.array2d(dtype=wp.vec3),
+        out: wp.array3d(dtype=float), out3: wp.array3d(dtype=wp.vec3),
+    ):  # fmt: skip
         w, f = wp.tid()
         slot = chosen[w]
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -248,25 +240,14 @@ def report_kernel(block: bool, shear: bool, raw: bool) -> wp.Kernel:
                 out[w, f, t] = z
                 if wp.static(shear):
                     out3[w, f, t] = wp.vec3(xy[0], xy[1], z)
-        at = pads.centre[f]
-        if total[3] > 0.0:
-            at = xyz(total) / total[3]
         force[w, f] = total[3]
-        centre[w, f] = xmat[w, pads.body[f]] * at + xpos[w, pads.body[f]]
+        centre[w, f] = here.xmat[w, pads.body[f]] * centre_of(pads, f, total) + here.xpos[w, pads.body[f]]
 
     def tiled(
-        ring: wp.array4d(dtype=float),
-        ring_shear: wp.array4d(dtype=wp.vec2),
-        chosen: wp.array(dtype=int),
-        pads: Pads,
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        # out
-        force: wp.array2d(dtype=float),
-        centre: wp.array2d(dtype=wp.vec3),
-        out: wp.array3d(dtype=float),
-        out3: wp.array3d(dtype=wp.vec3),
-    ):
+        ring: wp.array4d(dtype=float), ring_shear: wp.array4d(dtype=wp.vec2), chosen: wp.array(dtype=int), pads: Pads,
+        here: Surroundings, force: wp.array2d(dtype=float), centre: wp.array2d(dtype=wp.vec3),
+        out: wp.array3d(dtype=float), out3: wp.array3d(dtype=wp.vec3),
+    ):  # fmt: skip
         w, f, t = wp.tid()
         slot = chosen[w]
         z = float(0.0)
@@ -286,11 +267,8 @@ def report_kernel(block: bool, shear: bool, raw: bool) -> wp.Kernel:
         sums = wp.tile_sum(wp.tile(mine, preserve_type=True))
         total = sums[0]
         if t == 0:
-            at = pads.centre[f]
-            if total[3] > 0.0:
-                at = xyz(total) / total[3]
             force[w, f] = total[3]
-            centre[w, f] = xmat[w, pads.body[f]] * at + xpos[w, pads.body[f]]
+            centre[w, f] = here.xmat[w, pads.body[f]] * centre_of(pads, f, total) + here.xpos[w, pads.body[f]]
 
     return wp.kernel(tiled if block else serial, enable_backward=False, module="unique")
 

@@ -326,7 +326,6 @@ class Tactile:
         m = self._m
         if m is None:
             return
-        xpos, xmat = self.engine.wp.xpos, self.engine.wp.xmat
         wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
         pad = self.by_pad
         readings = a.readings if pad is None else pad.launch_skin(self, a.readings)
@@ -337,7 +336,7 @@ class Tactile:
         args = [m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late]
         wp.launch(stamp, dim=n, inputs=args, device=self.device)
         ring, ring_shear, chosen = (m.ring, m.ring_shear, m.chosen) if pad is None else pad.launch_choice(self)
-        args = [ring, ring_shear, chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
+        args = [ring, ring_shear, chosen, self._pads, self._around, m.force, m.centre, m.raw, m.raw3]
         grid = (n, self.layout.pads)
         if self.lanes:  # a block of one thread per taxel for each world and pad
             width = self._pads.taxel.shape[1]
