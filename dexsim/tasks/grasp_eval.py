@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -162,7 +163,7 @@ def _play(
     out = {k: v.cpu().numpy() for k, v in out.items()}
     frames = shot.frames(full=1.2 * env.f_max)
     if frames is not None:
-        names = [env.objects.scene.variants[int(v)].shape.name for v in out["shape"]]
+        names = _objects(out, env)
         frames["label"] = [f"{name}, {1000 * m:.0f} g, friction {mu:.1f}" for name, m, mu in
                            zip(names, out["mass"], out["friction"], strict=True)][: len(shot.worlds)]  # fmt: skip
         for row, share in zip(frames["overlay"], out["command"], strict=False):
@@ -279,28 +280,35 @@ def _correlations(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
 
 def _by_object(r: dict, env: GraspEnv) -> dict[str, float | None]:
     """Share of unpushed episodes held, command >= 0.1, by object."""
-    names = np.array([env.objects.scene.variants[int(v)].shape.name for v in r["shape"]])
+    names = _objects(r, env)
     among = ~r["pushed"].astype(bool) & (r["command"] >= 0.1)
     return {str(name): _rate(r["held"], among & (names == name)) for name in np.unique(names)}
+
+
+def _objects(r: dict, env: GraspEnv) -> np.ndarray:
+    """Return the name of each episode's object [E]."""
+    return np.array([env.objects.scene.variants[int(v)].shape.name for v in r["shape"]])
 
 
 def by_share(r: dict) -> dict:
     """Return episodes by the share of the normal contact force on the object that fingertips have just before the hold
     (the rest is links' and palm's), in fifths: their number, shares held of those without and with a push, and of all
     those still held with the hand turned by 180 degrees. Commands below 0.1 do not count; empty fifths are left out."""
-    bins = np.minimum((np.asarray(r["tips"]) * SHARES).astype(int), SHARES - 1)
+    bins = _bins(np.asarray(r["tips"]), SHARES)
     pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
-    rows: dict = {"from": [], "to": [], "episodes": [], "held": [], "held_pushed": [], "held_turned_180": []}
-    for b in range(SHARES):
-        among = firm & (bins == b)
-        if among.any():
-            rows["from"].append(b / SHARES)
-            rows["to"].append((b + 1) / SHARES)
-            rows["episodes"].append(int(among.sum()))
-            rows["held"].append(_rate(r["held"], among & ~pushed))
-            rows["held_pushed"].append(_rate(r["held"], among & pushed))
-            rows["held_turned_180"].append(_rate(r["held180"], among))
-    return rows
+    parts = [(b, m) for b in range(SHARES) if (m := firm & (bins == b)).any()]
+    return {
+        "from": [b / SHARES for b, _ in parts], "to": [(b + 1) / SHARES for b, _ in parts],
+        "episodes": [int(m.sum()) for _, m in parts],
+        "held": [_rate(r["held"], m & ~pushed) for _, m in parts],
+        "held_pushed": [_rate(r["held"], m & pushed) for _, m in parts],
+        "held_turned_180": [_rate(r["held180"], m) for _, m in parts],
+    }  # fmt: skip
+
+
+def _bins(x: np.ndarray, count: int) -> np.ndarray:
+    """Return which of so many equal parts of [0, 1] each number lies in."""
+    return np.minimum((x * count).astype(int), count - 1)
 
 
 def _of(x: np.ndarray, columns: list[int]) -> np.ndarray:
@@ -317,17 +325,14 @@ def _flexing(r: dict, env: GraspEnv) -> np.ndarray:
 def _by_command(r: dict, held: np.ndarray, torque: np.ndarray) -> dict:
     """Return held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95
     percentile) and the torque [E, K] of the flexion joints [N.m], their mean; empty tenths left out."""
-    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
-    total, torque = r["force"].sum(1), torque.mean(1)
-    rows: dict = {"command": [], "force_N": [], "force_range_N": [], "torque_Nm": []}
-    for b in range(BINS):
-        m = held & (bins == b)
-        if m.any():
-            rows["command"].append(float(r["command"][m].mean()))
-            rows["force_N"].append(float(total[m].mean()))
-            rows["force_range_N"].append([float(x) for x in np.percentile(total[m], [5, 95])])
-            rows["torque_Nm"].append(float(torque[m].mean()))
-    return rows
+    bins, total, torque = _bins(r["command"], BINS), r["force"].sum(1), torque.mean(1)
+    parts = [m for b in range(BINS) if (m := held & (bins == b)).any()]
+    return {
+        "command": [float(r["command"][m].mean()) for m in parts],
+        "force_N": [float(total[m].mean()) for m in parts],
+        "force_range_N": [[float(x) for x in np.percentile(total[m], [5, 95])] for m in parts],
+        "torque_Nm": [float(torque[m].mean()) for m in parts],
+    }
 
 
 def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
@@ -340,100 +345,58 @@ def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
     def value(name: str) -> str:
         return "-" if metrics.get(name) is None else f"{metrics[name]:.3f}"
 
-    said = (
-        "hold_rate",
-        "hold_rate_pushed",
-        "hold_rate_kept_out_shapes",
-        "force_command_correlation",
-        "torque_command_correlation",
-    )
+    said = ("hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation",
+            "torque_command_correlation")  # fmt: skip
+    held = (ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))
     return [
-        (
-            "Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
-            ("contact forces N", "joint torque N m", "force and command", "torque and command"),
-            [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))],
-        ),
-        (
-            "95 % intervals (of rates Wilson's, of correlations by bootstrap over episodes)",
-            ("quantity", "value", "interval"),
-            [(n, value(n), ends(f"{n}_interval", 4)) for n in said],
-        ),
-    ]
+        ("Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
+         ("contact forces N", "joint torque N m", "force and command", "torque and command"), [held]),
+        ("95 % intervals (of rates Wilson's, of correlations by bootstrap over episodes)",
+         ("quantity", "value", "interval"), [(n, value(n), ends(f"{n}_interval", 4)) for n in said]),
+    ]  # fmt: skip
 
 
 def _tables(r: dict, k: dict, env: GraspEnv) -> list:
     f_max, others = env.f_max, list(env.hand.others)
     n, names_of = len(others), [env.hand.finger_names[i] for i in others]
-    rows = []
-    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
-    pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
+    bins, pushed, held = _bins(r["command"], BINS), r["pushed"].astype(bool), r["held"].astype(bool)
+    rows: list[tuple] = []
     for b in range(BINS):
         m = bins == b
         if not m.any():
             continue
         h = m & held
-        force = r["force"][h][:, others].sum(1).mean() if h.any() else float("nan")
-        error = np.abs(r["force"][h][:, others] - r["command"][h, None] * f_max).mean() if h.any() else float("nan")
-        rows.append(
-            (
-                f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}",
-                int(m.sum()),
-                _pct(held, m & ~pushed),
-                _pct(held, m & pushed),
-                f"{n * f_max * (b + 0.5) / BINS:.1f}",
-                f"{force:.1f}",
-                f"{error:.2f}",
-            )
-        )
-    tables: list[tuple[str, tuple[str, ...], list[tuple]]] = [
-        (
-            "Hold and force by command",
-            ("F_cmd", "episodes", "held %", "held pushed %", f"asked N ({n} fingers)", "got N", "error N/finger"),
-            rows,
-        )
-    ]
-    mass_edges, mu_edges = [0.03, 0.065, 0.14, 0.31], [0.4, 0.67, 0.93, 1.21]
-    grid: list[tuple] = []
-    able = must_hold(r, f_max, n)
-    for light, heavy in zip(mass_edges[:-1], mass_edges[1:], strict=True):
+        got = r["force"][h][:, others]
+        off = np.abs(got - r["command"][h, None] * f_max)
+        force, error = (got.sum(1).mean(), off.mean()) if h.any() else (np.nan, np.nan)
+        rows.append((f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}", int(m.sum()), _pct(held, m & ~pushed),
+                     _pct(held, m & pushed), f"{n * f_max * (b + 0.5) / BINS:.1f}", f"{force:.1f}",
+                     f"{error:.2f}"))  # fmt: skip
+    able, grid = must_hold(r, f_max, n), []
+    for light, heavy in pairwise((0.03, 0.065, 0.14, 0.31)):
         line = [f"{1000 * light:.0f}-{1000 * min(heavy, 0.3):.0f} g"]
-        for c, d in zip(mu_edges[:-1], mu_edges[1:], strict=True):
+        for c, d in pairwise((0.4, 0.67, 0.93, 1.21)):
             among = (r["mass"] >= light) & (r["mass"] < heavy) & (r["friction"] >= c) & (r["friction"] < d)
             line.append(_pct(held, able & among))
         grid.append(tuple(line))
-    tables.append(
-        (
-            "Held % by mass and friction (where the command can carry the load)",
-            ("mass", "mu 0.4-0.67", "mu 0.67-0.93", "mu 0.93-1.2"),
-            grid,
-        )
-    )
-    by_shape = []
+    by_shape: list[tuple] = []
     for part, label in ((r, ""), (k, " (kept out)")):
-        able = must_hold(part, f_max, n)
-        names = np.array([env.objects.scene.variants[int(v)].shape.name for v in part["shape"]])
+        able, p = must_hold(part, f_max, n), part["pushed"].astype(bool)
+        names = _objects(part, env)
         for name in dict.fromkeys(names.tolist()):
             m = names == name
-            p = part["pushed"].astype(bool)
             h = m & part["held"].astype(bool)
             missing = [f"{100 * (part['force'][h, i] < 0.1).mean():.0f}" if h.any() else "-" for i in others]
-            by_shape.append(
-                (
-                    name + label,
-                    int(m.sum()),
-                    _pct(part["held"], m & ~p & (part["command"] >= 0.1)),
-                    _pct(part["held"], m & p & able),
-                    *missing,
-                )
-            )
-    tables.append(
-        (
-            "Held % by object, and % of held episodes in which a finger does not touch",
-            ("object", "episodes", "held %", "held pushed %", *names_of),
-            by_shape,
-        )
-    )
-    return tables
+            both = _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able)
+            by_shape.append((name + label, int(m.sum()), *both, *missing))
+    return [
+        ("Hold and force by command",
+         ("F_cmd", "episodes", "held %", "held pushed %", f"asked N ({n} fingers)", "got N", "error N/finger"), rows),
+        ("Held % by mass and friction (where the command can carry the load)",
+         ("mass", "mu 0.4-0.67", "mu 0.67-0.93", "mu 0.93-1.2"), grid),
+        ("Held % by object, and % of held episodes in which a finger does not touch",
+         ("object", "episodes", "held %", "held pushed %", *names_of), by_shape),
+    ]  # fmt: skip
 
 
 def _pct(ok: np.ndarray, among: np.ndarray) -> str:
@@ -452,7 +415,7 @@ def _force_plot(ax: Axes, r: dict, env: GraspEnv) -> None:
 
 
 def _hold_plot(ax: Axes, r: dict) -> None:
-    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
+    bins = _bins(r["command"], BINS)
     pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
     x = (np.arange(BINS) + 0.5) / BINS
     for label, sel, shift in (("unpushed", ~pushed, -0.02), ("pushed", pushed, 0.02)):
