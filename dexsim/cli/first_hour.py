@@ -84,7 +84,7 @@ class Step:
     picture: str = ""
 
     def judge(self, verdict: str, text: str) -> None:
-        """Say what speaks against a good result."""
+        """Give the verdict, and say why."""
         self.verdict = verdict
         self.text.append(text)
 
@@ -207,7 +207,7 @@ class Session:
 
 
 class Hour:
-    """The steps, over a `Session`. Each returns a `Step`."""
+    """The steps, over a `Session`. Each fills its `Step`."""
 
     def __init__(self, session: Session, info: dict[str, str], given: dict[str, Any], out: Path, say: Callable):
         self.s, self.info, self.given, self.out, self.say = session, info, given, out, say
@@ -232,20 +232,17 @@ class Hour:
             self.s.recorder.close(120.0)
             self.s.recorder = whole
 
-    def connection(self) -> Step:
+    def connection(self, step: Step) -> None:
         """See: the serial number is your hand's."""
-        step = Step("connection", "Connection and versions")
         step.text = [f"{k}: {v}" for k, v in self.info.items() if v]
         step.figures = dict(self.info)
-        return step
 
-    def cycles(self) -> Step:
+    def cycles(self, step: Step) -> None:
         """See: nothing moves; you may move the fingers by hand."""
         t = self.s.watch(5.0, 0.25 * PERIOD)
         gaps = 1e3 * np.diff(t.stamp)
         rate = 1e3 / gaps.mean()
         noise = np.std(np.diff(t.position, axis=0), 0) / 2**0.5
-        step = Step("cycles", "Cycle times and their tail")
         step.figures = {"rate_Hz": rate, "median_ms": float(np.median(gaps)), "p99_ms": float(np.percentile(gaps, 99)),
                         "largest_ms": float(gaps.max()), "jitter_rad": float(np.median(noise))}  # fmt: skip
         step.text = [
@@ -256,12 +253,10 @@ class Hour:
         if rate < 80 or gaps.max() > 110:
             step.judge("look", "slower than the 9.6 ms a cycle that others measure: is another program on the port?")
         step.picture = _picture(lambda ax: (ax.hist(gaps, bins=40), ax.set_xlabel("ms between readings")))
-        return step
 
-    def signs(self) -> Step:
+    def signs(self, step: Step) -> None:
         """See: one joint after the other closes a little, opens, and goes to both ends of its range; nothing
         strains."""
-        step = Step("signs", "Signs and ranges, joint by joint")
         self.s.move(_still(self.middle), 4.0, self.amps)
         rows: dict[str, Any] = {}
         for j in self.joints:
@@ -311,11 +306,9 @@ class Hour:
         if more:
             step.text.append("needed more than current=: " + ", ".join(f"{n} {x}" for n, x in more.items()))
         step.figures = rows
-        return step
 
-    def limp(self) -> Step:
+    def limp(self, step: Step) -> None:
         """See: once the hand is let go, press its fingers gently: they give way."""
-        step = Step("limp", "Does letting go make it limp?")
         self.s.move(_still(self.middle), 1.0, self.amps)
         ok, text = self.s.relax()
         t = self.s.watch(4.0)
@@ -326,13 +319,11 @@ class Hour:
             step.judge("bad", "it still resists: do not run a policy before you know how to cut its power at once")
         elif moved < MOVED:
             step.judge("look", "nobody moved a finger: that it gives way is not shown")
-        return step
 
-    def zero(self) -> Step:
+    def zero(self, step: Step) -> None:
         """See: nothing touches the fingertips."""
-        step = Step("zero", "Zero of touch")
         if not self.s.taxels[0]:
-            return Step("zero", "Zero of touch", "skipped", ["this hand feels nothing"])
+            return step.judge("skipped", "this hand feels nothing")
         frames, silent = [], np.zeros(self.s.taxels[0], bool)
         for _ in range(50):
             self.s.watch(2 * PERIOD)
@@ -347,13 +338,11 @@ class Hour:
                      for n, v in step.figures.items()]  # fmt: skip
         if silent.any():
             step.judge("look", "boards that say nothing: " + ", ".join(np.array(names)[silent]))
-        return step
 
-    def taxels(self) -> Step:
+    def taxels(self, step: Step) -> None:
         """See: press the corner that is named with a pin, until the next finger is named."""
-        step, layout = Step("taxels", "Which taxel is which"), hand_layout(self.hand)
-        if layout is None:
-            return Step("taxels", "Which taxel is which", "skipped", ["this hand feels nothing"])
+        if hand_layout(self.hand) is None:
+            return step.judge("skipped", "this hand feels nothing")
         # a pad's index is column * 12 + row
         guesses = {11: "as in our layout", 119: "columns are mirrored", 0: "rows are mirrored",
                    108: "rows and columns are mirrored", 110: "counted row by row"}  # fmt: skip
@@ -378,22 +367,20 @@ class Hour:
             step.text.append(f"{name}: index {k} (row {row}, column {column}) felt most: {guesses[corner]}")
             if corner != 11:
                 step.verdict = "bad"
-        return step
 
-    def latency(self) -> Step:
+    def latency(self, step: Step) -> None:
         """See: single joints twitch by a few degrees."""
-        step = Step("latency", "From command to motion")
-        step.figures = latency(self.s, self.middle, self.joints, self.amps)
-        if not step.figures["ms"]:
-            return Step("latency", step.title, "bad", ["no joint moved at this current; raise current="])
+        found = latency(self.s, self.middle, self.joints, self.amps)
+        if not found["ms"]:
+            return step.judge("bad", "no joint moved at this current; raise current=")
+        step.figures = found
         all_ms = [x for row in step.figures["ms"].values() for x in row]
         step.text = [f"{np.median(all_ms):.0f} ms from a command until the reading that shows motion (median of"
                      f" {len(all_ms)} steps; {min(all_ms):.0f} to {max(all_ms):.0f} ms)"]  # fmt: skip
-        return step
 
-    def lowest(self) -> Step:
+    def lowest(self, step: Step) -> None:
         """See: each joint begins to move a little, by itself, as its current limit rises."""
-        step, rows = Step("lowest", "The lowest current that moves each joint"), {}
+        rows = {}
         for j in self.joints:
             self.s.move(_still(self.middle), 1.0, self.amps)
             at, goal = float(self.s.newest.position[j]), self.middle.copy()
@@ -411,14 +398,12 @@ class Hour:
         step.text = [f"{n}: {over if x is None else format(x, 'g')} mA" for n, x in rows.items()]
         if still:
             step.judge("bad", f"{', '.join(still)} did not move at all: blocked, or switched off?")
-        return step
 
-    def excite(self) -> Step:
+    def excite(self, step: Step) -> None:
         """See: the whole hand moves for a minute; keep objects and hands away."""
         from dexsim.recording.excitation import Limits, plan
         from dexsim.recording.mechanism import mechanism
 
-        step = Step("excite", "A recorded excitation, its audit and diagnosis")
         most = self.most
         self.s.relax()
         m = mechanism(hand=self.hand)
@@ -443,14 +428,13 @@ class Hour:
             step.text.append("servo.yaml holds the drives that the diagnosis fitted; diagnosis/report.html says why")
         else:
             step.judge("look", f"the diagnosis ended: {(servo.stderr or servo.stdout).strip().splitlines()[-1:]}")
-        return step
 
-    def calibrate(self) -> Step:
+    def calibrate(self, step: Step) -> None:
         """See: press the pad that is named all over with something blunt, as hard as you would hold a cup; then hold
         something hard to the fingertip that is named, which presses it harder and harder."""
-        step, names = Step("calibrate", "Taxels and currents under load"), self.hand.finger_names
+        names = self.hand.finger_names
         if hand_layout(self.hand) is None:
-            return Step("calibrate", step.title, "skipped", ["this hand feels nothing"])
+            return step.judge("skipped", "this hand feels nothing")
         press = getattr(self.s.driver, "press", None)
         with self.recorded("touch.mcap"):
             for f, name in enumerate(names):
@@ -467,8 +451,8 @@ class Hour:
                        f"hand_mirror={str(self.hand.mirror).lower()}")  # fmt: skip
         said = [line[9:] for line in done.stdout.splitlines() if line.startswith("touch    ")]
         if done.returncode:
-            text = f"not calibrated: {(done.stderr.strip() or done.stdout)[-300:]}"
-            return Step("calibrate", step.title, "look", [text], {"status": done.returncode})
+            step.figures = {"status": done.returncode}
+            return step.judge("look", f"not calibrated: {(done.stderr.strip() or done.stdout)[-300:]}")
         file = self.out / "calibration" / "calibration.yaml"
         entries = yaml_text.load(file, "calibration").get("joints", {})
         ratios = {n: entries.get(n, {}).get("current_per_torque", {}).get("value") for n in joints}
@@ -478,7 +462,6 @@ class Hour:
                      " calibration/calibration.yaml, for deploy and export calibration="]  # fmt: skip
         if any("0 dead; 0 swapped pairs; 0 not pressed" not in x for x in said) or not all(ratios.values()):
             step.verdict = "look"
-        return step
 
     def _presses(self, joints: Sequence[str]) -> None:
         """Record in press.mcap joints that press against what is held to their fingertip, at rising currents."""
@@ -496,16 +479,15 @@ class Hour:
                 block(-1)
                 self.s.move(_still(self.middle), 0.5, self.amps)
 
-    def bundle(self) -> Step:
+    def bundle(self, step: Step) -> None:
         """See: nothing moves."""
         from dexsim.calibration.file import Calibration
         from dexsim.deploy import bundle as bundles
         from dexsim.deploy.driver import VirtualClock
         from dexsim.deploy.simulated_hand import SimulatedXHand
 
-        step = Step("bundle", "Is the hand what this policy was trained for?")
         if not self.given["bundle"]:
-            return Step("bundle", step.title, "skipped", ["say which policy: bundle=DIR"])
+            return step.judge("skipped", "say which policy: bundle=DIR")
         b = bundles.load(self.given["bundle"])
         c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
         clock = VirtualClock()
@@ -519,7 +501,7 @@ class Hour:
         more = b.config.get("randomize", {}).get("servo", {}).get("delay", 0.0)
         reach = 1e3 * (max(more) if isinstance(more, list) else float(more))
         if not here.get("ms") or not there["ms"]:
-            return Step("bundle", step.title, "look", ["latency was not measured: nothing to compare"])
+            return step.judge("look", "latency was not measured: nothing to compare")
         ms = [float(np.median([x for r in f["ms"].values() for x in r])) for f in (here, there)]
         rise = [float(np.median([x for r in f["rise_ms"].values() for x in r] or [np.nan])) for f in (here, there)]
         step.figures = {"latency_ms": ms[0], "trained_ms": ms[1], "trained_up_to_ms": ms[1] + reach,
@@ -553,8 +535,6 @@ class Hour:
             step.text.append(f"encoders at rest {noise:.4f} rad, in training {quiet:g}")
         if slow or stiff or others or short or off or (noise or 0.0) > quiet:
             step.judge("look", "train with servo_file=servo.yaml, which holds what was measured here")
-        return step
-
 
     def _drives(self, b: Any) -> tuple[list[str], dict[str, Any]]:
         """Return what the fitted drives have outside of what training drew, in words, by joint and column."""
@@ -582,8 +562,14 @@ class Hour:
         return words, rows
 
 
-STEPS = ("connection", "cycles", "signs", "limp", "zero", "taxels", "latency", "lowest", "excite", "calibrate",
-         "bundle")  # fmt: skip
+STEPS = {
+    "connection": "Connection and versions", "cycles": "Cycle times and their tail",
+    "signs": "Signs and ranges, joint by joint", "limp": "Does letting go make it limp?", "zero": "Zero of touch",
+    "taxels": "Which taxel is which", "latency": "From command to motion",
+    "lowest": "The lowest current that moves each joint", "excite": "A recorded excitation, its audit and diagnosis",
+    "calibrate": "Taxels and currents under load", "bundle": "Is the hand what this policy was trained for?",
+}  # fmt: skip
+"""The steps in their order, by the title of each in the report."""
 
 
 def latency(s: Session, middle: np.ndarray, joints: Sequence[int], current: Any) -> dict[str, Any]:
@@ -689,8 +675,10 @@ def walk(
                 if answer == "s":
                     hour.found[name] = Step(name, name, "skipped")
                     continue
+            step = Step(name, STEPS[name])
             try:
-                hour.found[name] = step = work()
+                work(step)
+                hour.found[name] = step
                 session.relax()  # nobody turns the loop while a person reads, or a motion is planned
             except Stopped as why:
                 hour.found[name] = step = Step(name, name, "bad", [f"let go: {why}"])
