@@ -4,8 +4,10 @@ same laws in NumPy, written apart, as their check.
 
 Where several laws make up one quantity they are put together here, for both kernels, in the order of the signal:
 `encoder_error`, `command_delay`, `dragged_target`, `heard_speed`, `lost_error`, `warm_motor`, `supply_left`,
-`dry_friction`, `friction_acts`, `parasitic_torque`. `of` is there a drive's row of the table, in the order
-of `columns.py`.
+`dry_friction`, `friction_acts`, `parasitic_torque`. Each gives a Warp function, for a kernel with these of
+`columns.FEATURES`; `of` is there a drive's row of the table, in the order of `columns.py`. A further law of such a
+quantity is a function of this file, a term there, and a term of the same function of `reference.py`: training, search
+and what a diagnosis hands on take the quantity from these two.
 
 Laws with memory: all of them are given what their drive remembers and hand it on. memory: a vector, `columns.MEMORY`
 has the place of each number; fresh: nothing is remembered yet (the first step after a reset), a law begins from rest
@@ -93,13 +95,9 @@ def encoder_line(q: Any, scale: Any, offset: Any):
 
 @cache
 def encoder_error(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of what an encoder shows beyond scale * q + offset, as a sum of laws of the position,
-    for a kernel with these of `columns.FEATURES`.
-
-    A further such law is a function of this file and a term of `error` and `slope` here, and in
-    `reference.measured_position`; its columns are marked `encoder`. Training, search, recordings and whoever asks what
-    a position is from what is shown take the encoder from these two, at any time: none of our encoders
-    remembers."""
+    """Return what an encoder shows beyond scale * q + offset, as a sum of laws of the position (terms of `error` and
+    `slope`, and of `reference.measured_position`; columns are marked `encoder`). Recordings, and whoever asks what a
+    position is from what is shown, take the encoder from these two, at any time: none of our encoders remembers."""
 
     @wp.func
     def error(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool):
@@ -124,11 +122,9 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
 
 @cache
 def command_delay(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of how long after its time a target acts, as a sum of laws of the time and of what is
-    remembered, for a kernel with these of `columns.FEATURES`.
-
-    A further such law (a delay that varies, or grows) is a function of this file and a term of `late` here, and in
-    `reference.command_delay`; its columns are marked `delays`, so that a servo keeps its targets for as long."""
+    """Return how long after its time a target acts, as a sum of laws of the time and of what is remembered (a delay
+    that varies, or grows: terms of `late`; columns are marked `delays`, so that a servo keeps its targets for as
+    long)."""
 
     @wp.func
     def delay(of: wp.array(dtype=Any), t: Any, memory: Any, fresh: bool, dt: Any):
@@ -149,11 +145,8 @@ def arrived(end: Any, stamp: Any, dt: Any):
 
 @cache
 def dragged_target(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of how far another joint (column `coupling_from`) drags a joint's target, as a sum of
-    laws of where that is, for a kernel with these of `columns.FEATURES`.
-
-    A further such law (a tendon that is slack at first, one that gives) is a function of this file and a term of
-    `shift` here, and in `reference.dragged_target`; it needs the feature `rare`."""
+    """Return how far another joint (column `coupling_from`) drags a joint's target, as a sum of laws of where that is
+    (a tendon that is slack at first, one that gives: terms of `shift`); needs the feature `rare`."""
 
     @wp.func
     def dragged(of: wp.array(dtype=Any), away: Any, memory: Any, fresh: bool, dt: Any):
@@ -187,13 +180,9 @@ def stage_before(before: Any, after: Any, share: Any):
 
 @cache
 def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> Any:
-    """Return the Warp function of the speed that a loop's gain kd acts on, for a kernel with these of
-    `columns.FEATURES`;
-    skips: whether a filter without a lag passes the speed as it is, where it else comes out but for rounding: each
-    kernel keeps its own, as of `dry_friction`.
-
-    A further filter of the speed is a function of this file and one more step from v to `now` here, and in
-    `reference.heard_speed`."""
+    """Return the speed that a loop's gain kd acts on; a further filter is one more step from v to `now`. skips:
+    whether a filter without a lag passes the speed as it is, where it else comes out but for rounding: each kernel
+    keeps its own, as of `dry_friction`."""
 
     @wp.func
     def heard(of: wp.array(dtype=Any), v: Any, memory: Any, fresh: bool, dt: Any):
@@ -231,11 +220,8 @@ def warmed(per_degree: Any, warmth: Any):
 
 @cache
 def warm_motor(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of what a motor can do as it is now, for a kernel with these of `columns.FEATURES`.
-
-    A further such law (a motor that heats up as it works, one that weakens) is a function of this file and a term of
-    `warm`, or a factor of what is returned, here, and in `reference.warm_motor`: training, search and what a diagnosis
-    hands on take the motor from these two."""
+    """Return what a motor can do as it is now; a further law (a motor that heats up as it works, one that weakens) is
+    a term of `warm`, or a factor of what is returned."""
 
     @wp.func
     def motor(of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any):
@@ -274,11 +260,8 @@ def sagging(supply: Any, per_torque: Any, others: Any):
 
 @cache
 def supply_left(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of what is left of a supply that other motors load, for a kernel with these of
-    `columns.FEATURES`.
-
-    A further such law (a battery that empties, a converter that limits) is a function of this file and one more step
-    from the supply to what is left here, and in `reference.supply_left`; it needs the feature `sag`."""
+    """Return what is left of a supply that other motors load; a further law (a battery that empties, a converter that
+    limits) is one more step from the supply to what is left. Needs the feature `sag`."""
 
     @wp.func
     def remaining(of: wp.array(dtype=Any), supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
@@ -448,28 +431,16 @@ def opposed_square(motor: Any, outside: Any, per_motor: Any, per_outside: Any):
 
 @cache
 def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf) -> Any:
-    """Return the Warp function of a drive's dry friction, as a sum of laws, for a kernel with these of
-    `columns.FEATURES`;
-    gone: `stribeck_power` from which on nothing of the column `stribeck_peak` is left.
-
-    A further such law is a function of this file and a term of `steady` here, and in `reference.dry_friction`:
-    training, search and what a diagnosis hands on take their friction from these two. How a level acts on the joint is
-    told by `friction_acts`; that it sticks is the kernels' own."""
+    """Return a drive's dry friction, as a sum of laws (terms of `steady`). gone: `stribeck_power` from which on nothing
+    of the column `stribeck_peak` is left. How a level acts on the joint is told by `friction_acts`; that it sticks is
+    the kernels' own."""
     own = added("dry_friction", features)
 
     @wp.func
     def friction(
-        of: wp.array(dtype=Any),
-        q: Any,
-        v: Any,
-        motor: Any,
-        outside: Any,
-        carries: bool,
-        warm: Any,
-        memory: Any,
-        fresh: bool,
-        dt: Any,
-    ):
+        of: wp.array(dtype=Any), q: Any, v: Any, motor: Any, outside: Any, carries: bool, warm: Any, memory: Any,
+        fresh: bool, dt: Any,
+    ):  # fmt: skip
         """Return (level [N.m], memory), the level as four parts of a sum: what neither speed nor load changes; what
         falls with speed; by the load; by the load and falling with speed. Four, since in finite precision a sum
         depends on its order, and each kernel keeps its own, so that results made before can be made again bit for bit.
@@ -506,12 +477,9 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
 
 @cache
 def friction_acts(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of how a level of dry friction (`dry_friction`) acts on the joint, as sums of laws of
-    position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
-
-    A further such law (friction that differs by direction at one side of the turn, a seal that gives way farther after
-    a rest) is a function of this file and a term here, and in `reference.friction_acts`: training, search and what a
-    diagnosis hands on take it from these two. What gives way needs the feature `presliding`."""
+    """Return how a level of dry friction (`dry_friction`) acts on the joint, as sums of laws of position, speed and
+    what is remembered (friction that differs by direction at one side of the turn, a seal that gives way farther after
+    a rest). What gives way needs the feature `presliding`."""
 
     @wp.func
     def acts(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
@@ -596,11 +564,8 @@ def ripple_wave(angle: Any, shape: Any):
 
 @cache
 def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of all torque of a drive that neither its motor is asked for nor is dry friction, as
-    a sum of laws of position, speed and what is remembered, for a kernel with these of `columns.FEATURES`.
-
-    A further such law is a function of this file and a term here, and in `reference.parasitic_torque`: training, search
-    and what a diagnosis hands on take their torque from these two."""
+    """Return all torque of a drive that neither its motor is asked for nor is dry friction, as a sum of laws of
+    position, speed and what is remembered."""
     own = added("parasitic_torque", features)
 
     @wp.func
@@ -673,12 +638,9 @@ def profiled(at: Any, speed: Any, target: Any, most: Any, acceleration: Any, dt:
 
 @cache
 def lost_error(features: frozenset[str] = frozenset()) -> Any:
-    """Return the Warp function of what of its error a loop does not act on, as a sum of laws of the target, the
-    error and what is remembered, for a kernel with these of `columns.FEATURES`.
-
-    A further such law (another dead zone, an error that is limited, a target that is rounded or smoothed, a position
-    that the loop has filtered) is a function of this file and a term of `lost` and `slope` here, and in
-    `reference.lost_error`: training, search and what a diagnosis hands on take the error from these two."""
+    """Return what of its error a loop does not act on, as a sum of laws of the target, the error and what is
+    remembered (another dead zone, an error that is limited, a target that is rounded or smoothed, a position that the
+    loop has filtered: terms of `lost` and `slope`)."""
 
     @wp.func
     def lost_of(of: wp.array(dtype=Any), target: Any, e: Any, memory: Any, fresh: bool, dt: Any):

@@ -1,5 +1,8 @@
 """The servo's laws in NumPy float64 for arrays of any shape: what a search along measured motions takes, and what the
-kernels are checked against. Written apart from `laws.py` and `kernel.py`."""
+kernels are checked against. Written apart from `laws.py` and `kernel.py`.
+
+p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that count;
+step: what laws remember, None from rest."""
 
 from __future__ import annotations
 
@@ -75,9 +78,7 @@ def command_delay(
     p: Mapping[str, Numbers], t: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> Numbers:
     """Return how long after its time a target acts [...] s, in a step that begins at t [...] s: of all terms of
-    `laws.command_delay`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    `laws.command_delay`."""
     step = step or Step()
     late = p["delay"]
     return late
@@ -87,9 +88,7 @@ def dragged_target(
     p: Mapping[str, Numbers], away: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> Numbers:
     """Shift [...] rad of a joint's target by another that is `away` [...] rad from its home: of all terms of
-    `laws.dragged_target`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    `laws.dragged_target`."""
     step = step or Step()
     shift = p["coupling"] * away if "rare" in features else np.zeros(())
     return shift
@@ -100,9 +99,7 @@ def supply_left(
     step: Step | None = None,
 ) -> Numbers:  # fmt: skip
     """Supply [...] over nominal where it would be `supply` [...] without load and the other motors give |torque| of
-    `others` [...] N.m together: of all steps of `laws.supply_left`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    `others` [...] N.m together: of all steps of `laws.supply_left`."""
     step = step or Step()
     there = supply * np.maximum(1.0 - p["sag"] * others, 0.05) if "sag" in features else supply
     return there
@@ -142,9 +139,7 @@ def lost_error(
     step: Step | None = None,
 ) -> tuple[Numbers, Numbers, Numbers]:  # fmt: skip
     """Return (what of the error e [...] rad to a target [...] rad a loop does not act on [rad], its slope in e, what
-    acts: 0 no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    acts: 0 no torque, 1 all but the error's, 2 all): of all terms of `laws.lost_error`."""
     step = step or Step()
     kind = p["deadband_kind"] if "rare" in features else 0.0
     behind = target - setpoint(p, target, target - e, step) if "profile" in features else np.zeros(np.shape(e))
@@ -159,9 +154,7 @@ def heard_speed(
     p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Return (speed [...] rad/s that kd acts on where the encoder's is v [...] rad/s, at the end of a step at
-    unchanged v, share of a change of v that passes): of all filters of `laws.heard_speed`.
-
-    p: columns by name; features: those of `columns.FEATURES` that count; step: None from rest."""
+    unchanged v, share of a change of v that passes): of all filters of `laws.heard_speed`."""
     if "rare" not in features:
         return v, v, 1.0
     step = step or Step()
@@ -186,10 +179,7 @@ def warm_motor(
 ) -> tuple[Numbers, Numbers, Numbers, Numbers]:  # fmt: skip
     """Return (stall torque [...] N.m, no-load speed [...] rad/s, efficiency [...], factor [...] on the friction) of
     a motor as
-    it is now: of all of `laws.warm_motor`.
-
-    p: columns by name; torque [...] N.m that it gave before; features: those of `columns.FEATURES` that count; step:
-    None from rest."""
+    it is now: of all of `laws.warm_motor`. torque [...] N.m that it gave before."""
     step = step or Step()
     tau0, no_load, efficiency, rubs = p["torque_limit"], p["no_load_speed"], p["efficiency"], np.ones(())
     if "rare" in features:
@@ -244,10 +234,7 @@ def parasitic_torque(
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Return (torque [...] N.m, its slopes in position [N.m/rad] and speed [N.m.s/rad]) of a drive that neither its
     motor is
-    asked for nor is dry friction: of all terms of `laws.parasitic_torque`.
-
-    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
-    count; step: None from rest."""
+    asked for nor is dry friction: of all terms of `laws.parasitic_torque`."""
     step = step or Step()
     angle = p["ripple_per_turn"] * q + p["ripple_phase"]
     wave, tilt = np.sin(angle), np.cos(angle)
@@ -279,10 +266,7 @@ def dry_friction(
     features: Collection[str] = FEATURES, step: Step | None = None,
 ) -> Numbers:  # fmt: skip
     """Return the level [...] N.m of a drive's dry friction at the temperature of its columns: of all terms of
-    `laws.dry_friction`.
-
-    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; motor, outside: torques on the gear's two sides,
-    N.m; features: those of `columns.FEATURES` that count; step: None from rest."""
+    `laws.dry_friction`. motor, outside: torques on the gear's two sides, N.m."""
     step = step or Step()
     exponent = p["stribeck_exponent"] if "shape" in features else 2.0
     fades = np.exp(-(np.abs(v / p["stribeck_speed"]) ** exponent))
@@ -306,19 +290,14 @@ def friction_acts(
     p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers]:
     """(share [...] by which the level moving positive is above the mean of both directions, how far [...] rad the joint
-    gives way before it slides): of all terms of `laws.friction_acts`.
-
-    p: columns by name; q [rad] of the joint, v [rad/s] of the motor; features: those of `columns.FEATURES` that
-    count; step: None from rest."""
+    gives way before it slides): of all terms of `laws.friction_acts`."""
     step = step or Step()
     uneven, give = 0.5 * p["friction_asymmetry"], p["presliding"] if "presliding" in features else np.zeros(())
     return uneven, give
 
 
 def viscous(p: Mapping[str, Numbers], v: Numbers, features: Collection[str] = FEATURES) -> Numbers:
-    """Return the friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`.
-
-    p: columns by name; v [rad/s] of the motor; features: those of `columns.FEATURES` that count."""
+    """Return the friction per speed [...] N.m.s/rad at the temperature of its columns: of `laws.viscous`."""
     if "shape" not in features:
         return p["viscous_friction"]
     half = p["thinning_speed"]
