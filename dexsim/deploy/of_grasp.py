@@ -72,7 +72,7 @@ class Measured(Measure):
 
     def commanded(self, given: Any) -> list[float]:
         """Return the commanded force, a share of F_max (0.5 for None). Raises UserError."""
-        return commanded(given, [0.5], "grasp", 0.0, 1.0)
+        return commanded(given, [0.5], str(self.manifest["task"]), 0.0, 1.0)
 
     @torch.inference_mode()
     def observe(
