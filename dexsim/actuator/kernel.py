@@ -314,18 +314,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def control(
-        dt: real,
-        queue: int,
-        x0: int,
-        fresh: bool,
-        s: Sensed,
-        memory: Memory,
-        lower: real,
-        upper: real,
-        d: Drives,
-        w: int,
-        j: int,
-    ):
+        dt: real, queue: int, x0: int, fresh: bool, s: Sensed, memory: Memory, lower: real, upper: real, d: Drives,
+        w: int, j: int,
+    ):  # fmt: skip
         """Return ((now, end, slope), memory), what the loop asks for, torque [N.m] or duty; -lower .. upper: the
         limits, at which its integral waits."""
         waits, carry = late(d.params[w, j], d.time[w], memory, fresh, dt)
@@ -411,18 +402,9 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
 
     @wp.func
     def ask(
-        dt: real,
-        queue: int,
-        x0: int,
-        fresh: bool,
-        s: Sensed,
-        memory: Memory,
-        r: Rotor,
-        m: Motor,
-        d: Drives,
-        w: int,
+        dt: real, queue: int, x0: int, fresh: bool, s: Sensed, memory: Memory, r: Rotor, m: Motor, d: Drives, w: int,
         j: int,
-    ):
+    ):  # fmt: skip
         """Return (the motor's torque after its lag, memory); writes what the current shows."""
         t = Torque()
         carry = memory

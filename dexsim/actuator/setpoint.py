@@ -20,15 +20,9 @@ PROFILE = ("profile_speed", "profile_acceleration")
 def _kernel() -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def follow(
-        dt: f64,
-        t0: f64,
-        limits: wp.array2d(dtype=f64),
-        begun: wp.array2d(dtype=f64),
-        stamps: wp.array(dtype=f64),
-        targets: wp.array2d(dtype=f64),
-        steps: wp.array(dtype=int),
-        out: wp.array3d(dtype=f64),
-    ):
+        dt: f64, t0: f64, limits: wp.array2d(dtype=f64), begun: wp.array2d(dtype=f64), stamps: wp.array(dtype=f64),
+        targets: wp.array2d(dtype=f64), steps: wp.array(dtype=int), out: wp.array3d(dtype=f64),
+    ):  # fmt: skip
         n = wp.tid()
         column = wp.min(n, targets.shape[1] - 1)
         at = begun[n, 0]
@@ -61,14 +55,9 @@ def _kernel() -> wp.Kernel:
 
 
 def setpoints(
-    rows: np.ndarray,
-    begun: np.ndarray,
-    stamps: np.ndarray,
-    targets: np.ndarray,
-    start: float,
-    times: np.ndarray,
+    rows: np.ndarray, begun: np.ndarray, stamps: np.ndarray, targets: np.ndarray, start: float, times: np.ndarray,
     dt: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return the setpoint [rad] and its speed [rad/s] at `times` [W] s, [N, W, 2]: by the law of `laws.profiled` in
     steps of dt s, from position and speed `begun` [N, 2] at `start` s.
 

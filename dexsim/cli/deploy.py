@@ -297,7 +297,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
 
             side = b.hand.handedness
             driver = VendorXHand(given.get("port", "auto"), serial=given.get("serial"), side=side, hang=hang)
-        return driver, _imu(given, b) if needs == ORIENTATION else place
+        return driver, _imu(given) if needs == ORIENTATION else place
     vision = typed.one_of("vision", given.get("vision", "truth"), ("truth", "camera"))
     config = b.config
     shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
@@ -326,7 +326,7 @@ def _own(kind: str, given: dict[str, str], b: Any, calibration: Any, place: Any)
     lacks = [x for x in ("open", "read", "send", "relax", "close") if not callable(getattr(driver, x, None))]
     if lacks:
         raise UserError(f"driver={kind}: has no {', '.join(lacks)}; see dexsim.deploy.driver.HandDriver")
-    return driver, place or (_imu(given, b) if "imu" in given else driver)
+    return driver, place or (_imu(given) if "imu" in given else driver)
 
 
 def _ros2(given: dict[str, str], hand: Any) -> Any:
@@ -340,7 +340,7 @@ def _ros2(given: dict[str, str], hand: Any) -> Any:
     return Ros2Hand(hand, state or STATE, command or COMMAND, message=message, effort=effort)
 
 
-def _imu(given: dict[str, str], b: Any) -> Any:
+def _imu(given: dict[str, str]) -> Any:
     """Return the IMU in the object."""
     from dexsim.deploy.imu import UdpImu
 

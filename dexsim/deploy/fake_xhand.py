@@ -244,7 +244,6 @@ class _Control:
         self._crc_at, self._boot_until = -np.inf, -np.inf
 
     # -- the package's calls
-    # ---------------------------------------------------------------------------------------------------------------
     def enumerate_devices(self, kind: str) -> list[str]:
         """Return ports of a kind: RS485, EtherCAT."""
         return list(self._fake.ports()) if kind == ("EtherCAT" if self._fake.faults.ethercat else "RS485") else []
@@ -318,7 +317,6 @@ class _Control:
         self._port = ""
 
     # -- the wire
-    # ---------------------------------------------------------------------------------------------------------------
     def _said(self, hand: int, value: str) -> tuple:
         there = hand in self.list_hands_id()
         return (_error(), value) if there else (_error(NO_HAND, "no such hand"), "")

@@ -214,7 +214,6 @@ class Loop:
         self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs or "", 0.5)
 
     # -- the run
-    # -------------------------------------------------------------------------------------------------------------
     def run(self) -> Report:
         """Go home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand
         first."""
@@ -395,7 +394,6 @@ class Loop:
         return self.guard.must_relax(self.state.current, self.state.temperature, elapsed)
 
     # -- parts of a turn
-    # -------------------------------------------------------------------------------------------------------
     def _read(self, now: float) -> None:
         if not self._take(now):
             # a driver at about our rate gives the same one twice now and then; `stale` is what matters
@@ -568,7 +566,6 @@ class Loop:
             self.recorder.put("command", now, self.target)
 
     # -- phases
-    # ------------------------------------------------------------------------------------------------------------------
     def _begin_homing(self, now: float) -> None:
         self.phase, self._began = HOMING, now
         self._broken, self._coded, self._refused, self._frozen = None, Lasting(), Lasting(), Frozen()

@@ -91,7 +91,6 @@ class BusDriver:
         self.rescued = ""  # by what a hand was let go whose process had died
 
     # -- HandDriver
-    # ---------------------------------------------------------------------------------------------------------------
     def open(self) -> dict[str, str]:
         """Connect; returns what to log. Raises UserError."""
         self._era = self._number = self._object = 0
@@ -230,7 +229,6 @@ class BusDriver:
             raise UserError(f"{self.name}: the hand is not known to be limp ({why}); cut its power")
 
     # -- the object, of a simulated hand
-    # ---------------------------------------------------------------------------------------------------------------
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
         """Return the object (a HeightSource) as a simulated camera last saw it."""
         return self._object_seen(slice(0, 4))
@@ -255,7 +253,6 @@ class BusDriver:
         return None if not np.isfinite(row).all() else (row[:-1], float(row[-1]))
 
     # -- parts
-    # ---------------------------------------------------------------------------------------------------------------
     def _handle(self, what: int) -> None:
         self._object = what
         if self.body is not None:
@@ -325,7 +322,6 @@ class BusDriver:
 
 
 # -- the child
-# -------------------------------------------------------------------------------------------------------------------
 def _child(make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, output: str) -> None:
     """Run the child's process: no key of the loop's terminal reaches the one that holds the hand."""
     system.leave_terminal()

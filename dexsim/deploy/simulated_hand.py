@@ -343,7 +343,6 @@ def choose_gl() -> str:
 
 
 # -- the driver
-# -----------------------------------------------------------------------------------------------------------------
 class SimulatedBody:
     """The hand's side of `SimulatedXHand`: a bus cycle every `BUS_PERIOD`, whose state is there `LATENCY` later."""
 

@@ -37,7 +37,7 @@ JOINTS, TAXELS = 12, (5, 120, 3)
 MOST_CURRENT = 400.0
 """mA, of a run that does not say: what others drive this hand with (300 to 400)."""
 NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT, CRC = 1501018, 1501019, 1501020, 1501035, 1501070
-TOO_WARM, REFUSED, BOOT = 1501028, (1501029, 1501030), 1501036
+TOO_WARM, BOOT = 1501028, 1501036
 ACCEPTED = frozenset((0, NO_SUMS, NO_TAXELS, NO_TAXEL_TEMPERATURES, AT_LIMIT))
 """Codes with which a command has reached the hand; `AT_LIMIT`: its current is at its limit, as in a grasp."""
 GOOD_JOINTS = ACCEPTED | {CRC}
@@ -98,7 +98,6 @@ class XHandBus:
         return max(self.clock.now(), self._pause_until, self._next)
 
     # -- opening
-    # ---------------------------------------------------------------------------------------------------------------
     def open(self) -> dict[str, str]:
         """Find the hand and read it; nothing moves. Returns what to log. Raises UserError."""
         kind = "ethercat" if self.port.startswith("ethercat") else "serial"
@@ -107,7 +106,7 @@ class XHandBus:
             if attempt:
                 self.clock.sleep_until(self.clock.now() + BETWEEN[kind])
             wrong, missing = [], False
-            for port in self._ports(kind, wrong):
+            for port in self._ports(kind):
                 device = self._sdk.XHandControl()
                 code, message = _error(
                     device.open_serial(port, BAUD) if kind == "serial" else device.open_ethercat(port)
@@ -130,7 +129,7 @@ class XHandBus:
         )
         raise UserError(f"no hand to drive ({'; '.join(wrong) or 'no port is there'}): {hint}")
 
-    def _ports(self, kind: str, wrong: list[str]) -> list[str]:
+    def _ports(self, kind: str) -> list[str]:
         name, _, interface = self.port.partition(":")
         if kind == "ethercat":
             return [interface] if interface else list(_enumerate(self._sdk, "EtherCAT"))
@@ -170,7 +169,6 @@ class XHandBus:
                 raise UserError(f"{port}: the hand gives no whole reading ({self._why or 'no answer'})")
 
     # -- a cycle
-    # ---------------------------------------------------------------------------------------------------------------
     def cycle(self, command: HandCommand | None) -> HandState | None:
         """Send, one round trip; then the state that it brought. None where it brought nothing that is new and whole."""
         self.clock.sleep_until(self.due)
@@ -256,7 +254,7 @@ class XHandBus:
         self._feel(raw, code, now)
         speed = _int16([getattr(j, "default5", 0) for j in joints]).astype(np.float32) * 1e-3
         self._fast = self._fast or bool(speed.any())
-        self._stir(now, code)
+        self._stir(now)
         errors = [getattr(j, "commboard_err", 0) or getattr(j, "jonitboard_err", 0) for j in joints]
         self._sequence += 1
         silent = now - self._touched > LOST
@@ -289,7 +287,7 @@ class XHandBus:
                 self._touch[f], self._touched[f], self._unfelt = touch, now, 0
         self._touch_worked = self._touch_worked or code in GOOD_TOUCH
 
-    def _stir(self, now: float, code: int) -> None:
+    def _stir(self, now: float) -> None:
         """Note since when no bit of the cache has changed. Encoders that go to and fro while the hand stands still show
         that its readings never stand."""
         bits = (self._frame, list(self._boards))
@@ -317,7 +315,6 @@ class XHandBus:
         )
 
     # -- what the loop asks
-    # ---------------------------------------------------------------------------------------------------------------
     def problem(self) -> str:
         """Return why the hand cannot be driven any longer; empty while it can."""
         now = self.clock.now()
@@ -328,7 +325,6 @@ class XHandBus:
         return self._dead()
 
     # -- letting go
-    # ---------------------------------------------------------------------------------------------------------------
     def _letting(self, command: HandCommand) -> HandCommand:
         """Return passive, without stiffness and torque, where the joints are. Where the hand still draws current, the
         same in position mode: a firmware may not know the passive one."""

@@ -183,7 +183,6 @@ class Couplings:
                 out[m.jnt_dofadr[j]] = slope[m.jnt_qposadr[j]]
         return out
 
-
     def dragged(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [n, nq] along a motion of the driven joints, and how every dof moves with each of them
         [n, nv, J]. A joint that a tendon holds with slack stays where it is until the tendon drags it (a play

@@ -47,15 +47,9 @@ class Model:
 
 
 def build(
-    name: str,
-    m: mujoco.MjModel,
-    tree: Tree,
-    shapes: Shapes,
-    figures: Figures,
-    excluded: list[tuple[str, str]],
-    note: str,
-    pulls: Sequence[Pull] = (),
-) -> Model:
+    name: str, m: mujoco.MjModel, tree: Tree, shapes: Shapes, figures: Figures, excluded: list[tuple[str, str]],
+    note: str, pulls: Sequence[Pull] = (),
+) -> Model:  # fmt: skip
     """Return the MJCF of the hand: its root is the palm, which stands in the world's origin.
 
     Links meet those of other fingers and objects; a tip meets objects with its mesh and the hand with a capsule inside.

@@ -217,7 +217,7 @@ def stretched(m: mujoco.MjModel, motions: list[Motion]) -> np.ndarray:
     return q
 
 
-def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
+def opposing(m: mujoco.MjModel, motions: list[Motion]) -> list[int]:
     """Return which finger presses against the others: the one called thumb, or the one that points and closes least
     like them. One that closes against the others' direction joins it."""
     for k, x in enumerate(motions):

@@ -124,7 +124,7 @@ def import_hand(
     names = [f.name for f in found.fingers]
     if said is not None and (not isinstance(said, list) or not said or any(n not in names for n in said)):
         raise UserError(f"{out / folder.HAND}: opposing ({said}): must name fingers; there are {', '.join(names)}")
-    thumbs = [names.index(n) for n in said] if said is not None else frame.opposing(m, found, motions)
+    thumbs = [names.index(n) for n in said] if said is not None else frame.opposing(m, motions)
     if said is None:
         guessed.append("opposing")
     palm = frame.palm(m, found, motions, thumbs)
@@ -315,15 +315,9 @@ def _palm(guess: frame.Palm, pick: Callable[..., Any]) -> frame.Palm:
 
 
 def _search(
-    own: build.Model,
-    m: mujoco.MjModel,
-    found: tree.Tree,
-    motions: list[frame.Motion],
-    thumbs: list[int],
-    palm: frame.Palm,
-    pulls: list[Pull],
-    reach: dict[int, tuple[float, float, str]],
-) -> poses.Search:
+    own: build.Model, m: mujoco.MjModel, found: tree.Tree, motions: list[frame.Motion], thumbs: list[int],
+    palm: frame.Palm, pulls: list[Pull], reach: dict[int, tuple[float, float, str]],
+) -> poses.Search:  # fmt: skip
     """Return the search over the hand's own model, whose ids differ from the source's. reach: by id of a joint, where
     its followers let it go."""
     new = own.compile()

@@ -213,15 +213,8 @@ def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for group in (
-        spec.sensors,
-        spec.keys,
-        spec.lights,
-        spec.cameras,
-        spec.excludes,
-        spec.pairs,
-        spec.skins,
-        spec.sites,
-    ):
+        spec.sensors, spec.keys, spec.lights, spec.cameras, spec.excludes, spec.pairs, spec.skins, spec.sites,
+    ):  # fmt: skip
         for item in list(group):
             spec.delete(item)
     for material in spec.materials:

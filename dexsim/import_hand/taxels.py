@@ -46,14 +46,9 @@ class Pad:
 
 
 def paint(
-    finger: str,
-    surface: Surface,
-    position: np.ndarray,
-    normal: np.ndarray,
-    along: np.ndarray,
-    size: tuple[int, int],
+    finger: str, surface: Surface, position: np.ndarray, normal: np.ndarray, along: np.ndarray, size: tuple[int, int],
     holes: str = "hull",
-) -> Pad:
+) -> Pad:  # fmt: skip
     """Lay a grid of size (rows, columns) on the side of `surface` that `normal` looks out of.
 
     surface: the tip's, tip body's frame; position [3] m: the middle of the pad, about; along [3]: from the joint to

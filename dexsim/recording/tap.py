@@ -300,15 +300,9 @@ class _Track:
         self.over = self.over or len(self.episode.times) * self.dt >= self.least
 
     def add(
-        self,
-        about: list[np.ndarray],
-        turned: np.ndarray | None,
-        rows: np.ndarray,
-        target: np.ndarray,
-        gravity: np.ndarray,
-        done: np.ndarray,
-        touch: np.ndarray | None,
-    ) -> None:
+        self, about: list[np.ndarray], turned: np.ndarray | None, rows: np.ndarray, target: np.ndarray,
+        gravity: np.ndarray, done: np.ndarray, touch: np.ndarray | None,
+    ) -> None:  # fmt: skip
         """Add one control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows
         [K, W], target [J] and touch as they are after it."""
         if self.over:

@@ -133,16 +133,9 @@ def poses(
         y = turned(wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0)), q)
         z = turned(wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)), q)
         xmat[w, b] = wp.mat33(
-            float(x[0]),
-            float(y[0]),
-            float(z[0]),
-            float(x[1]),
-            float(y[1]),
-            float(z[1]),
-            float(x[2]),
-            float(y[2]),
+            float(x[0]), float(y[0]), float(z[0]), float(x[1]), float(y[1]), float(z[1]), float(x[2]), float(y[2]),
             float(z[2]),
-        )
+        )  # fmt: skip
 
 
 @wp.kernel(enable_backward=False)

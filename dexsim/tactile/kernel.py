@@ -266,25 +266,10 @@ def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j
 
 @cache
 def touch_kernel(
-    lanes: bool,
-    solver: bool,
-    raw: bool,
-    others: bool,
-    *,
-    law: str = "hertz",
-    pads: int = 5,
-    groups: int = 5,
-    taxels: int = 120,
-    rounds: int = 4,
-    objects: int = 1,
-    feel_others: bool = False,
-    links: int = 5,
-    selves: bool = False,
-    most: int = 1,
-    units: int = 5,
-    unit_rounds: int = 4,
-    registers: int = 0,
-) -> wp.Kernel:
+    lanes: bool, solver: bool, raw: bool, others: bool, *, law: str = "hertz", pads: int = 5, groups: int = 5,
+    taxels: int = 120, rounds: int = 4, objects: int = 1, feel_others: bool = False, links: int = 5,
+    selves: bool = False, most: int = 1, units: int = 5, unit_rounds: int = 4, registers: int = 0,
+) -> wp.Kernel:  # fmt: skip
     """Return the kernel for one choice of options. Dimensions: serial [N, G]; lanes: see `spans`.
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
@@ -313,13 +298,9 @@ def touch_kernel(
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
     options = {"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK}
     return wp.kernel(
-        kernel,
-        enable_backward=False,
-        module="unique",
-        grid_stride=False,
-        cuda_max_registers=registers or None,
+        kernel, enable_backward=False, module="unique", grid_stride=False, cuda_max_registers=registers or None,
         module_options=options,
-    )
+    )  # fmt: skip
 
 
 def spans(worlds: int, groups: int, units: int, others: bool, raw: bool) -> tuple[int, list[tuple[int, int]]]:

@@ -76,23 +76,12 @@ class Tactile:
     """
 
     def __init__(
-        self,
-        engine: Posed,
-        layout: TaxelLayout,
-        shapes: ShapeSet,
-        object_body: str | Sequence[str],
-        cfg: Mapping | TactileConfig | None = None,
-        *,
-        pairs: Sequence | None = None,
-        tips: Sequence[np.ndarray] | None = None,
-        other_pairs: Sequence[Sequence[str]] | None = None,
-        links: Sequence[tuple[str, np.ndarray]] | None = None,
-        selves: Sequence[str] | None = None,
-        seed: int = 0,
-        lanes: bool | None = None,
-        registers: int = REGISTERS,
-        block_dim: int = BLOCK_DIM,
-    ):
+        self, engine: Posed, layout: TaxelLayout, shapes: ShapeSet, object_body: str | Sequence[str],
+        cfg: Mapping | TactileConfig | None = None, *, pairs: Sequence | None = None,
+        tips: Sequence[np.ndarray] | None = None, other_pairs: Sequence[Sequence[str]] | None = None,
+        links: Sequence[tuple[str, np.ndarray]] | None = None, selves: Sequence[str] | None = None, seed: int = 0,
+        lanes: bool | None = None, registers: int = REGISTERS, block_dim: int = BLOCK_DIM,
+    ):  # fmt: skip
         self.cfg = cfg = tactile_config(cfg)
         self.engine, self.layout, self.shapes = engine, layout, shapes
         self.device, n, f, t = engine.device, engine.n, layout.pads, layout.taxels

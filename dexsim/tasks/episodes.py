@@ -60,14 +60,9 @@ class Episodes(Built):
             wp.launch(state_kernels.keep_finite, dim=dim, inputs=[*args, out], device=self.device)
 
     def place(
-        self,
-        mask: torch.Tensor,
-        hand_q: torch.Tensor,
-        object_pose: torch.Tensor,
-        object_velocity: torch.Tensor,
-        target: torch.Tensor | None = None,
-        also: Mapping[int, torch.Tensor] | None = None,
-    ) -> None:
+        self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor,
+        target: torch.Tensor | None = None, also: Mapping[int, torch.Tensor] | None = None,
+    ) -> None:  # fmt: skip
         """Place, where mask holds, the hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); the
         object at pose [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the
         object's own), where it moves freely. also: values [N] of further numbers of qpos, by index (`q_of`)."""

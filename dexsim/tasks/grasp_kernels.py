@@ -162,17 +162,9 @@ def times(a: wp.vec4, b: wp.vec4):
 
 @wp.kernel(enable_backward=False)
 def begin(
-    mask: wp.array(dtype=wp.bool),
-    p: Place,
-    f: Fall,
-    r: CommandRange,
-    d: Draws,
-    variant: wp.array(dtype=wp.int64),
-    radius: wp.array(dtype=float),
-    mass: wp.array(dtype=float),
-    b: Begun,
-    o: Orders,
-):
+    mask: wp.array(dtype=wp.bool), p: Place, f: Fall, r: CommandRange, d: Draws, variant: wp.array(dtype=wp.int64),
+    radius: wp.array(dtype=float), mass: wp.array(dtype=float), b: Begun, o: Orders,
+):  # fmt: skip
     """Begin new episodes in the masked worlds. The object's longest axis lies across the fingers (palm y) up to the
     tilt; its lowest point is `drop` over the palm."""
     w = wp.tid()

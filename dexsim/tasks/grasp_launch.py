@@ -111,14 +111,10 @@ class Launches(Task):
             hold_span=last - first,
         )  # fmt: skip
         drawn = filled(
-            kernels.Draws,
-            value=s.uniform() if fixed is None else fixed,
-            hold=s.uniform(),
-            weights=s.draw("push.weights"),
-            direction=s.normal(3),
-            duration=s.draw("push.duration"),
+            kernels.Draws, value=s.uniform() if fixed is None else fixed, hold=s.uniform(),
+            weights=s.draw("push.weights"), direction=s.normal(3), duration=s.draw("push.duration"),
             wait=s.draw("push.wait"),
-        )
+        )  # fmt: skip
         return how, drawn
 
     def launch_begin(self, mask: torch.Tensor) -> None:

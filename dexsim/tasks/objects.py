@@ -101,16 +101,9 @@ class Objects:
         return self._base_size[variant] * scale
 
     def write(
-        self,
-        mask: torch.Tensor,
-        variant: torch.Tensor,
-        scale: torch.Tensor,
-        mass: torch.Tensor,
-        com: torch.Tensor,
-        friction: torch.Tensor,
-        stiffness: torch.Tensor,
-        damping_ratio: torch.Tensor,
-    ) -> None:
+        self, mask: torch.Tensor, variant: torch.Tensor, scale: torch.Tensor, mass: torch.Tensor, com: torch.Tensor,
+        friction: torch.Tensor, stiffness: torch.Tensor, damping_ratio: torch.Tensor,
+    ) -> None:  # fmt: skip
         """Give the worlds where mask [N] holds this object.
 
         variant [N] row of the scene's table; scale [N, 3] of a primitive's sizes (hulls keep their baked scale);

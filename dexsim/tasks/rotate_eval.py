@@ -28,17 +28,8 @@ if TYPE_CHECKING:
 Policy = Callable[..., torch.Tensor]  # a TensorDict of observations -> actions [N, J]
 Progress = Callable[[int, int, str], object]  # trials done, of how many, what is played
 
-HEADER = (
-    "Contact center",
-    "Contact force",
-    "Force weighted",
-    "Orientation",
-    "Cons. success trials (sorted)",
-    "Average",
-    "Median",
-    "Succ. time (Ave.) s",
-    "Time to fall (Ave.) s",
-)
+HEADER = ("Contact center", "Contact force", "Force weighted", "Orientation", "Cons. success trials (sorted)",
+          "Average", "Median", "Succ. time (Ave.) s", "Time to fall (Ave.) s")  # fmt: skip
 """Columns of the paper's rotation table."""
 
 
@@ -126,7 +117,7 @@ def evaluate(env: RotateEnv, policy: Policy, episodes: int, seed: int, progress:
     metrics |= env.of_trials(r)
     plots = [("successes", partial(_successes_plot, successes=r["successes"])),
              ("survival", partial(_survival_plot, time=r["time"], cap=cap))]  # fmt: skip
-    return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": plots}
+    return {"metrics": metrics, "tables": _tables(env, metrics), "frames": frames, "plots": plots}
 
 
 def _by_object(env: RotateEnv, parts: list[dict]) -> dict:
@@ -184,7 +175,7 @@ def row_of(env: RotateEnv) -> tuple[str, ...]:
     )
 
 
-def _tables(env: RotateEnv, m: dict, r: dict) -> list:
+def _tables(env: RotateEnv, m: dict) -> list:
     c = m["consecutive_successes"]
     spread = (
         c["all"] if len(c["all"]) <= 12 else np.percentile(c["all"], np.linspace(5, 95, 10), method="nearest").tolist()

@@ -174,7 +174,6 @@ class FingertipEnv(TipTrials, RotateEnv):
         return every.gather(1, pick)[:, 0]
 
     # -- pushes
-    # --------------------------------------------------------------------------------------------------------------
     def _new_push(self, mask: torch.Tensor) -> None:
         """Draw a push in a random direction, of a multiple of the object's weight, after a random wait."""
         s = self.sampler

@@ -48,16 +48,10 @@ def read_kernel(real: type) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def read(
-        flags: wp.array(dtype=int),
-        qpos: wp.array2d(dtype=real),
-        qvel: wp.array2d(dtype=real),
-        motor: wp.array2d(dtype=real),
-        pair_normal: wp.array2d(dtype=float),
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        at: Places,
-        out: Seen,
-    ):
+        flags: wp.array(dtype=int), qpos: wp.array2d(dtype=real), qvel: wp.array2d(dtype=real),
+        motor: wp.array2d(dtype=real), pair_normal: wp.array2d(dtype=float), xpos: wp.array2d(dtype=wp.vec3),
+        xmat: wp.array2d(dtype=wp.mat33), at: Places, out: Seen,
+    ):  # fmt: skip
         w, k = wp.tid()
         bad = (flags[w] & wp.static(FLAG_NAN)) != 0
         joints = at.joint_q.shape[0]

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
@@ -85,7 +85,6 @@ class Task(HandEnv):
                 raise UserError(f"{cls.__name__}.{name}: every task has something of this name; give it another")
 
     # -- from the class to settings
-    # ----------------------------------------------------------------------------------------------
     @classmethod
     def config(cls) -> dict[str, Any]:
         """Return the settings that a run of this task starts from: groups "task" and "randomize"."""
@@ -130,7 +129,6 @@ class Task(HandEnv):
         super().__init__(cfg, n_worlds, device, seed, engine)
 
     # -- setting up
-    # --------------------------------------------------------------------------------------------------------------
     def setup(self) -> None:
         """Allocate what declared terms need; called once, before the first reset."""
         n, dev, t = self.num_envs, self.device, self.task
@@ -267,7 +265,6 @@ class Task(HandEnv):
         self._rows, self._chances = rows, (weight / weight.sum()).cumsum(0)
 
     # -- what terms read
-    # ---------------------------------------------------------------------------------------------------------
     @property
     def clean(self) -> bool:
         """Whether the value that is computed now is for the critic, which sees no faults of sensors."""
@@ -304,7 +301,6 @@ class Task(HandEnv):
         return self.engine.t.qpos[:, self.q_of(name)].float(), self.engine.t.qvel[:, self.v_of(name)].float()
 
     # -- episodes
-    # ----------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:
         """Draw object, touch, drives; then `begin`, commands and events of the task."""
         for held in memories_of(type(self)).values():
@@ -326,7 +322,7 @@ class Task(HandEnv):
         for x in self._terms["command"]:
             self.renew(x.name, mask)
         for x in self._terms["event"]:
-            self._happen(x, mask, True)
+            self._happen(x, mask)
 
     def begin(self, mask: torch.Tensor) -> None:
         """Put hand and object where an episode begins in the masked worlds, through `start`, `drop_object` or `hold`;
@@ -371,13 +367,9 @@ class Task(HandEnv):
         return angles
 
     def start(
-        self,
-        mask: torch.Tensor,
-        hand: str | torch.Tensor = "open",
-        object_pose: torch.Tensor | None = None,
-        target: torch.Tensor | None = None,
-        also: Mapping[int, torch.Tensor] | None = None,
-    ) -> torch.Tensor:
+        self, mask: torch.Tensor, hand: str | torch.Tensor = "open", object_pose: torch.Tensor | None = None,
+        target: torch.Tensor | None = None, also: Mapping[int, torch.Tensor] | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """Place, where mask holds, the hand in a pose (its name, or [J] or [N, J] rad), give or take
         `randomize.initial.joint`, at rest, sent to `target` [N, J]; the object at object_pose [N, 7], which is
         returned. also: see `place`."""
@@ -420,7 +412,6 @@ class Task(HandEnv):
         return g.pose[pick]
 
     # -- commands and events
-    # -------------------------------------------------------------------------------------------------------
     def _command_value(self, term: Term) -> torch.Tensor:
         value = term.method(self, **self._params("commands", term))
         return _columns(value, self.num_envs, f"command {term.name}").float()
@@ -445,9 +436,9 @@ class Task(HandEnv):
                 self._remaining[x.name] -= self.dt
                 self.renew(x.name, self._remaining[x.name] <= 0)
         for x in self._terms["event"]:
-            self._happen(x, None, False)
+            self._happen(x, None)
 
-    def _happen(self, term: Term, begun: torch.Tensor | None, beginning: bool) -> None:
+    def _happen(self, term: Term, begun: torch.Tensor | None) -> None:
         given = self.task["events"][term.name]
         if not given["on"]:
             return
@@ -484,7 +475,6 @@ class Task(HandEnv):
         applied[:, self.objects.body, :3] = force.to(applied.dtype)
 
     # -- terminations, rewards, metrics
-    # --------------------------------------------------------------------------------------------
     def update(self) -> None:
         """Move the task's own memory on: after physics, before terminations and rewards."""
 
@@ -529,7 +519,6 @@ class Task(HandEnv):
         return {f"task/{name}": value.mean() for name, value in (self.figures | self.last).items()}
 
     # -- observations
-    # ------------------------------------------------------------------------------------------------------------
     def actor_rows(self) -> list[Sensing]:
         """Return the rows that the actor sees."""
         return [x for x in self._sensed if self._named(self.task["observations"][x.term.name]["actor"])]
@@ -616,7 +605,6 @@ class Task(HandEnv):
         return super().memory() | own
 
     # -- what is said of it
-    # --------------------------------------------------------------------------------------------------------
     def describe(self) -> dict:
         """Return tables for the first screen: "observations" (name, width, what) by group, "action", "rewards",
         "terminations", "randomization", "notes", and "headline", names of the log that the console shows."""
@@ -714,6 +702,3 @@ def _lay(onto: dict[str, Any], over: Mapping[str, Any]) -> None:
             _lay(mine, value)
         else:
             onto[key] = copy.deepcopy(dict(value) if isinstance(value, Mapping) else _plain(value))
-
-
-Policy = Callable[[Any], torch.Tensor]

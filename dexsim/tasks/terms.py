@@ -66,17 +66,10 @@ def _declare(kind: str, method: Callable[..., Any], unit: str, options: dict[str
 
 
 def observe(
-    unit: str = "",
-    *,
-    noise: float | str = 0.0,
-    delay: Span | str = 0.0,
-    dropout: float = 0.0,
-    frames: int = 1,
-    only: Literal["actor", "critic"] | None = None,
-    real: str | None = None,
-    name: str | None = None,
+    unit: str = "", *, noise: float | str = 0.0, delay: Span | str = 0.0, dropout: float = 0.0, frames: int = 1,
+    only: Literal["actor", "critic"] | None = None, real: str | None = None, name: str | None = None,
     mirror: tuple[int, ...] | None = None,
-) -> Callable[[Method], Method]:
+) -> Callable[[Method], Method]:  # fmt: skip
     """Declare a row of the observation: [N] or [N, ...], flattened; or several, by name, of one method.
 
     What the actor sees passes through value -> noise -> delay -> dropout -> frames; the critic sees the value. A method

@@ -128,7 +128,6 @@ class LiveView:
         return self.gate.token
 
     # -- the page
-    # --------------------------------------------------------------------------------------------------------------
     def _lay_out(self, choices: list[str]) -> None:
         server, gui, w = self.server, self.server.gui, self.wishes
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -352,7 +351,6 @@ class LiveView:
         self._training.content = self._run.panel()
 
     # -- the loop
-    # ----------------------------------------------------------------------------------------------------------------
     def _keep_rewards(self) -> dict[str, torch.Tensor]:
         self._terms = self._rewards()
         return self._terms

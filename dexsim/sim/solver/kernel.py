@@ -88,10 +88,6 @@ def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False
         call(wp.tid() // wp.static(LANES), above, iterations, ls_iterations, warm, njmax, problem, solution)
 
     return wp.kernel(
-        solve,
-        enable_backward=False,
-        module="unique",
-        grid_stride=False,
-        cuda_max_registers=registers or None,
+        solve, enable_backward=False, module="unique", grid_stride=False, cuda_max_registers=registers or None,
         module_options={"fast_math": fast_math},
-    )
+    )  # fmt: skip
