@@ -47,7 +47,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     return q * np.sign(np.linalg.det(q))
 
 
-def felt(recordings, m, held=frozenset(), allowed=None):
+def touch_result(recordings, m, held=frozenset(), allowed=None):
     """Return what a diagnosis says of touch alone."""
     from dexsim.gap.touch.diagnosis import Touch
 

@@ -240,10 +240,10 @@ def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
-    apart = held_out.floor(runs, [case])[2]["joint"]
+    repeat_error = held_out.floor(runs, [case])[2]["joint"]
     thermal = EFFECTS["thermal"].variants(case.scales)[0].params
-    assert thermal[0].columns == ("thermal_torque",) and apart > 4 * case.sigma
-    assert held_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
+    assert thermal[0].columns == ("thermal_torque",) and repeat_error > 4 * case.sigma
+    assert held_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(repeat_error, rel=0.1)
     assert held_out.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
     assert held_out.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
 
@@ -305,8 +305,8 @@ def test_a_joint_that_rings_is_judged_by_its_quiet_noise(monkeypatch):
     runs = [plant_run("s", 0, 3.0, {})]
     runs[0].smooth()
     usual = build(model(), runs)[0].scales
-    for told, sigma in ((None, usual.sigma), (0.1 * usual.sigma, 0.1 * usual.sigma), (2 * usual.sigma, usual.sigma)):
-        monkeypatch.setattr(case_of_joint, "quiet_noise", lambda signals, quantum, told=told: told)
+    for quiet, sigma in ((None, usual.sigma), (0.1 * usual.sigma, 0.1 * usual.sigma), (2 * usual.sigma, usual.sigma)):
+        monkeypatch.setattr(case_of_joint, "quiet_noise", lambda signals, quantum, quiet=quiet: quiet)
         assert build(model(), runs)[0].scales.sigma == pytest.approx(sigma, rel=1e-9)
 
 
@@ -633,8 +633,8 @@ def test_some_missing_samples_are_said_not_fatal(rig, tmp_path, allowed):
     def change(r):
         r.states.position.value[50:60] = np.nan
 
-    asked = replace(changed(rig, tmp_path, change), allowed=allowed)
-    assert run(asked).data["verdict"] != "unusable"
+    settings = replace(changed(rig, tmp_path, change), allowed=allowed)
+    assert run(settings).data["verdict"] != "unusable"
 
 
 @pytest.mark.slow

@@ -325,10 +325,10 @@ def test_links_that_touch_each_other_are_cut_out():
 def test_what_is_wrong_in_a_recording_that_is_left_out_doubts_nothing_elsewhere():
     """A joint that is stuck in one of several recordings, which is left out: whole where it has no other joint."""
     stuck = lambda *names: Finding("", 0.9, "", ["joint"], when=[{"recording": n} for n in names])  # noqa: E731
-    kept = lambda **runs: Split(  # noqa: E731
+    split_of = lambda **runs: Split(  # noqa: E731
         [SimpleNamespace(name=n, left_out=frozenset(x)) for n, x in runs.items()], [0], [1], None, None
     )
-    assert conclude._elsewhere(stuck("b"), kept(a=(), c=()))
-    assert conclude._elsewhere(stuck("b", "c"), kept(a=(), c=("joint",)))
-    assert not conclude._elsewhere(stuck("b", "c"), kept(a=(), c=()))
-    assert not conclude._elsewhere(stuck("a"), kept(a=(), c=()))
+    assert conclude._elsewhere(stuck("b"), split_of(a=(), c=()))
+    assert conclude._elsewhere(stuck("b", "c"), split_of(a=(), c=("joint",)))
+    assert not conclude._elsewhere(stuck("b", "c"), split_of(a=(), c=()))
+    assert not conclude._elsewhere(stuck("a"), split_of(a=(), c=()))

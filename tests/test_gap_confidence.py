@@ -198,9 +198,9 @@ def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():
     both = [evidence(effect="lag", confidence=0.99), evidence(effect="inertia", confidence=0.9)]
     confidence.doubt_beside_others(both)
     assert both[0].confidence == 0.99 and both[1].confidence == DOUBTED and "what is fast" in both[1].reasons[0]
-    apart = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
-    confidence.doubt_beside_others(apart)
-    assert [e.confidence for e in apart] == [0.99, 0.9]
+    different = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
+    confidence.doubt_beside_others(different)
+    assert [e.confidence for e in different] == [0.99, 0.9]
 
 
 def test_what_is_neutral_is_not_believed_to_a_few_percent():
@@ -227,7 +227,7 @@ def test_a_size_that_may_lie_beyond_what_is_looked_for_is_doubted():
 
 def test_a_sensor_of_the_wrong_sign_is_not_doubted_for_its_sign():
     """That the effort's sign is not what it says is the effect itself; a fault of the position is not."""
-    for bad, signs, kept in (({"a"}, {"a"}, 0.95), ({"a"}, set(), DOUBTED)):
+    for bad, signs, expected in (({"a"}, {"a"}, 0.95), ({"a"}, set(), DOUBTED)):
         sensor = evidence(effect="current_sensor", joint="a", confidence=0.95)
         confidence.of_the_whole([sensor], {}, bad, signs)
-        assert sensor.confidence == kept
+        assert sensor.confidence == expected

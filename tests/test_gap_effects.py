@@ -135,7 +135,7 @@ def drives() -> tuple[Case, Case]:
     return moving(torque_limit=0.4, braking_slope=0.5), moving(kp=0.02, kd=0.004)
 
 
-def shown(case: Case, variant: Variant | None = None, x: Sequence[float] = ()) -> np.ndarray:
+def simulated(case: Case, variant: Variant | None = None, x: Sequence[float] = ()) -> np.ndarray:
     """Return [2, n] motion (rad) and the effort shown (N.m) with a variant of these sizes, or with what is believed."""
     params, fixed = (list(variant.params), variant.fixed) if variant else ([], ())
     return np.stack(free_run(case, params, np.array(x, float), case.plant.windows(None), fixed))
@@ -146,9 +146,9 @@ def test_the_plant_has_a_law_of_every_effect_that_is_simulated(drives, effect):
     """One of the sizes that the search begins from moves the joint by a milliradian (of an effect of the effort's
     sensor alone: what that shows, and the joint not at all), and each size by itself does something."""
     case = next(c for c in drives if effect.variants(c.scales))
-    believed, of = shown(case), 1 if effect.effort_only else 0
+    believed, of = simulated(case), 1 if effect.effort_only else 0
     for variant in effect.variants(case.scales):
-        by_start = np.stack([shown(case, variant, x) for x in variant.starts])
+        by_start = np.stack([simulated(case, variant, x) for x in variant.starts])
         change = np.sqrt(np.mean((by_start - believed) ** 2, -1))
         best = int(change[:, of].argmax())
         assert change[best, of] > 1e-3, variant.label
@@ -158,7 +158,7 @@ def test_the_plant_has_a_law_of_every_effect_that_is_simulated(drives, effect):
             for start, there in zip(variant.starts, by_start, strict=True):
                 x = list(start)
                 x[i] += (0.1 if x[i] + 0.1 * p.span < p.high else -0.1) * p.span
-                nudged = max(nudged, np.sqrt(np.mean((shown(case, variant, x) - there)[of] ** 2)))
+                nudged = max(nudged, np.sqrt(np.mean((simulated(case, variant, x) - there)[of] ** 2)))
                 if nudged > 1e-6:
                     break
             assert nudged > 1e-6, (variant.label, p.key)
@@ -240,9 +240,9 @@ def test_a_grease_that_thins_is_told_by_the_line_that_takes_as_much_energy_too()
     case = SimpleNamespace(plant=plant, scales=scales)
     value = {"at_rest": 0.02, "half_speed": 3.0}
     fit = FittedEffect(None, value, {"at_rest": (0.018, 0.022), "half_speed": (2.0, 4.0)}, case, None)
-    told = EFFECTS["viscous_friction"].parameters(fit)
-    assert (told["coefficient"]["value"], told["at_rest"]["value"]) == pytest.approx((0.021, 0.031))
-    assert (told["coefficient"]["low"], told["coefficient"]["high"]) == pytest.approx((0.02, 0.022))
+    parameters = EFFECTS["viscous_friction"].parameters(fit)
+    assert (parameters["coefficient"]["value"], parameters["at_rest"]["value"]) == pytest.approx((0.021, 0.031))
+    assert (parameters["coefficient"]["low"], parameters["coefficient"]["high"]) == pytest.approx((0.02, 0.022))
     line = FittedEffect(None, {"coefficient": 0.02}, {"coefficient": (0.01, 0.03)}, case, None)
     assert set(EFFECTS["viscous_friction"].parameters(line)) == {"coefficient"}
 

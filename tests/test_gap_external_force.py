@@ -32,8 +32,8 @@ def test_pushes_are_told_with_when_and_how_hard():
     assert push.clear and push.torque == pytest.approx(6.0, rel=0.1) and set(push.spans) == {"run0.mcap"}
     t = runs[0].t
     inside = lambda spans: np.any([(t >= a) & (t <= b) for a, b in spans], 0)  # noqa: E731
-    told, true = inside(push.spans["run0.mcap"]), np.abs(shove(t)) > 0.25 * 6.0
-    assert (told & true).sum() / (told | true).sum() > 0.8
+    found, true = inside(push.spans["run0.mcap"]), np.abs(shove(t)) > 0.25 * 6.0
+    assert (found & true).sum() / (found | true).sum() > 0.8
     finding = push.finding()
     assert finding.effect == "external_force" and finding.confidence >= 0.8 and len(finding.when) == 3
     assert finding.parameters["torque"]["low"] < 6.0 < finding.parameters["torque"]["high"] * 1.05
@@ -52,9 +52,9 @@ def test_the_size_of_a_push_lies_inside_its_interval(size, cogging):
         r.torque[:, 1] += cogging * size * np.sin(25.0 * r.q[:, 1])  # cogging
         true.append(r)
     (push,) = (p for p in logged_torque.find_pushes(model, true, [0, 1]) if p.joint == "elbow")
-    told = push.finding().parameters["torque"]
-    assert told["low"] < size < told["high"] and told["value"] == pytest.approx(size, rel=0.06)
-    assert told["high"] - told["low"] < 0.5 * size
+    torque = push.finding().parameters["torque"]
+    assert torque["low"] < size < torque["high"] and torque["value"] == pytest.approx(size, rel=0.06)
+    assert torque["high"] - torque["low"] < 0.5 * size
     sample = logged_torque.Push("elbow", 0.906, (0.7, 1.0), 0.5, True, False).finding().parameters["torque"]
     assert (sample["value"], sample["low"], sample["high"]) == (0.906, 0.7, 1.0)
 
@@ -140,7 +140,7 @@ def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
         r = run(model, k, pushed=shove if k == 1 else None)
         cmd = r.q + (r.torque + 3.0 * np.gradient(r.q, r.t, axis=0)) / 80.0
         made.append(save(tmp_path / f"r{k}.mcap", r.joints, r.t, cmd, r.t, r.q, effort=r.torque, gravity="0 0 -9.81"))
-    asked = Settings(
+    settings = Settings(
         made[:2],
         tmp_path,
         made[2:],
@@ -151,7 +151,7 @@ def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
         allowed={"viscous_friction"},
         joints={"elbow"},
     )
-    d = diagnose(asked, say=lambda _: None)
+    d = diagnose(settings, say=lambda _: None)
     assert d.sentence.startswith("Joint elbow is pushed by something outside")
     first = d.data["findings"][0]
     assert first["effect"] == "external_force" and {w["recording"] for w in first["when"]} == {"r1.mcap"}

@@ -198,7 +198,7 @@ def test_a_hand_with_play_in_every_joint_holds_what_it_catches(tmp_path):
         table.set(joint, "backlash", 0.03, 0.02, 0.04)
     table.loop_encoder = "motor"
     table.save(tmp_path / "servo.yaml")
-    kept = []
+    caught = []
     for settings in ((), (f"servo_file={tmp_path / 'servo.yaml'}",)):
         env = grasp_env(*settings, worlds=16, seed=1)
         policy, obs = env.scripted_policy(), env.get_observations()
@@ -206,9 +206,9 @@ def test_a_hand_with_play_in_every_joint_holds_what_it_catches(tmp_path):
         for k in range(70):  # 1.5 s: caught
             obs, *_ = env.step(policy(obs))
             fastest = max(fastest, float(env.object_velocity[:, :3].norm(dim=1).max())) if k > 2 else 0.0
-        kept.append(int((env.object_pose[:, 2] > 0.0).sum()))
+        caught.append(int((env.object_pose[:, 2] > 0.0).sum()))
         assert not env.nan.any() and fastest < 3.0, fastest
-    assert kept[1] >= kept[0] - 3 and kept[0] >= 10, kept
+    assert caught[1] >= caught[0] - 3 and caught[0] >= 10, caught
 
 
 def test_model_file_is_the_hand_that_trains(tmp_path):

@@ -71,8 +71,8 @@ def test_no_direction_has_a_negative_friction():
     effect, joint = EFFECTS["viscous_friction"], {"viscous_friction": 60.0}
     assert effect.refused_by_torque(-59.0, joint, 5.0) is None and effect.refused_by_torque(61.0, joint, 5.0)
     assert effect.refused_by_torque(1.0, {}, 5.0)  # beside none on the whole
-    told = effect.parameters_by_torque(ByTorque(-58.0, -66.0, -50.0, 0.0, joint, "N", "m"))["asymmetry"]
-    assert told["low"] == -2.0 <= told["value"] < told["high"]
+    asymmetry = effect.parameters_by_torque(ByTorque(-58.0, -66.0, -50.0, 0.0, joint, "N", "m"))["asymmetry"]
+    assert asymmetry["low"] == -2.0 <= asymmetry["value"] < asymmetry["high"]
 
 
 def test_nothing_further_is_named_where_nothing_is_missing():

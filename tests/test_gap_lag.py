@@ -125,6 +125,6 @@ def test_training_gets_the_first_order_with_the_same_mean_delay_and_is_told(swin
         params = search.params_of((Member(EFFECTS["lag"], variant),))[:1]
         trial = Trial((Member(EFFECTS["lag"], variant),), search.fitter.fit(params, np.array([0.02]), iterations=0))
         servo_changes(table, search.case, trial, np.array([[0.01, 0.03]]), ["joint"])
-        left = missing_of(search.case, trial)
+        missing = missing_of(search.case, trial)
         assert table.value("joint", "lag").value == pytest.approx(0.02)
-        assert [x.startswith("second order of lag@joint") for x in left] == [True] * second
+        assert [x.startswith("second order of lag@joint") for x in missing] == [True] * second

@@ -19,7 +19,7 @@ class Judged(JointAnswer):
     """One joint with one effect, which is found sure by all but what it removes: errors are given, not simulated."""
 
     def __init__(self, before: float, after: float):
-        """before, after: errors of a free run without and with the effect, rad."""
+        """Take the errors of a free run without and with the effect, rad."""
         effect = SimpleNamespace(
             effort_only=False, jitters=False, shows="", parameters=lambda fitted: {}, signal=lambda *_: np.ones(ROWS)
         )

@@ -100,8 +100,8 @@ def test_reading_has_its_share_and_names_what_it_left(limit, read, clock, monkey
         assert all(f"{k}.mcap" in said for k in range(12) if k not in there)
 
 
-@pytest.mark.parametrize("limit, kept", [(None, 10), (1000.0, 10), (190.0, 7), (100.0, 2)])
-def test_recordings_whose_model_would_take_too_long_are_left_out_evenly(limit, kept, clock, monkeypatch):
+@pytest.mark.parametrize("limit, modelled", [(None, 10), (1000.0, 10), (190.0, 7), (100.0, 2)])
+def test_recordings_whose_model_would_take_too_long_are_left_out_evenly(limit, modelled, clock, monkeypatch):
     """0.4 s of modelling for each second of a recording, 10 s each: 40 s in all, and a fifth of 100 s is 20, of 190 38,
     8 of it for a look. Of 1,000 s it would be 200, and nothing is tried: `clock` stands still."""
 
@@ -117,11 +117,11 @@ def test_recordings_whose_model_would_take_too_long_are_left_out_evenly(limit, k
     settings = SimpleNamespace(device="cpu", joints=None)
     drives.w = SimpleNamespace(runs=list(runs), held=[6, 7, 8, 9], settings=settings, limit=TimeLimit(limit))
     drives._within_the_limit()
-    assert len(drives.w.runs) == kept and (clock[0] == 0.0) == (kept == 10)
-    assert len(drives.w.held) == {10: 4, 7: 3, 2: 1}[kept]
-    if kept < 10:
-        assert [r.name for r in drives.w.runs] == {7: list("0135679"), 2: list("06")}[kept]
-        assert f"{10 - kept} of 10 recordings are left out" in drives.w.limit.left_out[0]
+    assert len(drives.w.runs) == modelled and (clock[0] == 0.0) == (modelled == 10)
+    assert len(drives.w.held) == {10: 4, 7: 3, 2: 1}[modelled]
+    if modelled < 10:
+        assert [r.name for r in drives.w.runs] == {7: list("0135679"), 2: list("06")}[modelled]
+        assert f"{10 - modelled} of 10 recordings are left out" in drives.w.limit.left_out[0]
 
 
 @pytest.mark.parametrize("spent, fitted", [(0.0, 3), (1 - STANDING_IN + 0.01, 0), (0.75, 2)])
@@ -145,19 +145,19 @@ def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
     clock[0] = 100 * spent
     drives.stand_in(d)
     assert len(d.standins) == fitted
-    left = ", ".join("abc"[fitted:])
-    assert drives.w.limit.left_out == ([f"no stand-in is fitted to {left} (the limit of 100 s)"] if left else [])
+    without = ", ".join("abc"[fitted:])
+    assert drives.w.limit.left_out == ([f"no stand-in is fitted to {without} (the limit of 100 s)"] if without else [])
 
 
 @pytest.mark.parametrize("spent, seconds", [(0.5, 200.0), (1 - PLANNING + 0.01, 2000.0), (0.5, 100.0)])
 def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeypatch):
     """A plan is one call that nothing ends: it is begun where a minute is left."""
-    asked = []
+    calls = []
     given = {"j": [full_model.Candidate("believed", 1.0, None)]}
     monkeypatch.setattr(diagnosis.conclude, "candidates", lambda *_: (given, {}))
-    monkeypatch.setattr(full_model, "write_best", lambda *given: asked.append(given[9]))
+    monkeypatch.setattr(full_model, "write_best", lambda *given: calls.append(given[9]))
     monkeypatch.setattr(diagnosis.logged_torque, "told", lambda *_: {})
-    monkeypatch.setattr(diagnosis, "plan_next", lambda *_: asked.append("plan"))
+    monkeypatch.setattr(diagnosis, "plan_next", lambda *_: calls.append("plan"))
     drives = object.__new__(Drives)
     settings = SimpleNamespace(replay="mujoco", device="cpu", next_recording=True)
     limit = TimeLimit(seconds)
@@ -180,7 +180,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
     diagnosis._next(SimpleNamespace(), w, [])
     replayed, planned = spent < 1 - PLANNING, limit.rest() > diagnosis.PLAN
     assert planned == (seconds == 200.0)
-    assert asked == ["mujoco" if replayed else "none"] + ["plan"] * planned
+    assert calls == ["mujoco" if replayed else "none"] + ["plan"] * planned
     said = ["not replayed in the engine that trains"] * (not replayed)
     said += ["no next recording is planned"] * (not planned)
     assert [x.split(" (")[0] for x in limit.left_out] == said

@@ -165,8 +165,8 @@ def test_a_joint_further_off_takes_the_place_of_the_last():
     e = cases[4]
     again = dragged_by(a, [e])  # e once more, from its own plant, from finer samples
     for name in ("drag3", "drag_v3", "drag_a3", "pull3"):
-        apart, size = (np.quantile(np.abs(x), 0.95) for x in (column(again, name) - column(a, name), column(a, name)))
-        assert apart < 0.1 * size, name
+        change, size = (np.quantile(np.abs(x), 0.95) for x in (column(again, name) - column(a, name), column(a, name)))
+        assert change < 0.1 * size, name
 
 
 @pytest.mark.slow
@@ -214,13 +214,13 @@ def test_the_other_end_of_a_linkage_is_asked_for_it():
     drives = object.__new__(Drives)
     drives.cases = several()
     assert drives.cases[5].scales.others == ("a", "b", "c", "d")
-    asked: list[dict] = []
-    drives._search_with = lambda answers, cases: asked.append(cases)
+    searches: list[dict] = []
+    drives._search_with = lambda answers, cases: searches.append(cases)
     found = [outcome("f"), None, outcome("f", "d", "z"), outcome(), outcome("f", "b"), outcome()]
     answers = [(SimpleNamespace(case=c), x) for c, x in zip(drives.cases, found, strict=True)]
     drives._search_draggers(answers, [0, 2, 4])
-    (ends,) = asked
+    (ends,) = searches
     assert list(ends) == [5] and ends[5].scales.others == ("a", "b", "c", "e")
     answers[5] = answers[5][0], SimpleNamespace(best=SimpleNamespace(members=()))  # nothing there to be explained
     drives._search_draggers(answers, [4])
-    assert asked[1] == {}
+    assert searches[1] == {}

@@ -212,7 +212,7 @@ def test_a_joint_of_another_sign_moves_the_others_as_it_was_read():
             out.append(Run(name, ("a", "b"), run.cmd_t, cmd, run.t, q, run.servo, run.gravity))
         return out
 
-    def felt(given):
+    def series_of(given):
         for r in given:
             r.smooth()
         (b,) = build(model, given, only={"b"})
@@ -224,8 +224,8 @@ def test_a_joint_of_another_sign_moves_the_others_as_it_was_read():
     wrong = channels.drop(wrong, out, notes, model)
     assert all(r.joints == ("a", "b") and r.left_out == {"a"} for r in wrong) and "a is left out (sign" in notes[0]
     alone = [Run(r.name, ("b",), r.cmd_t, r.cmd[:, 1:], r.t, r.q[:, 1:], r.servo, r.gravity) for r in wrong]
-    np.testing.assert_allclose(felt(wrong), felt(runs(1)), atol=1e-9)
-    assert np.abs(felt(wrong) - felt(alone)).max() > 0.1
+    np.testing.assert_allclose(series_of(wrong), series_of(runs(1)), atol=1e-9)
+    assert np.abs(series_of(wrong) - series_of(alone)).max() > 0.1
 
 
 def stepped(late, others=0):

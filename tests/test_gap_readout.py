@@ -39,14 +39,14 @@ def test_a_readout_is_shifted_and_stretched_and_the_motion_stays():
     assert np.abs(case.plant.simulate(both, windows)[0][0][late] - q[0][late]).max() < 5e-3
 
 
-@pytest.mark.parametrize("apart", [True, False])
-def test_a_readout_is_asked_for_where_there_are_two_encoders(apart):
-    _, case = built(APART if apart else None)
+@pytest.mark.parametrize("two_encoders", [True, False])
+def test_a_readout_is_asked_for_where_there_are_two_encoders(two_encoders):
+    _, case = built(APART if two_encoders else None)
     for effect in ("position_offset", "position_scale"):
         columns = {c for v in EFFECTS[effect].variants(case.scales) for p in v.params for c in p.columns}
-        assert any(c.startswith("readout_") for c in columns) is apart
+        assert any(c.startswith("readout_") for c in columns) is two_encoders
     search = JointSearch(case, [0], None, [0])
-    assert any(p.key == "zero" for p in search.all_nuisances) is apart
+    assert any(p.key == "zero" for p in search.all_nuisances) is two_encoders
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

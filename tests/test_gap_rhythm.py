@@ -30,14 +30,14 @@ def held(t: np.ndarray, q: np.ndarray, period: float, begin: float = 0.013) -> n
 @pytest.mark.parametrize("period", [0.03, 0.05, 0.08])
 def test_the_rhythm_of_readings_is_found_and_one_of_each_is_kept(period):
     t, q = motion()
-    shown = held(t, q, period)
-    assert channels.rhythm(t, shown) == pytest.approx(period, rel=0.01)
-    new = ~channels.between_readings(t, shown, period)
+    reading = held(t, q, period)
+    assert channels.rhythm(t, reading) == pytest.approx(period, rel=0.01)
+    new = ~channels.between_readings(t, reading, period)
     assert new.sum() == pytest.approx(4.0 / period, abs=2)
     beat = np.floor((t - 0.013) / period)
     assert len(np.unique(beat[new])) == new.sum()
     # what stands still for a while is read as well
-    still = np.where(t < 2.0, 0.3, shown)
+    still = np.where(t < 2.0, 0.3, reading)
     assert (~channels.between_readings(t, still, period))[t < 2.0].sum() == pytest.approx(2.0 / period, abs=2)
 
 
@@ -59,8 +59,8 @@ def test_a_joint_that_is_read_seldom_is_named_and_judged_by_its_readings():
     runs = []
     for k in range(3):
         t, q = motion(seed=k)
-        shown = held(t, q, 0.05)
-        runs.append(Run(f"r{k}", ("joint",), t, q[:, None], t, shown[:, None], table, np.array([0, 0, -9.81])))
+        reading = held(t, q, 0.05)
+        runs.append(Run(f"r{k}", ("joint",), t, q[:, None], t, reading[:, None], table, np.array([0, 0, -9.81])))
     found, out, _ = channels.inspect(runs, model(), {})
     assert [f.effect for f in found] == ["bad_channel"] and "every 50 ms" in found[0].regime and not out
     assert all(len(r.t) == pytest.approx(80, abs=2) for r in runs)

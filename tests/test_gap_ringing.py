@@ -56,11 +56,11 @@ def test_nothing_makes_a_joint_ring_that_has_no_loop(soft):
     """What is fed back makes a joint ring: of one whose loop gives hardly any torque nothing is asked."""
     nothing = without_search(soft)
     s = soft.case.scales
-    for share, asked in ((0.5, False), (2.0, True)):
+    for share, has_loop in ((0.5, False), (2.0, True)):
         bare = copy.copy(soft)
         bare.case = replace(soft.case, scales=replace(s, stiffness=share * SEARCH.doubt * s.tau / s.span))
-        assert ringing.without_loop(bare.case) != asked
-        if not asked:
+        assert ringing.without_loop(bare.case) != has_loop
+        if not has_loop:
             assert ringing.answered(bare, nothing) is nothing
     assert not ringing.without_loop(soft.case)
 

@@ -192,8 +192,8 @@ def test_what_is_not_sure_is_handed_on_with_what_was_believed():
 
 
 def test_what_removes_nothing_keeps_nothing():
-    kept = [confidence.weigh(doubtful(earned=x), 10.0, 1.0, 10.0, 1.0) for x in (0.0, 0.5)]
-    assert kept[0] == 0.0 and kept[1] == pytest.approx(0.5, abs=0.01)
+    weighed = [confidence.weigh(doubtful(earned=x), 10.0, 1.0, 10.0, 1.0) for x in (0.0, 0.5)]
+    assert weighed[0] == 0.0 and weighed[1] == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_name_earns_its_confidence_by_what_it_removes():
@@ -271,7 +271,7 @@ def test_a_size_that_fits_without_a_condition_do_not_repeat_is_a_hint():
 def test_intervals_grow_with_what_is_left():
     p = param("time_constant", "lag", "set", -1e3, 1e3)
     fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0)
-    factor = lambda left: float(stretched(np.array([[-1.0, 1.0]]), fit, left)[0, 1])  # noqa: E731
+    factor = lambda ratio: float(stretched(np.array([[-1.0, 1.0]]), fit, ratio)[0, 1])  # noqa: E731
     assert (
         factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)
     )
@@ -291,8 +291,8 @@ def test_a_stand_in_must_take_a_least_share_off():
 
 
 def test_a_stand_in_is_offered_where_much_is_left():
-    for left, offered in ((1.25, False), (1.35, True)):  # x the noise floor
-        d = SimpleNamespace(joints={"j": {"after": left}}, findings=[], standins=[], notes=[])
+    for error, offered in ((1.25, False), (1.35, True)):  # x the noise floor
+        d = SimpleNamespace(joints={"j": {"after": error}}, findings=[], standins=[], notes=[])
         parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
         search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
         outcome = SimpleNamespace(best=None, none=None)
@@ -304,7 +304,7 @@ def test_a_stand_in_is_offered_where_much_is_left():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(handed_on, "fit_stand_in", lambda *_: SimpleNamespace(text="a torque stands in"))
             Drives.stand_in(drives, d)
-        assert (len(d.standins) == 1) is offered, left
+        assert (len(d.standins) == 1) is offered, error
 
 
 class Shook(ringing.Ringing):
@@ -335,10 +335,10 @@ def test_a_joint_must_shake_in_some_windows():
     outcome = SimpleNamespace(none="none", best=SimpleNamespace(members=(rings,)))
     try:
         # in what was fitted, in what was held out, of which one must shake
-        for fitted, kept, told in ((1, 1, False), (2, 1, True), (1, 2, True), (4, 0, False)):
+        for fitted, held, expected in ((1, 1, False), (2, 1, True), (1, 2, True), (4, 0, False)):
 
-            def counted(search, none, runs=None, *_, fitted=fitted, kept=kept):
-                count = kept if runs else fitted
+            def counted(search, none, runs=None, *_, fitted=fitted, held=held):
+                count = held if runs else fitted
                 return SimpleNamespace(
                     quiet=1e-3,
                     loud=np.ones(count, bool),
@@ -347,18 +347,18 @@ def test_a_joint_must_shake_in_some_windows():
                 )
 
             ringing.Ringing = counted
-            assert (ringing.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is told, (fitted, kept)
+            assert (ringing.shown(SimpleNamespace(), outcome, [1], None) > 0.5) is expected, (fitted, held)
     finally:
         ringing.Ringing = made
 
 
 def test_joints_are_searched_again_that_feel_each_others_motion():
-    def felt(share: float) -> bool:
+    def is_coupled(share: float) -> bool:
         series = np.zeros((100, len(SERIES_INDEX)))
         series[:, SERIES_INDEX["rest"]] = share * 2.0 * (-1.0) ** np.arange(100)
         return coupled([SimpleNamespace(plant=SimpleNamespace(series=series), scales=SimpleNamespace(tau=2.0))])
 
-    assert felt(0.04) and not felt(0.02)
+    assert is_coupled(0.04) and not is_coupled(0.02)
 
 
 def test_how_much_a_joint_shakes_counts_before_where_it_rests():
@@ -373,8 +373,8 @@ def test_how_much_a_joint_shakes_counts_before_where_it_rests():
 
 def test_repeats_that_differ_by_what_was_found_are_no_floor():
     floor = conclude.Noise(3.0, "repeats", {"a": 3.0, "b": 3.0})
-    for left, same in ((2.2, False), (2.5, True)):
-        assert (floor.at_most({"a": left}) is floor) is same, left
+    for error, same in ((2.2, False), (2.5, True)):
+        assert (floor.at_most({"a": error}) is floor) is same, error
     assert floor.at_most({"a": 1.2}).lowered == ("a",) and floor.at_most({"a": 1.2}).how in files.FLOORS
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
@@ -537,7 +537,7 @@ def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():
     speed = np.where(run[sample_window] == 1, 10.0, 1.0) + 1e-3 * sample_window
     saturation = (sample_window == 27).astype(float)
     case = SimpleNamespace(plant=SimpleNamespace(dt=0.2), regimes={"saturation": saturation, "speed": speed})
-    kept = thin(windows, case, budget=24.0)
-    first = kept.sample_row[np.searchsorted(kept.sample_window, np.arange(len(kept.window)))] // rows
+    thinned = thin(windows, case, budget=24.0)
+    first = thinned.sample_row[np.searchsorted(thinned.sample_window, np.arange(len(thinned.window)))] // rows
     assert len(first) == 12 and 27 in first
     assert np.bincount(run[first], minlength=4).max() <= 5, np.bincount(run[first])

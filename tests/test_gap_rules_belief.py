@@ -43,7 +43,7 @@ def test_what_holds_a_joint_gives_a_little():
     assert 1.5e-3 < give(SimpleNamespace(slide=False)) < 3e-3 and 4e-5 < give(SimpleNamespace(slide=True)) < 8e-5
 
 
-def _told(t: np.ndarray, q: np.ndarray) -> float | None:
+def _noise_of(t: np.ndarray, q: np.ndarray) -> float | None:
     """Return what `quiet_noise` says of one recording q [S] rad of an encoder without counts."""
     return quiet_noise([(t, q, misfit(t, q[:, None])[:, 0])], 0.0)
 
@@ -54,7 +54,7 @@ def restless(loud: float, share: float, speed: float = 0.0) -> float | None:
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = (np.arange(5000) // 50 * 37) % 100 < 100 * share
     way = 0.3 * np.sin(0.4 * t) + np.cumsum(0.01 * speed * on)
-    return _told(t, way + noise * np.where(on, loud, 1.0))
+    return _noise_of(t, way + noise * np.where(on, loud, 1.0))
 
 
 def test_a_joint_that_rings_is_not_noisy():
@@ -69,7 +69,7 @@ def with_quiet_parts(count: int) -> float | None:
     tenth."""
     t, noise = np.arange(5000) * 0.01, 1e-3 * np.random.default_rng(5).normal(size=5000)
     on = np.arange(5000) // 50 >= 100 - count
-    return _told(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))
+    return _noise_of(t, np.cumsum(0.01 * on) + noise * np.where(on, 0.1, 1.0))
 
 
 def test_a_few_quiet_moments_are_no_accident_only_from_three_on():
@@ -77,14 +77,14 @@ def test_a_few_quiet_moments_are_no_accident_only_from_three_on():
 
 
 def test_what_noise_is_usual_is_told_by_several_joints():
-    def told(others: int) -> bool:
+    def is_usual(others: int) -> bool:
         rng, t = np.random.default_rng(3), np.arange(2000) * 0.01
         q = 0.3 * np.sin(0.4 * t)[:, None] + 1e-3 * rng.normal(size=(2000, others + 1))
         q[:, -1] += 4e-3 * np.sqrt(2) * np.sin(2 * np.pi * 31.0 * t + 0.2)
         run = SimpleNamespace(name="a", noises=None, t=t, q=q, torque=None, read=None, readings=lambda j: (t, q[:, j]))
         return usual_noise([run], others, 4e-3, np.ones(others + 1)) is not None
 
-    assert [told(n) for n in (2, 3)] == [False, True]
+    assert [is_usual(n) for n in (2, 3)] == [False, True]
 
 
 def rattling(loud: float, swings: float, others: float = 0.3, torque: float | None = None,

@@ -57,11 +57,11 @@ def left_by_a_plain_fit(of: Columns) -> float:
 
 
 def test_a_plain_fit_must_leave_much_for_a_push():
-    for share, told in ((0.4, True), (0.22, False)):
+    for share, expected in ((0.4, True), (0.22, False)):
         tried = [recorded(h * stretches(0.3), 0.01) for h in np.geomspace(0.5, 5.0, 60)]
         one = min(tried, key=lambda of: abs(left_by_a_plain_fit(of) - share))
         assert left_by_a_plain_fit(one) == pytest.approx(share, abs=0.02)
-        assert (pushed(one) is not None) is told, share
+        assert (pushed(one) is not None) is expected, share
 
 
 def test_pushes_are_clear_where_the_quiet_torque_fits():
@@ -152,32 +152,32 @@ def named(u: np.ndarray, column: np.ndarray, block: np.ndarray, seed: int = 0) -
 def test_a_further_effect_of_the_torque_must_remove_a_least_share():
     rng = np.random.default_rng(3)
     column, noise = (rng.choice([-1.0, 1.0], len(T)) for _ in range(2))
-    for share, told in ((0.17, True), (0.08, False)):
+    for share, expected in ((0.17, True), (0.08, False)):
         u = np.sqrt(share) * column + np.sqrt(1 - share) * noise
-        assert named(u, column, np.repeat(np.arange(BLOCKS), A_BLOCK)) is told, share
+        assert named(u, column, np.repeat(np.arange(BLOCKS), A_BLOCK)) is expected, share
 
 
 def test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps():
     # it helps in three stretches and harms a little in all others: draws without any of the three, of 8 and of 40
     # stretches, are (5/8)^8 = 2.3 % and (37/40)^40 = 4.4 % of all
-    for stretches_, told in ((8, True), (40, False)):
+    for stretches_, expected in ((8, True), (40, False)):
         block = np.repeat(np.arange(stretches_), 200)
         where = np.isin(block, [0, stretches_ // 2, stretches_ - 1])
         way = np.tile([1.0, -1.0], 100 * stretches_)
-        assert named(np.where(where, way, 0.0), np.where(where, way, 0.01 * way), block) is told, stretches_
+        assert named(np.where(where, way, 0.0), np.where(where, way, 0.01 * way), block) is expected, stretches_
 
 
 def test_a_torque_that_fits_nothing_is_no_witness():
     value = {n: 1.0 for n in NAMES}
-    for left, told in ((0.5, True), (0.6, False)):
+    for share, expected in ((0.5, True), (0.6, False)):
         scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=1.0)
         case = SimpleNamespace(joint="j", unknown=("coulomb_friction",), scales=scales, ranges={}, factors={},
                                told=False, plant=SimpleNamespace(nominal=np.zeros((1, len(INDEX)))))  # fmt: skip
-        logged_torque.believe([IdentifiedJoint(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
-        assert case.told is told, left
+        logged_torque.believe([IdentifiedJoint(case, inverse_dynamics.Inverse(value, value, value, share, []), [])])
+        assert case.told is expected, share
 
 
-def told(after: float) -> float:
+def confidence_at(after: float) -> float:
     """Return the confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was held
     out."""
     n = SimpleNamespace(effect=LoadFriction.id, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
@@ -193,17 +193,17 @@ def told(after: float) -> float:
 
 
 def test_what_the_torque_names_is_never_certain():
-    assert 0.8 < told(0.5) < 1.0
+    assert 0.8 < confidence_at(0.5) < 1.0
 
 
 def test_what_the_torque_names_must_help_in_what_was_held_out():
-    assert 0.4 < told(0.99) < JUDGE.firm
+    assert 0.4 < confidence_at(0.99) < JUDGE.firm
 
 
 def test_what_the_torque_names_is_a_part_of_the_answer():
-    for left, word in ((0.65, "partly_explained"), (0.75, "unknown")):
-        named_ = [SimpleNamespace(effect="load_friction", before=1.0, after=left)]
-        held = {"before": 1.0, "after": left, "removed_low": 0.1, "error": "effort_rmse_Nm"}
+    for after, word in ((0.65, "partly_explained"), (0.75, "unknown")):
+        named_ = [SimpleNamespace(effect="load_friction", before=1.0, after=after)]
+        held = {"before": 1.0, "after": after, "removed_low": 0.1, "error": "effort_rmse_Nm"}
         finding = Finding("load_friction", 0.9, "", ["j"], held_out=held)
         d = SimpleNamespace(data=empty(), touch=None, judged=Judged({}), findings=[])
         by_torque = [IdentifiedJoint(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
@@ -211,7 +211,7 @@ def test_what_the_torque_names_is_a_part_of_the_answer():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(conclude, "sentence", lambda *_: "")
             conclude.decide(d)
-        assert d.data["verdict"] == word, left
+        assert d.data["verdict"] == word, after
 
 
 def fitted_from_torque(samples=1000, seconds=10.0) -> bool:

@@ -63,7 +63,7 @@ class Choosing(PadSearch):
     """A search of one pad that is offered some effects, whose losses are given."""
 
     def __init__(self, losses, offered=()):
-        """losses: of a reading, by what is left out and where it was fitted, from the effects of a hypothesis."""
+        """Take losses of a reading, by what is left out and where it was fitted, from the effects of a hypothesis."""
         self.losses, self.offered = losses, [TOUCH_EFFECTS[e] for e in offered]
         self.rng, self.train, self.scale_known, self.runs = (
             np.random.default_rng(0), np.ones(100, bool), False, [SimpleNamespace(pad=1)])  # fmt: skip
@@ -97,8 +97,8 @@ def chosen(losses, *offered):
 
 
 def test_within_the_noise_no_touch_effect_is_looked_for():
-    for left, found in ((1.38, ()), (1.5, ("tactile_delay",))):  # squared
-        assert chosen(lambda ids, left=left: (0.5 if ids else left,) * 2, "tactile_delay") == found, left
+    for loss, found in ((1.38, ()), (1.5, ("tactile_delay",))):  # squared
+        assert chosen(lambda ids, loss=loss: (0.5 if ids else loss,) * 2, "tactile_delay") == found, loss
 
 
 def test_a_pad_has_at_most_so_many_effects():
@@ -123,14 +123,14 @@ def test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken():
 class Mapped(PadSearch):
     """A search of one pad that has a gain for every taxel, and one for the pad, to choose from."""
 
-    def __init__(self, left):
-        self.left, self.train, self.scale_known, self.allowed, self.shear = left, np.ones(50, bool), True, None, False
+    def __init__(self, ratio):
+        self.ratio, self.train, self.scale_known, self.allowed, self.shear = ratio, np.ones(50, bool), True, None, False
 
     def fit(self, ids, values, where=None, gains=None, order=None, evaluations=60, still=()):
         return TouchTrial(ids, dict(values), gains, order, res=np.ones(50))
 
     def residual(self, values, gains=None, order=None):
-        return np.full(50, np.sqrt(self.left))
+        return np.full(50, np.sqrt(self.ratio))
 
     def gain_map(self, trial, where):
         return np.ones(4)
@@ -147,22 +147,22 @@ class Mapped(PadSearch):
 
 def test_a_gain_for_every_taxel_must_follow_clearly_better_than_one():
     gain = next(e for e in TOUCH_CATALOGUE if e.by_taxel)
-    for left, mapped in ((0.58, True), (0.6, False)):  # x what one gain leaves
-        assert (Mapped(left)._try(TouchTrial((), {}), gain).gains is not None) is mapped, left
+    for loss, mapped in ((0.58, True), (0.6, False)):  # x what one gain leaves
+        assert (Mapped(loss)._try(TouchTrial((), {}), gain).gains is not None) is mapped, loss
 
 
 def claimed(after=0.5, share=0.0):
     """Return the finding of a pad's gain that leaves so much of 1 N on what was held out, its like having a share of
     the draws."""
     of = lambda x: (x, np.full(20, x * x), np.arange(20))  # noqa: E731
-    left = lambda _, trial, stage: of(after if trial == "best" else 1.0)  # noqa: E731
+    loss_of = lambda _, trial, stage: of(after if trial == "best" else 1.0)  # noqa: E731
     best = SimpleNamespace(ids=("tactile_gain",))
     answer = SimpleNamespace(search=SimpleNamespace(load=False), best=best, none="none", name="thumb", pad=0, notes=[],
                              outcome=SimpleNamespace(rivals={"tactile_gain": [("contact_stiffness", share)]},
                                                      confidence={"tactile_gain": 1.0}),
                              _parameters=lambda e: ([], {}))  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judge, "held_out", lambda s, trial, stage: left(s, "best" if trial is best else trial, stage))
+        patch.setattr(judge, "held_out", lambda s, trial, stage: loss_of(s, "best" if trial is best else trial, stage))
         patch.setattr(judge, "when", lambda *_: [])
         return PadAnswer._finding(answer, "tactile_gain")
 
@@ -208,10 +208,10 @@ def test_the_gain_of_a_taxel_is_believed_to_be_one():
 
 
 def test_what_is_left_of_a_pad_has_structure():
-    for loss, left, structure in ((1.8, 1.4, True), (1.6, 1.4, False), (1.8, 1.2, False)):
+    for loss, remaining, structure in ((1.8, 1.4, True), (1.6, 1.4, False), (1.8, 1.2, False)):
         search = SimpleNamespace(cross=lambda _, loss=loss: np.full(10, loss), train=np.ones(10, bool))
-        answer = SimpleNamespace(search=search, best=None, left=left, floor=1.0)
-        assert PadAnswer.structured(answer) is structure, (loss, left)
+        answer = SimpleNamespace(search=search, best=None, left=remaining, floor=1.0)
+        assert PadAnswer.structured(answer) is structure, (loss, remaining)
 
 
 class Recorded:
@@ -263,10 +263,10 @@ class Scanned(PadSearch):
     """A search of one pad whose one effect would take a share of what is left, by a linear score."""
 
     def __init__(self, share):
-        self.train, left = np.ones(100, bool), np.ones(100)
+        self.train, residual = np.ones(100, bool), np.ones(100)
         across = np.tile([1.0, -1.0], 50)
-        self.changed = np.sqrt(share) * left + np.sqrt(1 - share) * across
-        self.current = TouchTrial((), {}, keys=(), jac=np.zeros((100, 0)), res=left)
+        self.changed = np.sqrt(share) * residual + np.sqrt(1 - share) * across
+        self.current = TouchTrial((), {}, keys=(), jac=np.zeros((100, 0)), res=residual)
 
     def _possible(self, current, effect):
         return effect.id == "tactile_delay"

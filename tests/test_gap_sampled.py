@@ -66,7 +66,7 @@ def sampled(eccentric: tuple[float, float] = (0.0, 0.0), seconds: float = 4.0) -
     return run, torque[(t * 1000).astype(int)]
 
 
-def left(run: Run, **columns: float) -> tuple[float, np.ndarray]:
+def simulated_error(run: Run, **columns: float) -> tuple[float, np.ndarray]:
     """Return (rms of the position error, simulated torque) of the plant run free with these columns."""
     plant = build(model(), [run])[0].plant
     params = plant.base()[None].copy()
@@ -78,18 +78,19 @@ def left(run: Run, **columns: float) -> tuple[float, np.ndarray]:
 
 def test_a_sampled_loop_is_followed_by_the_age_of_what_it_acts_on():
     run, torque = sampled()
-    at_once = left(run)[0]
-    aged, shown = left(run, feedback_delay=0.5e-3, speed_lag=1e-3)
+    at_once = simulated_error(run)[0]
+    aged, simulated = simulated_error(run, feedback_delay=0.5e-3, speed_lag=1e-3)
     assert at_once > 5e-4 and aged < 0.2 * at_once
     size = np.abs(np.quantile(torque, 0.9))
-    assert np.sqrt(np.median((shown - torque) ** 2)) < 0.02 * size  # the torque in force, and not that of a step before
-    assert float(np.polyfit(shown, torque, 1)[0]) == pytest.approx(1.0, abs=0.01)
+    # the torque in force, and not that of a step before
+    assert np.sqrt(np.median((simulated - torque) ** 2)) < 0.02 * size
+    assert float(np.polyfit(simulated, torque, 1)[0]) == pytest.approx(1.0, abs=0.01)
 
 
 def test_an_eccentric_encoder_shows_other_speeds_too():
     run, _ = sampled((-0.09, 0.04))
-    error, _ = left(run, feedback_delay=0.5e-3, speed_lag=1e-3, eccentric_sin=-0.09, eccentric_cos=0.04)
-    assert error < 4e-4 and left(run, feedback_delay=0.5e-3, speed_lag=1e-3)[0] > 10 * error
+    error, _ = simulated_error(run, feedback_delay=0.5e-3, speed_lag=1e-3, eccentric_sin=-0.09, eccentric_cos=0.04)
+    assert error < 4e-4 and simulated_error(run, feedback_delay=0.5e-3, speed_lag=1e-3)[0] > 10 * error
 
 
 def test_a_motion_as_it_is_from_what_an_encoder_shows():
@@ -102,9 +103,9 @@ def test_a_motion_as_it_is_from_what_an_encoder_shows():
         row[INDEX["eccentric_sin"]],
         row[INDEX["eccentric_cos"]],
     ) = 1.1, 0.03, 0.08, -0.05
-    shown = 1.1 * q + 0.03 + 0.08 * np.sin(q) - 0.05 * (np.cos(q) - 1)
-    speed = np.gradient(shown, t)
-    x, v, a = true_motion((t, shown, speed, np.gradient(speed, t)), row)[1:]
+    reading = 1.1 * q + 0.03 + 0.08 * np.sin(q) - 0.05 * (np.cos(q) - 1)
+    speed = np.gradient(reading, t)
+    x, v, a = true_motion((t, reading, speed, np.gradient(speed, t)), row)[1:]
     assert (
         np.abs(x - q).max() < 1e-4
         and np.abs(v - 3.5 * np.cos(5 * t))[5:-5].max() < 2e-3

@@ -46,8 +46,8 @@ def test_cases_do_not_depend_on_the_number_of_cores(monkeypatch):
 def test_a_motion_without_what_may_be_added_is_the_same_motion():
     """Refining simulates with no mass added and no tilt: those columns alone are left out."""
     model, runs = mujoco.MjModel.from_xml_string(MODEL), two_runs()
-    kept = lambda j, plant: plant  # noqa: E731
-    whole, bare = moved(model, runs, kept).used, moved(model, runs, kept, added=False).used
+    unchanged = lambda j, plant: plant  # noqa: E731
+    whole, bare = moved(model, runs, unchanged).used, moved(model, runs, unchanged, added=False).used
     for j, plant in whole.items():
         windows = plant.windows(None)
         expected, got = (p.simulate(p.base()[None], p.windows(None)) for p in (plant, bare[j]))
@@ -81,9 +81,9 @@ def test_lines_between_rows_are_those_of_interp(columns):
     on_lines(at, known, x, room[1:-1])
     np.testing.assert_array_equal(room[1:-1], expected)
     assert (room[[0, -1]] == -1.0).all()
-    apart = np.full((len(at), 2 * columns), -1.0)  # into every other column
-    np.testing.assert_array_equal(on_lines(at, known, x, apart[:, ::2]), expected)
-    assert (apart[:, 1::2] == -1.0).all()
+    wide = np.full((len(at), 2 * columns), -1.0)  # into every other column
+    np.testing.assert_array_equal(on_lines(at, known, x, wide[:, ::2]), expected)
+    assert (wide[:, 1::2] == -1.0).all()
 
 
 def test_cross_products_are_numpys():

@@ -171,9 +171,9 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     ).values()
     assert own.over(lambda table, spec: ["written"])(servo, None) == ["written"]
     assert "as the recorded torque tells it" in own.note(nuisance)
-    told = servo.value("shoulder", "coulomb_friction")
-    assert told.value == pytest.approx(COULOMB[0], rel=0.05) and told.low < told.value < told.high
-    assert nuisance["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
+    friction = servo.value("shoulder", "coulomb_friction")
+    assert friction.value == pytest.approx(COULOMB[0], rel=0.05) and friction.low < friction.value < friction.high
+    assert nuisance["coulomb_friction@shoulder"] == pytest.approx(friction.value, abs=1e-5)
     assert servo.value("shoulder", "viscous_friction").value == pytest.approx(VISCOUS[0], rel=0.1)
     assert servo.value("elbow", "coulomb_friction").unknown
     notes: list[str] = []

@@ -21,7 +21,7 @@ from dexsim.gap.touch import search as touch_search
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import mechanism
 from dexsim.tactile import reference as ref
-from tests.tactile_fixtures import felt
+from tests.tactile_fixtures import touch_result
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def found(folder, seconds=4.0, allowed=None, count=3, **planted):
     """Return the touch of some rig recordings with what was planted."""
     paths, model, servo = press_rig.record(folder, count, seconds, seed=4, **planted)
     m = mechanism(model, servo)
-    return felt([read(p, joints=m.joints, audit=False) for p in paths], m, set(), allowed=allowed)
+    return touch_result([read(p, joints=m.joints, audit=False) for p in paths], m, set(), allowed=allowed)
 
 
 def test_catalogue_of_touch_is_that_of_the_specification():
@@ -73,8 +73,8 @@ def test_the_plant_reads_what_the_rig_reads(plain):
         for load in (run.load, None):
             run.load, run.memory = load, {}
             error = touch_plant.readings(run, touch_plant.neutral())[on] - run.z[on]
-            felt = run.z.max(0) > 0.3
-            assert np.sqrt(np.mean(error[:, felt] ** 2)) < (0.05 if load is not None else 0.12)
+            loaded = run.z.max(0) > 0.3
+            assert np.sqrt(np.mean(error[:, loaded] ** 2)) < (0.05 if load is not None else 0.12)
 
 
 def test_rubber_relaxes_as_the_standard_linear_solid():
@@ -160,7 +160,7 @@ def test_more_planted_touch_effects(tmp_path, effect, planted, values):
 def test_nothing_planted_nothing_found(plain):
     paths, model, servo = plain
     m = mechanism(model, servo)
-    out = felt([read(p, joints=m.joints, audit=False) for p in paths], m, set())
+    out = touch_result([read(p, joints=m.joints, audit=False) for p in paths], m, set())
     assert not out.findings and not out.structured and out.before[0] < 1.3 * out.floor
 
 
@@ -247,7 +247,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 
     kinds, td.KINDS = td.KINDS, {}
     try:
-        out = felt([read(tmp_path / "a.mcap", joints=m.joints, audit=False)], m, set())
+        out = touch_result([read(tmp_path / "a.mcap", joints=m.joints, audit=False)], m, set())
     finally:
         td.KINDS = kinds
     assert out.before is None and any("not what was touched" in n for n in out.notes)
@@ -258,7 +258,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
     paths, model, servo = press_rig.record(tmp_path, 3, 4.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
     m = mechanism(model, servo)
-    out = felt(
+    out = touch_result(
         [read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set()
     )
     assert not out.findings and any("tactile_lsb is unknown" in n for n in out.notes)

@@ -96,9 +96,9 @@ def test_the_sensor_that_trains_reads_what_was_recorded(late, tmp_path):
 
 
 def test_what_is_doubted_holds_what_was_believed(late, tmp_path):
-    felt, path = late[0].touch, tmp_path / "tactile.yaml"
-    f = replace(felt.findings[0], confidence=0.6)
-    h = handed([f], felt.facts)
+    diagnosed, path = late[0].touch, tmp_path / "tactile.yaml"
+    f = replace(diagnosed.findings[0], confidence=0.6)
+    h = handed([f], diagnosed.facts)
     assert (
         write(h, path)
         and "not sure: its range holds what was believed" in path.read_text()

@@ -78,8 +78,8 @@ def test_a_column_that_says_nothing_alone_is_taken_as_absent_and_said():
     said = conclude.not_fitted([search.case])
     assert len(said) == 2 and all("taken as absent" in x for x in said)
     ripple = EFFECTS["torque_ripple"]
-    left = [narrowed(search, ripple, v) for v in ripple.variants(search.case.scales)]
-    assert any(v is not None for v in left), "it is still looked for"
+    variants = [narrowed(search, ripple, v) for v in ripple.variants(search.case.scales)]
+    assert any(v is not None for v in variants), "it is still looked for"
 
 
 def test_the_joint_that_drags_is_the_one_the_servo_names():

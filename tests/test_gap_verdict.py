@@ -32,9 +32,9 @@ def test_names_on_joints_that_need_no_effect_are_hints():
     assert held_out.firm(found) == [found[1]]
 
 
-def told(effect: str, confidence: float, joint: str = "a", **held) -> Finding:
-    shown = {"before": 2.0, "after": 1.0, "removed_low": 0.5} | held
-    return Finding(effect, confidence, "now and then", [joint], held_out=shown)
+def finding_of(effect: str, confidence: float, joint: str = "a", **held) -> Finding:
+    errors = {"before": 2.0, "after": 1.0, "removed_low": 0.5} | held
+    return Finding(effect, confidence, "now and then", [joint], held_out=errors)
 
 
 def decided(*found: Finding, before=4.0, after=1.0, floor=1.0, touch=None, **judged) -> SimpleNamespace:
@@ -56,12 +56,12 @@ EFFORT = {"error": "effort_rmse_Nm", "before": 2.0, "before_low": 2.0, "after": 
 @pytest.mark.parametrize("other", [{}, PUSH, BAD, {"effect": "current_sensor"}])
 def test_whatever_is_named_below_a_half_is_a_hint_and_not_in_the_sentence(other):
     """A name of a joint, a push, a signal or an effort: after what is sure, unknown to the verdict."""
-    d = decided(replace(told("lag", 0.45), **other), told("backlash", 0.9, "b"), effort=EFFORT)
+    d = decided(replace(finding_of("lag", 0.45), **other), finding_of("backlash", 0.9, "b"), effort=EFFORT)
     assert [f.get("hint", False) for f in d.data["findings"]] == [False, True]
     assert d.data["verdict"] == "explained" and "Joint b" in d.sentence and "Joint a" not in d.sentence
-    alone = decided(replace(told("lag", 0.45), **other), effort=EFFORT)
+    alone = decided(replace(finding_of("lag", 0.45), **other), effort=EFFORT)
     assert alone.data["verdict"] == "unknown" and alone.sentence.startswith("Something is missing that no effect")
-    assert decided(replace(told("lag", 0.45), **other), before=1.1, effort=EFFORT).data["verdict"] == "none"
+    assert decided(replace(finding_of("lag", 0.45), **other), before=1.1, effort=EFFORT).data["verdict"] == "none"
 
 
 def test_what_the_torque_whispers_decides_nothing():
@@ -70,36 +70,36 @@ def test_what_the_torque_whispers_decides_nothing():
     d = SimpleNamespace(data={}, findings=[], judged=Judged({}))
     named = [SimpleNamespace(effect="stribeck_friction", before=0.5, after=0.2)]
     by_torque = [(SimpleNamespace(joint="a"), SimpleNamespace(named=named), ["r"])]
-    conclude.add_behind(d, [told("stribeck_friction", 0.45, error="effort_rmse_Nm")], by_torque)
+    conclude.add_behind(d, [finding_of("stribeck_friction", 0.45, error="effort_rmse_Nm")], by_torque)
     assert d.judged.torque is None and len(d.findings) == 1
-    sure = told("stribeck_friction", 0.9, error="effort_rmse_Nm")
+    sure = finding_of("stribeck_friction", 0.9, error="effort_rmse_Nm")
     assert decided(sure, torque=behind).data["verdict"] == "partly_explained"
-    whispered = decided(told("stribeck_friction", 0.45, error="effort_rmse_Nm"))
+    whispered = decided(finding_of("stribeck_friction", 0.45, error="effort_rmse_Nm"))
     assert whispered.data["verdict"] == "unknown" and whispered.data["held_out"]["error"] == "position_rmse_rad"
     # beside a name that the motion bears out the torque's counts for nothing in the motion's verdict
-    both = decided(sure, told("backlash", 0.45), after=1.0, torque=behind)
+    both = decided(sure, finding_of("backlash", 0.45), after=1.0, torque=behind)
     assert both.data["held_out"]["error"] == "effort_rmse_Nm" and both.data["findings"][1]["hint"]
 
 
 @pytest.mark.parametrize(("low", "word"), [(0.01, "explained"), (-0.03, "unknown")])
 def test_no_verdict_by_a_name_that_does_not_surely_lower_the_error(low, word):
-    assert decided(told("backlash", 0.9, removed_low=low)).data["verdict"] == word
-    assert decided(told("current_sensor", 0.9, removed_low=low), effort=EFFORT).data["verdict"] == word
-    quiet = decided(told("backlash", 0.9, removed_low=-0.03), before=1.2)
+    assert decided(finding_of("backlash", 0.9, removed_low=low)).data["verdict"] == word
+    assert decided(finding_of("current_sensor", 0.9, removed_low=low), effort=EFFORT).data["verdict"] == word
+    quiet = decided(finding_of("backlash", 0.9, removed_low=-0.03), before=1.2)
     assert quiet.data["verdict"] == "none" and quiet.data["findings"][0]["hint"]
 
 
 @pytest.mark.parametrize(
-    ("low", "left", "word"), [(-0.01, 1.0, "explained"), (-0.03, 1.0, "unknown"), (-0.01, 1.97, "unknown")]
+    ("low", "after", "word"), [(-0.01, 1.0, "explained"), (-0.03, 1.0, "unknown"), (-0.01, 1.97, "unknown")]
 )
-def test_what_acts_in_a_few_moments_surely_lowers_the_error_where_draws_without_them_show_no_loss(low, left, word):
+def test_what_acts_in_a_few_moments_surely_lowers_the_error_where_draws_without_them_show_no_loss(low, after, word):
     """A limit that is reached for half a second takes most of the error away, and nothing in draws without it."""
-    limit = told("torque_limit", 0.9, before=2.0, after=left, removed_low=low, removed_high=2.8)
+    limit = finding_of("torque_limit", 0.9, before=2.0, after=after, removed_low=low, removed_high=2.8)
     assert decided(limit).data["verdict"] == word
 
 
 def test_what_was_not_judged_is_kept_whatever_the_verdict_goes_by():
-    d = decided(told("current_sensor", 0.9), effort=EFFORT)
+    d = decided(finding_of("current_sensor", 0.9), effort=EFFORT)
     assert d.data["held_out"]["error"] == "effort_rmse_Nm" and d.data["verdict"] == "explained"
     d.data["held_out"]["not_judged"] = ["saturation of a"]
     conclude.decide(d)
@@ -108,13 +108,13 @@ def test_what_was_not_judged_is_kept_whatever_the_verdict_goes_by():
 
 def test_touch_beside_joints_is_one_verdict():
     for confidence, alone, beside in ((0.9, "explained", "explained"), (0.3, "unknown", "partly_explained")):
-        gain = replace(told("tactile_gain", confidence), joints=(), taxels=["0:1"])
-        felt = TouchResult([gain], before=(0.3, 0.2, 0.4), after=(0.03, 0.03, 0.03), floor=0.03)
-        d = decided(before=1.1, touch=felt)
+        gain = replace(finding_of("tactile_gain", confidence), joints=(), taxels=["0:1"])
+        touch = TouchResult([gain], before=(0.3, 0.2, 0.4), after=(0.03, 0.03, 0.03), floor=0.03)
+        d = decided(before=1.1, touch=touch)
         assert d.data["verdict"] == alone and d.data["held_out"]["error"] == "tactile_rmse_N"
-        d = decided(told("backlash", 0.9), touch=felt)
+        d = decided(finding_of("backlash", 0.9), touch=touch)
         assert d.data["verdict"] == beside and d.data["held_out"]["error"] == "position_rmse_rad"
-        assert felt.findings[0].hint is (confidence < 0.5)
+        assert touch.findings[0].hint is (confidence < 0.5)
 
 
 def test_the_sentence_says_what_the_plain_model_leaves_where_that_is_handed_on():
@@ -227,8 +227,8 @@ def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
     # with the half second before and after it, in which a free run is on its way back
     assert np.flatnonzero(inside)[[0, -1]].tolist() == [2000 + 50, 2000 + 949] and inside.sum() == 900
     both = Held([(0, 0), (2.0, 4.0), (1.0, 9.0)])
-    shown = held_out.split(both.runs, [2], [0, 1, 2], [both])
-    assert not shown.not_judged and not shown.apart
+    parts = held_out.split(both.runs, [2], [0, 1, 2], [both])
+    assert not parts.not_judged and not parts.apart
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
 )
 def test_what_no_fitted_recording_shows_makes_no_verdict_unknown(before, after, found, word):
     """The error away from it decides then, and the sentence says what is not judged."""
-    names = [told(effect, confidence) for effect, confidence in found]
+    names = [finding_of(effect, confidence) for effect, confidence in found]
     near = {"error": "position_rmse_rad", "before": before, "before_low": 0.9 * before, "after": after, "how": "near"}
     given = empty()["held_out"] | {"not_judged": ["saturation of a"]}
     d = SimpleNamespace(
@@ -343,9 +343,9 @@ def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypat
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():
     error = (0.03, 0.03, 0.03)
-    felt = TouchResult([Finding("tactile_gain", 0.3, "", taxels=["0:1"])], before=error, after=error, floor=0.03)
-    d = decided(before=0.9, touch=felt)
-    assert d.data["verdict"] == "none" and felt.findings[0].hint
+    touch = TouchResult([Finding("tactile_gain", 0.3, "", taxels=["0:1"])], before=error, after=error, floor=0.03)
+    d = decided(before=0.9, touch=touch)
+    assert d.data["verdict"] == "none" and touch.findings[0].hint
 
 
 @pytest.mark.parametrize(

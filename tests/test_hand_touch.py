@@ -20,7 +20,7 @@ from dexsim.recording.mechanism import mechanism
 from dexsim.tactile.file import load
 from dexsim.tactile.sensors import Sensors
 from tests import hands
-from tests.tactile_fixtures import felt
+from tests.tactile_fixtures import touch_result
 
 
 @pytest.fixture(scope="module")
@@ -47,16 +47,16 @@ def test_the_plant_reads_what_a_hands_taxels_read(claw, tmp_path, mirror):
     assert len(data.runs) == 3 and {r.name for r in data.runs} == {finger} and not data.blind and not data.notes
     for run in data.runs:
         assert run.z.shape[1] == (120 if mirror else 48) and run.z.max() > 0.3
-        on, felt = run.z.max(1) > 0, run.z.max(0) > 0.3
+        on, loaded = run.z.max(1) > 0, run.z.max(0) > 0.3
         error = touch_plant.readings(run, touch_plant.neutral())[on] - run.z[on]
-        assert np.sqrt(np.mean(error[:, felt] ** 2)) < 0.05
+        assert np.sqrt(np.mean(error[:, loaded] ** 2)) < 0.05
 
 
 @pytest.mark.slow
 def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     k = Sensors(claw).middle(2)
     m, recordings = pressed(tmp_path, claw, "middle", 5.0, gains={k: 0.4})
-    result = felt(recordings, m, set(), allowed={"tactile_gain"})
+    result = touch_result(recordings, m, set(), allowed={"tactile_gain"})
     (f,) = result.findings
     assert f.effect == "tactile_gain" and list(f.taxels) == [f"2:{k}"], f
     assert f.parameters["gain"]["value"] == pytest.approx(0.4, abs=0.08) and result.names[2] == "middle"
@@ -91,5 +91,5 @@ def test_a_hand_without_touch_says_so(tmp_path):
     hand = load_hand(made_hand(tmp_path / "made", pads=False))
     m = mechanism(hand.folder)
     r = replace(signal(joints=hand.joints, tactile=True), joints=hand.joints)
-    result = felt([r], m, set())
+    result = touch_result([r], m, set())
     assert not result.findings and any("made_left has no touch pads" in note for note in result.notes)
