@@ -127,7 +127,7 @@ class ByPad:
                 wp.zeros((n, f, t) if used else (1, 1, 1), dtype=float)
                 for used in (self.rubber, self.hysteresis, self.mixes)
             )
-            self._felt = SimpleNamespace(spread=spread, skin=skin, mixed=mixed)
+            self._between = SimpleNamespace(spread=spread, skin=skin, mixed=mixed)
             self._ring = wp.zeros((1, n, f, t) if self.delayed else (1, 1, 1, 1), dtype=float)
             sheared = self.delayed and cfg.shear
             self._ring_shear = wp.zeros((1, n, f, t) if sheared else (1, 1, 1, 1), dtype=wp.vec2)
@@ -166,19 +166,19 @@ class ByPad:
     def launch_skin(self, touch: Tactile, forces: wp.array) -> wp.array:
         """Return felt forces [N, F, T] N as they reach each taxel's wire; `forces` itself where nothing lies between.
         touch: `Tactile`."""
-        felt = self._felt
+        between = self._between
         if self.rubber:
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
-            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, forces, felt.spread]
+            args = [touch._around, touch._pads, touch._law, touch.shapes.wp, self._skins, forces, between.spread]
             wp.launch(kernel, dim=self.shape[:2], inputs=args, device=self.device)
-            forces = felt.spread
+            forces = between.spread
         if self.hysteresis:
-            args = [forces, self._m, touch.imperfect.measured, felt.skin]
+            args = [forces, self._m, touch.imperfect.measured, between.skin]
             wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
-            forces = felt.skin
+            forces = between.skin
         if self.mixes:
-            wp.launch(mix, dim=self.shape, inputs=[forces, self._m, felt.mixed], device=self.device)
-            forces = felt.mixed
+            wp.launch(mix, dim=self.shape, inputs=[forces, self._m, between.mixed], device=self.device)
+            forces = between.mixed
         return forces
 
     def launch_stuck(self, touch: Tactile) -> None:
