@@ -100,7 +100,8 @@ class MujocoEngine(Engine):
         self._simple = np.flatnonzero(model.dof_simplenum) if "dof_armature" in fields else np.zeros(0, int)
         self._inertia = b.expand("dof_M0") if len(self._simple) else np.zeros((worlds, 0))
         self._own_inertia = self._without_armature()
-        self._flags, self._disabled = int(model.opt.disableflags), b.expand("opt.disableflags")
+        self._disabled = b.expand("opt.disableflags")
+        self._flags = self._disabled.copy()
         self._fields_wp: dict[str, wp.array] = {}
         if model.nmocap:
             raise UserError(
@@ -142,6 +143,16 @@ class MujocoEngine(Engine):
             self._kinematics()
             if after is not None:
                 after()
+
+    def contacts(self, on: np.ndarray) -> None:
+        """Simulate contacts in the worlds where `on` [N] holds, in no others, in steps with `before_each`."""
+        off = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._flags[:] = np.where(on.reshape(-1, *[1] * (self._flags.ndim - 1)), self._flags & ~off, self._flags | off)
+
+    def changed(self) -> list[np.ndarray]:
+        """Return what a step changes and the next depends on, in place."""
+        return [*(x.numpy() for x in vars(self.wp).values() if isinstance(x, wp.array)), self._warmstart.numpy(),
+                *self._fields.values()]  # fmt: skip
 
     def refresh(self) -> None:
         self._kinematics()

@@ -11,7 +11,6 @@ world of one batch.
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -46,7 +45,6 @@ from dexsim.recording.mechanism import (
 )
 from dexsim.recording.schema import Recording, Series
 from dexsim.sim import make_engine
-from dexsim.sim.make import engine_of
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.batch import Windows
@@ -65,8 +63,6 @@ REPLAYED, TOLD = "what may be written", 500  # steps from one word on it to the 
 SHORTEST = 5.0  # s: shorter runs share a batch, longer ones one with those of up to twice their time
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 LOOK = 20  # steps from one look to the next at whether anything touches, where contacts are not simulated
-GLANCE = 0.05  # s from one look to the next at whether anything touches in a recording
-TOUCHED = 1.5  # x the time without contacts that a step with them takes
 BELIEVED = "believed"  # candidate: nothing is changed
 WHOLE = ", as fitted"  # of a fit's candidate: with the figures that else only absorb the search's plant's inaccuracy
 # of candidates that follow alike the first is written
@@ -100,8 +96,7 @@ class World:
     J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
     from where a joint that drags another is counted (None: q); setpoint: None or of `setpoints_at`; led: joints that
     follow their recording, in every world of a batch the same; figures [3, J]: `FIELDS` of the joints in the world's
-    own model (None: as in the batch's); spec: of its batch (None: everybody's); touch: when something first touches in
-    its recording [s from the start]."""
+    own model (None: as in the batch's); spec: of its batch (None: everybody's)."""
 
     rows: np.ndarray
     table: ServoTable
@@ -119,13 +114,6 @@ class World:
     led: Led | None = None
     figures: np.ndarray | None = None
     spec: mujoco.MjSpec | None = None
-    touch: float = math.inf
-
-    @property
-    def touches(self) -> bool:
-        """Whether something touches in its recording: then it will here."""
-        return self.touch < self.duration
-
 
 @dataclass
 class Replayed:
@@ -288,9 +276,8 @@ def worlds_of(
         q, home = scale * rest + offset, scale * rest + offset
         place = [m.joints.index(j) for j in run.joints]
         if w not in begins:
-            initial, v, paths = begun(recordings[run.name], m, start)
-            begins[w] = initial, v, paths, first_touch(model, m.joints, paths)
-        initial, v, paths, touch = begins[w]
+            begins[w] = begun(recordings[run.name], m, start)
+        initial, v, paths = begins[w]
         q = np.where(np.isfinite(initial), initial, q)
         sent = max(int(np.searchsorted(run.cmd_t, start - BEFORE)) - 1, 0)
         targets = np.full((len(run.cmd_t) - sent, len(m.joints)), np.nan)
@@ -328,27 +315,9 @@ def worlds_of(
                 setpoints_at(recordings[run.name], mine, rows, Series(run.cmd_t, run.cmd), run.joints, start, STEP),
                 led if held else None,
                 figures,
-                touch=touch,
             )
         )
     return out
-
-
-def first_touch(model: mujoco.MjModel, joints: Sequence[str], paths: Mapping[str, tuple[np.ndarray, ...]]) -> float:
-    """Return when anything of a model first touches along recorded positions [s]; infinite where nothing does. paths:
-    of `mechanism.begun`."""
-    t = np.arange(0.0, max((p[0][-1] for p in paths.values()), default=0.0), GLANCE)
-    qpos = np.tile(model.qpos0, (len(t), 1))
-    for joint, (at, x, *_) in paths.items():
-        qpos[:, model.joint(joint).qposadr[0]] = np.interp(t, at, x)
-    ties, data = Couplings(model, joints), mujoco.MjData(model)
-    qpos = ties.complete(torch.as_tensor(qpos)).numpy() if ties.tied else qpos
-    for now, q in zip(t, qpos, strict=True):
-        try:
-            _apart(model, data, q[None])
-        except Touching:
-            return float(now)
-    return math.inf
 
 
 def frame_of(m: Mechanism, spec: mujoco.MjSpec) -> str:
@@ -381,34 +350,18 @@ def free_runs(
     whole = sum(w.duration for w in worlds)
     for members in groups.values():
         together = [worlds[i] for i in members]
-        for touch in (True, False):
-            some = [i for i in members if worlds[i].touches is touch]
-            count = math.ceil(cores * sum(worlds[i].duration for i in some) / whole)
-            longest = sorted(some, key=lambda i: -worlds[i].duration)
-            parts += [(together, longest[k::count]) for k in range(min(count, len(some)))]
+        count = math.ceil(cores * sum(w.duration for w in together) / whole)
+        longest = sorted(members, key=lambda i: -worlds[i].duration)
+        parts += [(together, longest[k::count]) for k in range(min(count, len(members)))]
     parts.sort(key=lambda x: -max(worlds[i].duration for i in x[1]))
 
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
         given = [worlds[i] for i in mine]
-        batch = partial(_batch, spec, joints, given, together, device, timestep, engine, partial(tell, k))
-        if given[0].touches:
-            return batch(True)
-        in_air = batch(False)
-
-        def moved() -> list:
-            try:
-                return in_air()
-            except Touching:
-                return batch(True)()
-
-        return moved
+        return _batch(spec, joints, given, together, device, timestep, engine, partial(tell, k))
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
-    sizes = [
-        max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) * (TOUCHED if worlds[mine[0]].touches else 1.0)
-        for _, mine in parts
-    ]
+    sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
     with compute.watched(sizes, cores, REPLAYED, progress) as tell:
         for (_, mine), moved in zip(parts, compute.forked(len(parts), part, cores), strict=True):
             for i, q in zip(mine, moved, strict=True):
@@ -425,10 +378,8 @@ def _batch(
     timestep: float,
     kind: str,
     tell: Callable[[float], None],
-    contacts: bool,
 ) -> Callable[[], list]:
-    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done;
-    contacts: simulated; without them C MuJoCo takes two thirds of the time, and `Touching` is raised where any is."""
+    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done."""
     spec = (worlds[0].spec or spec).copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -436,11 +387,7 @@ def _batch(
     for joint in led:
         spec.joint(joint).armature = HEAVY
     N = len(worlds)
-    look: Callable[[np.ndarray], None] | None = None
-    if not contacts and engine_of(kind, device) == "mujoco":
-        solid = spec.compile()
-        look = partial(_apart, solid, mujoco.MjData(solid))
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    solid = spec.compile()
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in group])
@@ -488,7 +435,7 @@ def _batch(
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
 
     def moved() -> list:
-        q = _stepped(engine, servo, changes, seen, path, tell, look).cpu().numpy().astype(float)
+        q = _stepped(engine, servo, changes, seen, path, tell, solid).cpu().numpy().astype(float)
         tell(1.0)
         return [q[:, i] for i in range(N)]
 
@@ -543,40 +490,50 @@ def _stepped(
     seen: torch.Tensor,
     lead: Callable[[int], None],
     tell: Callable[[float], None],
-    look: Callable[[np.ndarray], None] | None,
+    solid: mujoco.MjModel,
 ) -> torch.Tensor:
     """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
-    lead: of `_path`; tell: how much of it is done; look: raises `Touching` where anything touches at positions [N, nq]
-    (None: contacts are simulated)."""
-    steps = len(seen)
-    step = itertools.count()
-    if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
+    lead: of `_path`; tell: how much of it is done; solid: the model.
+
+    C MuJoCo takes two thirds of the time without contacts. They are simulated from where something first touches in a
+    world: the batch goes back to the look before, so that it moves as with contacts from the begin."""
+    steps, k = len(seen), 0
+    if engine.kind == "mujoco":  # nothing in a step that is not needed: there are 2000 a second
         turned = None if servo.at_rotor else torch.zeros(steps, *engine.t.qpos.shape, dtype=engine.t.qpos.dtype)
         at, kept = engine.t.qpos.numpy(), None if turned is None else turned.numpy()
+        own = (servo.state, servo.params, servo.torque)
+        data, memory = mujoco.MjData(solid), [*engine.changed(), *(x.numpy() for x in own), changes.now]
 
         def before_each() -> None:
-            k = next(step)
+            nonlocal k
             if not k % TOLD:
                 tell(k / steps)
             if k in changes.when:
                 changes.before(k)
             lead(k)
-            if look is not None and not k % LOOK:
-                look(at)
             if kept is None:
                 seen[k].copy_(servo.position())
             else:
                 kept[k] = at
             servo.before_each()
             lead(k)
+            k += 1
 
-        engine.step(steps, before_each)
+        met = np.array([_touching(solid, data, q) for q in at])
+        engine.contacts(met)
+        while k < steps:
+            before, first = [x.copy() for x in memory], k
+            engine.step(min(LOOK, steps - k), before_each)
+            new = [i for i in np.flatnonzero(~met) if _touching(solid, data, at[i])]
+            if new:
+                met[new], k = True, first
+                engine.contacts(met)
+                for x, y in zip(memory, before, strict=True):
+                    x[...] = y
         if turned is not None:
             seen = servo.measured(turned[:, :, servo.reported_q])
     else:  # a step is a graph of launches
-        for k in step:
-            if k == steps:
-                break
+        for k in range(steps):
             if not k % TOLD:
                 tell(k / steps)
             changes.before(k)
@@ -591,19 +548,13 @@ def _stepped(
     return seen
 
 
-class Touching(Exception):
-    """Something touches where contacts are not simulated."""
-
-
-def _apart(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> None:
-    """Raise `Touching` where anything of a model touches at one of qpos [N, nq]."""
-    for q in qpos:
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        if data.ncon:
-            raise Touching
+def _touching(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> bool:
+    """Return whether anything of a model touches at qpos [nq]."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    return bool(data.ncon)
 
 
 class Changes:
@@ -621,7 +572,7 @@ class Changes:
         up: Callable[..., torch.Tensor],
         heated: bool,
     ):
-        self._servo, self._worlds, self._now, self._timestep, self._up = servo, worlds, now, timestep, up
+        self._servo, self._worlds, self.now, self._timestep, self._up = servo, worlds, now, timestep, up
         self._sent: dict[int, list[list[tuple[int, np.ndarray, float]]]] = {}
         self._freed: dict[int, list[tuple[int, np.ndarray]]] = {}
         begins = timestep * np.arange(steps)
@@ -640,7 +591,7 @@ class Changes:
     def _sends(self, i: int, w: World, ends: np.ndarray) -> None:
         """World i's targets by the step within which they are stamped; several of one step follow each other."""
         at = np.searchsorted(ends, np.maximum.accumulate(w.stamps), side="right") if len(w.stamps) else np.zeros(0, int)
-        last, turn, step = self._now[i], 0, -1
+        last, turn, step = self.now[i], 0, -1
         for k, row, stamp in zip(at, w.targets, w.stamps, strict=True):
             if k == len(ends):
                 break
@@ -657,10 +608,10 @@ class Changes:
         """Tells the worlds what is new in step k."""
         servo, up = self._servo, self._up
         for turn in self._sent.get(k, ()):
-            mask, stamp = np.zeros(len(self._now), bool), np.zeros(len(self._now))
+            mask, stamp = np.zeros(len(self.now), bool), np.zeros(len(self.now))
             for i, new, at in turn:
-                self._now[i], mask[i], stamp[i] = new, True, at
-            servo.send(up(self._now), up(mask, torch.bool), up(stamp))
+                self.now[i], mask[i], stamp[i] = new, True, at
+            servo.send(up(self.now), up(mask, torch.bool), up(stamp))
         for i, on in self._freed.get(k, ()):
             servo.state[i, :, servo.slots["enabled"]] = up(on)
         if self._warm and k % self._renewed == 0:
