@@ -255,7 +255,7 @@ def test_a_search_tells_how_far_it_is():
     s.tell, s.allowed = stages.append, {"torque_limit", "lag"}
     settle_found(s, search_joint(s))
     counts = [tuple(map(int, x)) for x in re.findall(r"(?:candidate|rival) (\d+) of (\d+)", "; ".join(stages))]
-    assert stages[0] == "effect 1, all of the catalogue" and stages[-1] == "what was found, on whole recordings"
+    assert stages[0] == "effect 1, all of the catalogue" and stages[-1] == "on whole recordings"
     assert counts and all(1 <= k <= of for k, of in counts)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import signal
 import sys
 import threading
@@ -309,7 +310,10 @@ class Progress:
             text = f"  {doing}ing {name} ({done + 1}/{total})" + (f": {stage}, {spent:.0f} s so far" if stage else "")
             if self.limit is not None and self.limit.seconds is not None:
                 text += f", at most {max(self.limit.until(1.0), 0.0):.0f} s left of all"
-        print(f"\r{text:<79}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
+        if self.live:  # over the line before, and no longer than one
+            wide = shutil.get_terminal_size().columns - 1
+            text = f"\r{text[:wide]:<{wide}}"
+        print(text, end="" if self.live and done < total else "\n", flush=True)
 
 
 def verdict(d: Diagnosis) -> str:

@@ -110,7 +110,7 @@ def search_joint(search: JointSearch) -> Outcome:
             current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
         if len(current.members) > 1 and not search.deadline.over():
             current = swapped(search, current, pool)
-    search.tell("what explains as much otherwise, and what is not needed")
+    search.tell("what is not needed")
     current = from_plain(search, beside_alike(search, forks, current, pool))
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
@@ -555,7 +555,7 @@ def rivals_of(
         for n, (key, (other, start, _)) in enumerate(pool.items(), 1):
             if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
                 continue
-            search.tell(f"in the place of effect {i + 1} of {len(current.members)}, rival {n} of {len(pool)}")
+            search.tell(f"effect {i + 1}, rival {n} of {len(pool)}")
             known = search.fitted.get(frozenset((key, *(m.id for m in rest))))
             if known is None and len(others) >= 3 and not confusable(key, member.id):
                 continue
@@ -645,7 +645,7 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
         if not search.deadline.over():
             found.best = simpler(search, found.best)
         search.whole = search.case.plant.refined(FINER)
-    search.tell("what was found, on whole recordings")
+    search.tell("on whole recordings")
     polished(search, found.best), polished(search, found.none)  # kept for the judgement
 
 
