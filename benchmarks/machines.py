@@ -58,7 +58,7 @@ class Nodes:
         self.names = [f"dexsim{tag}n{k}" for k in range(count)]
         self.addresses = [f"10.77.0.{k + 1}" for k in range(count)]
         self.bridge = f"dxb{tag}"
-        self.apart = True
+        self.separate = True
         """Whether the nodes are namespaces; else all are 127.0.0.1."""
 
     def __enter__(self) -> Nodes:
@@ -68,7 +68,7 @@ class Nodes:
             self._build()
         except (OSError, subprocess.CalledProcessError) as error:
             self._destroy()
-            self.apart, self.addresses = False, ["127.0.0.1"] * self.count
+            self.separate, self.addresses = False, ["127.0.0.1"] * self.count
             why = getattr(error, "stderr", None) or error
             print(f"  no network namespaces here ({str(why).strip()}): all nodes are at 127.0.0.1", flush=True)
         return self
@@ -111,11 +111,11 @@ class Nodes:
         the loopback carried."""
         out = []
         for name in self.names:
-            where = ("ip", "netns", "exec", name) if self.apart else ()
-            device = "eth0" if self.apart else "lo"
+            where = ("ip", "netns", "exec", name) if self.separate else ()
+            device = "eth0" if self.separate else "lo"
             text = sh(*where, "cat", "/proc/net/dev").stdout
             line = next(x for x in text.splitlines() if x.strip().startswith(f"{device}:"))
-            out.append(int(line.split(":")[1].split()[8]) // (1 if self.apart else self.count))
+            out.append(int(line.split(":")[1].split()[8]) // (1 if self.separate else self.count))
         return out
 
     def start(self, node: int, ranks: int, argv: Sequence[str], devices: Sequence[str] = (), nodes: int | None = None,
@@ -123,12 +123,12 @@ class Nodes:
         """Return torchrun on a node, of `nodes` (default: all) with `ranks` processes each. devices: CUDA devices of
         it."""
         nodes = self.count if nodes is None else nodes
-        where = ["ip", "netns", "exec", self.names[node]] if self.apart else []
+        where = ["ip", "netns", "exec", self.names[node]] if self.separate else []
         run = ["-m", "torch.distributed.run", f"--nnodes={nodes}", f"--nproc_per_node={ranks}",
                "--rdzv_backend=c10d", f"--rdzv_endpoint={self.addresses[0]}:{PORT}", "--rdzv_id=dexsim",
                f"--rdzv_conf=last_call_timeout=1,timeout=120,is_host={int(node == 0)}",
                f"--local-addr={self.addresses[node]}", "--max-restarts=0"]  # fmt: skip
-        network = "eth0" if self.apart else "lo"
+        network = "eth0" if self.separate else "lo"
         env = os.environ | {
             "NCCL_HOSTID": f"node{node}", "NCCL_NET": "Socket", "NCCL_IB_DISABLE": "1", "NCCL_MNNVL_ENABLE": "0",
             "NCCL_NVLS_ENABLE": "0", "NCCL_SOCKET_IFNAME": network, "GLOO_SOCKET_IFNAME": network,
@@ -169,7 +169,7 @@ def measure(nodes: Nodes, each: int, settings: Sequence[str], devices: Sequence[
             process.kill()
     sent, rows = nodes.sent(), progress(run)
     found: dict[str, object] = {
-        "nodes": nodes.count, "ranks": nodes.count * each, "gbit": nodes.gbit, "namespaces": nodes.apart,
+        "nodes": nodes.count, "ranks": nodes.count * each, "gbit": nodes.gbit, "namespaces": nodes.separate,
         "status": [p.returncode for p in started], "seconds": round(time.perf_counter() - began, 1),
         "iterations": len(rows),
     }  # fmt: skip
