@@ -544,14 +544,16 @@ def _of_object(
                 k = int(0)
                 for r in range(wp.static(all_rounds)):
                     c = float(0.0)
-                    if d[r] < level and (wp.static(most == 1) or r < n):  # behind them stands the other half
-                        p = load4(groups.taxel, at + wp.static(WIDTH) * r)
-                        if wp.static(solver):
-                            c = spread_weight(d[r], p[3], level)
-                        else:
+                    p = load4(groups.taxel, at + wp.static(WIDTH) * r)
+                    if wp.static(solver):
+                        c = spread_weight(d[r], p[3], level)
+                        if wp.static(most > 1):
+                            c = wp.where(r < n, c, 0.0)  # behind them stands the other half
+                    else:
+                        if d[r] < level and (wp.static(most == 1) or r < n):
                             stiff = law.scale[w] * law.stiffness[groups.round[g, unit.round + r // wp.static(split)][0]]
                             c = taxel_force(wp.static(kind), law, stiff, -d[r], p[3], law.threshold[w])
-                        s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
+                    s += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                     whole += c
                     d[r] = c
                     if (r + 1) % wp.static(split) == 0:
@@ -610,7 +612,6 @@ def _of_hand(
 ) -> Callable:  # fmt: skip
     """Return a function of a warp for what pads touch of the hand itself, which few do at a time."""
     blocks, slots, tested = -(-links // LANES), -(-most // HAND_WIDTH), 1 if selves else links
-    chunk = min(CHUNK, rounds)
     Reals, Gaps, Sums = (wp.types.vector(length=n, dtype=float) for n in (rounds, max(blocks, 1), slots))
 
     @wp.func
@@ -621,14 +622,13 @@ def _of_hand(
         low = s.origin[i]
         h = s.spacing[i]
         high = low + h * wp.vec3(float(dims[0] - 1), float(dims[1] - 1), float(dims[2] - 1))
-        for c in range(wp.static(rounds // chunk)):
-            if wp.static(chunk) * c < n:
-                for k in range(wp.static(chunk)):
-                    r = wp.static(chunk) * c + k
-                    q = a * xyz(load4(groups.taxel, at + LANES * r)) + b
+        for r in range(wp.static(rounds)):
+            if r < n:
+                q = a * xyz(load4(groups.taxel, at + LANES * r)) + b
+                off = q - wp.max(low, wp.min(q, high))
+                near = wp.dot(off, off) <= level * level
+                if lane_ballot(near) != 0:
                     # those that are far read one cell, all the same, without a branch that others would wait at
-                    off = q - wp.max(low, wp.min(q, high))
-                    near = wp.dot(off, off) <= level * level
                     e = sd_cells(s.data, offset, dims, low, h, 1.0, wp.where(near, q, low))
                     d[r] = wp.min(d[r], wp.where(near, e, FAR))
         return d
@@ -639,9 +639,7 @@ def _of_hand(
         level = spread_level(lanes_min(wp.min(d), LANES), reach)
         whole = float(0.0)
         for r in range(wp.static(rounds)):
-            c = float(0.0)
-            if d[r] < level:
-                c = spread_weight(d[r], load4(groups.taxel, at + LANES * r)[3], level)
+            c = spread_weight(d[r], load4(groups.taxel, at + LANES * r)[3], level)
             whole += c
             d[r] = c
         return d * (force / lanes_sum(whole, LANES))

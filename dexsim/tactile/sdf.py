@@ -110,10 +110,8 @@ def sd_cells(
     gy = g[1] - y
     gz = g[2] - z
     gap = gx * gx + gy * gy + gz * gz
-    if gap > 0.0:
-        v = wp.max(v, 0.0)
-        v = wp.sqrt(gap * (scale * h) * (scale * h) + v * v)
-    return v
+    out = wp.max(v, 0.0)
+    return wp.where(gap > 0.0, wp.sqrt(gap * (scale * h) * (scale * h) + out * out), v)
 
 
 @wp.func
