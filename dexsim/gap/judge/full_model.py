@@ -838,7 +838,9 @@ def composed(
     while chosen not in [c for c, _ in done] and len(done) < first + TURNS and not passed(1):
         together = replayed([chosen] if passed(2) else [chosen, safe_of(chosen)])[0]
         done.append((chosen, together))
-        moved = [j for j in by if together[j] > math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]] and len(by[j]) > 1]
+        # what is as good as the noise stays
+        far = {j: max(quiet[j], math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]]) for j in by}
+        moved = [j for j in by if together[j] > far[j] and len(by[j]) > 1]
         swaps = [(j, k) for j in moved for k in by[j] if k != chosen[j]]
         if passed(len(swaps)):
             break

@@ -24,6 +24,7 @@ STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss i
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 ROUNDS, GUESSES = 2, 20  # of what is tried about a fit, and guesses of each
+LOOK = 2  # steps of a fit after which it may be given up
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
 MOST = 1e6  # sigmas of a residual
@@ -326,6 +327,7 @@ class Fitter:
         slopes: dict[str, np.ndarray] | None = None,
         lazy: bool = False,
         exact: bool = True,
+        hopeless: float = np.inf,
     ) -> Fitted:
         """Fit by Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
 
@@ -333,7 +335,7 @@ class Fitter:
         windows. lazy: once known, from there or from the first batch, the slopes of beliefs and of these parameters
         follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only
         where they lead no further: a third of the simulations. exact: end with slopes that were simulated at the
-        end."""
+        end. hopeless: what leaves more than this after `LOOK` steps ends there."""
         box = Box(params)
         low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
         x = np.clip(centre if x0 is None else np.array(x0, float), low, high)
@@ -355,7 +357,7 @@ class Fitter:
                     jac += rise
                 jac[:, ~known] = columns / (delta / span)[~known]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
-            if it >= iterations or P == 0 or self.passed():
+            if it >= iterations or P == 0 or self.passed() or (it >= LOOK and loss > hopeless):
                 break
             weighed = jac * robust(res, self.r.huber)[:, None]
             A = weighed.T @ jac

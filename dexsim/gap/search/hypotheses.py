@@ -419,10 +419,14 @@ class JointSearch:
         return fitter.eliminated(fitter.compare(q, tau, plants), s)
 
     def draft(
-        self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | SimpleNamespace | None = None
+        self,
+        members: tuple[Member, ...],
+        starts: np.ndarray,
+        like: Trial | SimpleNamespace | None = None,
+        hopeless: float = np.inf,
     ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
         """Return (members, where it began, fit on short windows) of a hypothesis, from `starts` of the members'
-        parameters."""
+        parameters. hopeless: as of `Fitter.fit`."""
         params = self.params_of(members)
         if like is not None:  # what left a trace in that alone starts from there too, not from what was believed
             taken = {c for p in params for c in p.columns}
@@ -440,7 +444,9 @@ class JointSearch:
         free = np.array([p.mode == "add" for p in params[:n]], bool)
         x0[:n] = np.where(free, x0[:n], inside[:n])
         fitter = self.scan_fitter.given(members)
-        fit = fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False)
+        fit = fitter.fit(
+            params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False, hopeless=hopeless
+        )
         return members, x0, fit
 
     def finish(

@@ -44,6 +44,7 @@ Rivals = dict[str, tuple[list[tuple[str, float]], float]]
 """By member: what else in its place would do with its share of bootstraps, its confidence."""
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
 LISTED = 6  # effects of a short list
+HOPELESS = 2.0  # x what would do: a draft that leaves more after its first steps is given up
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
 
 
@@ -192,9 +193,11 @@ def drafts_of(
         if k and search.deadline.over():
             return None
         search.tell(f"effect {len(current.members) + 1}, candidate {k + 1} of {len(listed)}")
-        tries = [search.draft((*current.members, member), begin(start), current)]
+        hopeless = HOPELESS * _worth(min((d[2].loss for d in drafts), default=np.inf))
+        tries = [search.draft((*current.members, member), begin(start), current, hopeless)]
         if k < 4 and member.id in search.other_start and len(start) == len(search.other_start[member.id]):
-            tries.append(search.draft((*current.members, member), begin(search.other_start[member.id]), current))
+            other = search.other_start[member.id]
+            tries.append(search.draft((*current.members, member), begin(other), current, hopeless))
         return min(tries, key=lambda d: d[2].loss)
 
     for (_, p, member, start), draft in zip(listed, map(drafted, range(len(listed))), strict=True):
@@ -209,7 +212,12 @@ def drafts_of(
             followed[member.id] = drafts[-1][2].loss
     drafts.sort(key=lambda d: d[2].loss)
     # how many are looked at: two, and others that may still win when they are fitted on long windows
-    return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
+    return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < _worth(drafts[0][2].loss))]
+
+
+def _worth(least: float) -> float:
+    """Return the loss up to which a draft may still win on long windows, where the best one leaves `least`."""
+    return 1.3 * least + 0.15
 
 
 def finished_drafts(
@@ -564,9 +572,10 @@ def rivals_of(
                 continue
             trial = known
             if trial is None:
-                draft = search.draft((*rest, other), np.concatenate([kept, start]), current)
                 # one that cannot follow even short stretches is no rival
-                if draft[2].loss > SEARCH.rival * max(short, 1.0):
+                most = SEARCH.rival * max(short, 1.0)
+                draft = search.draft((*rest, other), np.concatenate([kept, start]), current, HOPELESS * most)
+                if draft[2].loss > most:
                     continue
                 trial = search.finish(*draft, current, quick=True)
             search.fitted[frozenset(trial.ids)] = trial
