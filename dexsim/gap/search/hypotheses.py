@@ -493,6 +493,7 @@ class JointSearch:
     ) -> Trial:
         """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long
         ones."""
+        self.tell(f"with {', '.join(m.id for m in members) or 'none'}")
         members, x0, short = self.draft(members, starts, like)
         return self.finish(members, x0, short, like, quick)
 
