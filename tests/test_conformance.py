@@ -11,8 +11,8 @@ state: positions, velocities, warm start, servo queues, random numbers. What is 
 - Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact.
   MuJoCo-Warp stops at 8 and 20 in training (configs/config.yaml), and where a solver is cut off depends on rounding: 5
   % of impacts then differ by 0.3 mm and more. Here both solvers may finish.
-- C MuJoCo must not be cut off there: at 8 iterations it throws an object out of a firm grasp now and then (last tests),
-  so it gets 50 (`sim.iterations_mujoco`).
+- C MuJoCo must not be cut off there: at 8 iterations, or at 20 of the line search, it throws an object out of a firm
+  grasp now and then (last tests), so it gets 50 (`sim.iterations_mujoco`) and 100.
 Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 8e-8, 2e-7, 2e-6 rad; object 7e-9, 7e-8, 2e-7 m; contact
 forces 1e-5, 8e-4, 2e-3 N; reward 1e-7, 2e-6, 1e-5.
 """
@@ -254,3 +254,8 @@ def test_no_object_is_thrown_by_c_mujoco():
 def test_in_a_held_grasp_no_object_is_thrown_and_at_8_iterations_some_are():
     assert thrown(250) == set()
     assert thrown(250, "sim.iterations_mujoco=8")
+
+
+def test_c_mujoco_finishes_its_line_search():
+    env, _ = play_env("grasp", 1)  # of a checkpoint with the 20 that MuJoCo-Warp gets
+    assert env.cfg["sim"]["ls_iterations"] == 20 and env.engine.mjm.opt.ls_iterations == 100

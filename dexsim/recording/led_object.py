@@ -17,7 +17,7 @@ from dexsim.recording import attached
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
-from dexsim.sim.make import newton_iterations
+from dexsim.sim.make import solver_iterations
 
 NAME, JOINT = "object", "object_free"
 TYPES = {
@@ -141,9 +141,9 @@ def _solver(spec: mujoco.MjSpec, hand: Hand, sim: dict[str, Any]) -> None:
     for joint in spec.joints:
         if joint.name in hand.joints:
             joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
-    for key in ("impratio", "ls_iterations", "noslip_iterations"):
+    for key in ("impratio", "noslip_iterations"):
         if key in sim:
             setattr(spec.option, key, sim[key])
     if "iterations" in sim:
-        spec.option.iterations = newton_iterations(sim, "mujoco")
+        spec.option.iterations, spec.option.ls_iterations = solver_iterations(sim, "mujoco")
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD

@@ -20,8 +20,8 @@ def no_log_file() -> None:
         log.set()
 
 
-MUJOCO_ITERATIONS = 50
-"""Newton iterations that C MuJoCo gets where nothing else is said (`sim.iterations_mujoco`)."""
+MUJOCO_ITERATIONS, MUJOCO_LINE_SEARCH = 50, 100
+"""Newton and line-search iterations that C MuJoCo gets where no more are said (the first: `sim.iterations_mujoco`)."""
 
 
 def engine_of(engine: str, device: str) -> str:
@@ -33,16 +33,17 @@ def engine_of(engine: str, device: str) -> str:
     return engine
 
 
-def newton_iterations(sim: Mapping[str, Any], engine: str) -> int:
-    """Return Newton iterations at most of "warp" or "mujoco", from the settings `sim`.
+def solver_iterations(sim: Mapping[str, Any], engine: str) -> tuple[int, int]:
+    """Return Newton and line-search iterations at most of "warp" or "mujoco", from the settings `sim`.
 
-    C MuJoCo gets `iterations_mujoco`, or `iterations` where that is more: its iterations are cheap, it stops by itself
-    when it has converged (after 2 on average in a grasp), and cut off at 8 it throws an object out of a firm grasp now
-    and then.
+    C MuJoCo gets `iterations_mujoco`, or `iterations` where that is more, and MUJOCO_LINE_SEARCH: its iterations are
+    cheap, it stops by itself when it has converged (after 2 on average in a grasp), and where either is cut off it
+    throws an object out of a firm grasp now and then. A line search that stops at 20 ends the solver, too.
     """
+    newton, line = int(sim["iterations"]), int(sim.get("ls_iterations", 0))
     if engine == "warp":
-        return int(sim["iterations"])
-    return max(int(sim["iterations"]), int(sim.get("iterations_mujoco", MUJOCO_ITERATIONS)))
+        return newton, line
+    return max(newton, int(sim.get("iterations_mujoco", MUJOCO_ITERATIONS))), max(line, MUJOCO_LINE_SEARCH)
 
 
 def make_engine(

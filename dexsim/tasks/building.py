@@ -22,7 +22,7 @@ from dexsim.hand.couplings import Couplings
 from dexsim.hand.places import places
 from dexsim.hand.skin import link_skins, tip_skins
 from dexsim.sim import ContactPair, make_engine
-from dexsim.sim.make import engine_of, newton_iterations
+from dexsim.sim.make import engine_of, solver_iterations
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
@@ -425,7 +425,7 @@ def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str, several: bool) 
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     o.impratio = sim["impratio"]
-    o.iterations, o.ls_iterations = newton_iterations(sim, engine), sim["ls_iterations"]
+    o.iterations, o.ls_iterations = solver_iterations(sim, engine)
     o.noslip_iterations = sim["noslip_iterations"]
     if engine == "warp":  # MuJoCo-Warp then adds up an iteration's Hessian in one kernel, not two: 7 % of the step
         o.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
