@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim import files, guard, model_file
 from dexsim.errors import UserError
-from dexsim.import_hand import drives, inertias, ties, urdf
+from dexsim.import_hand import drives, inertias, routed, ties, urdf
 from dexsim.import_hand.drives import Drives
 from dexsim.import_hand.inertias import Moments
 
@@ -91,8 +91,9 @@ def _source(
     notes: list[str] = []
     _one_tree(spec, path, notes)
     _not_in_force(spec, notes)
+    bent = {} if coupled == "independent" else routed.straighten(spec, notes)
     said = drives.read(spec)
-    tied, passive = ties.read(spec, path, coupled, said.moved)
+    tied, passive = ties.read(spec, path, coupled, said.moved, bent)
     if coupled == "independent":
         said.pulls.clear()
     read = {s.objname for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_JOINTPOS}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +16,32 @@ GRID = 401  # places of a drive's range that are tried
 SLACK = 0.02  # of a follower's range: beyond its limits by less is rounding
 
 
-def read(spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str]) -> tuple[list[str], set[str]]:
+def read(
+    spec: mujoco.MjSpec, path: Path, coupled: str, moved: set[str], bent: Mapping[str, float]
+) -> tuple[list[str], set[str]]:
     """Return what ties joints together, a line each, and the joints that follow others. Taken out where coupled is
-    "independent". moved: joints that an actuator of the file moves.
+    "independent". moved: joints that an actuator of the file moves; bent: routed tendons that no fixed coefficients
+    replace, and how far they are from it.
 
     Raises UserError for joints that follow in a ring, and for all that is not simulated: loops, routed tendons, joints
     with a motor that follow.
     """
     found, things, passive = [], [], set()
     closed: list[str] = []
+    targets = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
+    reached = moved.union(*(drives.fixed_arms(t) for t in spec.tendons if t.name in targets))
     for tendon in spec.tendons:
         things.append(tendon)
         arms = drives.fixed_arms(tendon)
         if not arms:
-            closed.append(f"tendon '{tendon.name}' is routed over sites or geoms")
+            off = f", off a line by {100 * bent[tendon.name]:.0f} % of its travel" if tendon.name in bent else ""
+            closed.append(f"tendon '{tendon.name}' is routed over sites or geoms{off}")
         elif len(arms) > 1:  # one over a single joint is a spring or a limit of that joint
             found.append(f"tendon '{tendon.name}' ({', '.join(sorted(arms))})")
             still = [j for j in arms if j not in moved]
-            pulled = any(a.trntype == mujoco.mjtTrn.mjTRN_TENDON and a.target == tendon.name for a in spec.actuators)
-            pulled |= any(e.type == mujoco.mjtEq.mjEQ_TENDON and e.name1 == tendon.name and e.name2 for e in
+            follows = any(e.type == mujoco.mjtEq.mjEQ_TENDON and e.name1 == tendon.name and e.name2 for e in
                           spec.equalities)  # fmt: skip
-            if len(still) == len(arms) and not pulled:
+            if not reached & set(arms) and not follows:
                 closed.append(f"no actuator moves any of the joints of tendon '{tendon.name}' ({', '.join(arms)})")
             passive |= set(still)
     for equality in spec.equalities:
@@ -103,13 +108,13 @@ def _twice(spec: mujoco.MjSpec, joint: str) -> bool:
     return sum(e.type == mujoco.mjtEq.mjEQ_JOINT and e.name1 == joint for e in spec.equalities) > 1
 
 
-def _laws(m: mujoco.MjModel) -> list[tuple[int, int, np.ndarray]]:
+def laws_of(m: mujoco.MjModel) -> list[tuple[int, int, np.ndarray]]:
     """Return follower, leader and coefficients [5] of the equalities of two joints."""
     return [(int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e, :5]) for e in range(m.neq)
             if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] >= 0]  # fmt: skip
 
 
-def _follows(m: mujoco.MjModel, law: tuple[int, int, np.ndarray], q: np.ndarray) -> np.ndarray:
+def follow(m: mujoco.MjModel, law: tuple[int, int, np.ndarray], q: np.ndarray) -> np.ndarray:
     """Return the follower's positions where its leader is at q."""
     one, other, factors = law
     zero = [float(m.qpos0[m.jnt_qposadr[j]]) for j in (one, other)]
@@ -118,13 +123,13 @@ def _follows(m: mujoco.MjModel, law: tuple[int, int, np.ndarray], q: np.ndarray)
 
 def give_limits(m: mujoco.MjModel) -> None:
     """Give a joint without limits (a `continuous` one) those that the joints tied to it leave it, in place."""
-    laws = _laws(m)
+    laws = laws_of(m)
     for _ in laws:
         for law in laws:
             one, other, (offset, slope, *rest) = law
             bounded = [bool(m.jnt_limited[j]) for j in (one, other)]
             if bounded == [False, True]:
-                ends = _follows(m, law, np.linspace(m.jnt_range[other, 0], m.jnt_range[other, 1], GRID))
+                ends = follow(m, law, np.linspace(m.jnt_range[other, 0], m.jnt_range[other, 1], GRID))
                 j = one
             elif bounded == [True, False] and slope and not any(rest):
                 zero = [m.qpos0[m.jnt_qposadr[j]] for j in (one, other)]
@@ -141,7 +146,7 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
 
     Raises UserError where a follower is beyond its limits wherever the driven joint stands, or is held there.
     """
-    laws, out = _laws(m), {}
+    laws, out = laws_of(m), {}
     for e in range(m.neq):
         j = int(m.eq_obj1id[e])
         if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] < 0 and m.jnt_limited[j]:
@@ -158,7 +163,7 @@ def reach(m: mujoco.MjModel, leaders: Sequence[int], where: str) -> dict[int, tu
             for law in laws:
                 if law[1] not in places or law[0] in places or not m.jnt_limited[law[0]]:
                     continue
-                at = places[law[0]] = _follows(m, law, places[law[1]])
+                at = places[law[0]] = follow(m, law, places[law[1]])
                 low, high = m.jnt_range[law[0]]
                 beyond = np.maximum(low - at, at - high)
                 free &= beyond <= SLACK * (high - low)
