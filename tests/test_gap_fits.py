@@ -56,6 +56,24 @@ def test_no_effect_is_begun_again_from_where_an_effect_ended():
     assert begun_again(s, short, [worse]) is short
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.008])
+def test_gravitys_direction_is_let_go_where_a_fit_without_it_ends(tilt):
+    """Where it is off it is found, by as much; else the fit is that without it."""
+    run = plant_run("a", 0, 5.0, {"tilt_y": tilt, "*kp": 0.97}, 1)
+    s = JointSearch(build(model(), [run])[0], [0], None, [0])
+    params = s.all_nuisances
+    late = [p.key for p in params if p.late]
+    assert late == ["tilt_y"]  # about the hinge: about another axis it gives the joint no torque
+    sets = params, [p for p in params if not p.late]
+    with_it, without = (Trial((), s.fitter.fit(p, iterations=8, lazy=True)) for p in sets)
+    if tilt:
+        assert s.objective(with_it) < 0.8 * s.objective(without)
+        assert with_it.fit.value("tilt_y") == pytest.approx(tilt, abs=2e-3)
+    else:  # it earns nothing: the same fit
+        assert with_it.fit.params == without.fit.params
+        np.testing.assert_allclose(with_it.fit.x, without.fit.x, rtol=1e-6, atol=1e-9)
+
+
 def test_what_left_a_trace_beside_one_effect_begins_there_beside_a_further_one():
     """How a drive brakes shows only beside a limit: a second effect is fitted from what the first has told of it."""
     run = plant_run("a", 0, 3.0, {}, 1)

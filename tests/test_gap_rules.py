@@ -112,7 +112,9 @@ class Started(JointSearch):
         residual = np.concatenate([q, torque])
         fitter = SimpleNamespace(use_torque=True, w=windows, tau_on=np.ones(n, bool))
         fitter.toward_prior = lambda params, fit: fit
-        fitter.fit = lambda params, x0, **_: SimpleNamespace(x=x0, residual=residual, loss=1.0, jacobian=None)
+        fitter.fit = lambda params, x0, **_: SimpleNamespace(
+            params=params, x=x0, residual=residual, loss=1.0, jacobian=None
+        )
         self.scan_fitter = self.fitter = fitter
         self.all_nuisances = self.nuisances = []
         self.r = SimpleNamespace(sigma_q=1.0, sigma_torque=1.0, huber=3.0)
@@ -518,7 +520,10 @@ def test_a_belief_without_a_trace_is_not_refitted():
     beliefs = [replace(param(k, k, "set", 0.0, 1.0, 0.5), nuisance=True) for k in ("kp", "kd")]
     search = Started(np.zeros(100), np.zeros(100))
     residual, jacobian = np.zeros(200), np.tile([0.025, 0.015], (200, 1))  # sigmas over the whole range
-    fit = lambda params, x0, **_: SimpleNamespace(x=x0, residual=residual, loss=1.0, jacobian=jacobian)  # noqa: E731
+
+    def fit(params, x0, **_):
+        return SimpleNamespace(params=params, x=x0, residual=residual, loss=1.0, jacobian=jacobian)
+
     search.fitter.fit, search.case = fit, SimpleNamespace(unknown=(), scales=None)
     search.all_nuisances = beliefs
     search.start()

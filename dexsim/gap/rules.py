@@ -203,6 +203,9 @@ class BeliefRules:
     # by half as much, whatever the residuals say; gravity that is a smaller part of a torque, or that the torque tells
     # less well, is believed, and an error that is larger by less is as good
     tolerance: float = 0.05
+    # rad, one standard deviation: gravity's direction at a joint is off by as much, as axes, centres of mass and the
+    # stand are; refitted where that lowers the loss by `SearchRules.apart` for each axis
+    tilt: float = 0.005
     # periods of its loop by which any drive may act on its commands late, or of its readings, where those tell it
     late: float = 0.75
     filter: float = 0.003  # s: a filter of the measured speed that any drive may have

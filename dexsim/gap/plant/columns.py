@@ -205,6 +205,7 @@ class Param:
     sd: float = (
         0.0  # what is believed of it beforehand: its start to this standard deviation; 0: nothing inside the bounds
     )
+    late: bool = False  # let go where a fit of the others ends (`Fitter.fit`)
 
     @property
     def span(self) -> float:

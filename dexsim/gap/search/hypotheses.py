@@ -234,6 +234,9 @@ def _of_the_body(case: Case) -> list[Param]:
     out = [Param("inertia", ("inertia_scale",), "factor", low, high, middle, nuisance=True, sd=sd)]
     if s.gravity > 0.01 * s.tau:
         out.append(_within("gravity", "gravity_scale"))
+    for name in (f"tilt_{k}" for k, size in s.tilt.items() if size > 0.01 * s.tau):
+        sd = BELIEF.tilt  # axes, centres of mass and the stand are off by as much
+        out.append(Param(name, (name,), "add", -3 * sd, 3 * sd, 0.0, "rad", nuisance=True, sd=sd, late=True))
     if c.damping > 0:
         d = BELIEF.tolerance * c.damping
         out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
@@ -381,16 +384,17 @@ class JointSearch:
             self.r.sigma_q *= max(1.0, SEARCH.apart * parts[0])
             restless = restlessness(f.residual[n:], self.scan_fitter.w.sample_window)
             self.r.sigma_torque *= max(1.0, SEARCH.apart * parts[1], restless)
-            f = self.scan_fitter.fit(params, x0=f.x, iterations=4, lazy=True)
+            f = self.scan_fitter.fit(f.params, x0=f.x, iterations=4, lazy=True)
         if params:
-            trace = np.sqrt((f.jacobian**2).mean(0)) * Box(params).span
-            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > BELIEF.trace]
-        keep = [i for i, p in enumerate(params) if p in self.nuisances]
-        x = f.x[keep]
+            trace = np.sqrt((f.jacobian**2).mean(0)) * Box(f.params).span
+            without = [p for p, size in zip(f.params, trace, strict=True) if size <= BELIEF.trace]
+            self.nuisances = [p for p in params if p not in without]
+        known = dict(zip(f.params, f.x, strict=True))
+        x = np.array([known.get(p, p.start) for p in self.nuisances])
         # large residuals are effects still to be named: the threshold follows them down
         self.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8, lazy=True)
-        return Trial((), self.fitter.toward_prior(self.nuisances, self._restarted(self.fitter, self.nuisances, fit)))
+        return Trial((), self.fitter.toward_prior(fit.params, self._restarted(self.fitter, fit.params, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
         """Return [P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to
@@ -445,8 +449,9 @@ class JointSearch:
         x0[:n] = np.where(free, x0[:n], inside[:n])
         fitter = self.scan_fitter.given(members)
         fit = fitter.fit(
-            params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False, hopeless=hopeless
-        )
+            params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, lazy=True, exact=False,
+            hopeless=hopeless,
+        )  # fmt: skip
         return members, x0, fit
 
     def finish(

@@ -162,7 +162,7 @@ class Ringing:
         taken = {c for p in member.variant.params for c in p.columns}
         # as in a fit: keys of the effect's own parameters are unique in the hypothesis
         params = [p for p in search.params_of((member,)) if not p.nuisance]
-        params += [p for p in search.all_nuisances if not taken & set(p.columns)]
+        params += [p for p in search.all_nuisances if not (p.late or taken & set(p.columns))]
         box = Box(params)
         low, high = box.low, box.high
         keys = [p.key for p in params]
