@@ -571,9 +571,10 @@ def trace(name: str, steps: int, worlds: int = 6) -> tuple[list[str], dict]:
 @pytest.mark.parametrize(("name", "steps"), [
     *((name, 100) for name in GOLDEN), *(pytest.param(name, 1000, marks=pytest.mark.slow) for name in GOLDEN),
 ])  # fmt: skip
-def test_the_tasks_of_before_bit_for_bit(name, steps):
-    """Observations, rewards, ends. On another processor the last bits differ from the first step on, and with them,
-    soon, all that follows: there the first step is compared."""
+def test_the_tasks_of_before_bit_for_bit(name, steps, monkeypatch):
+    """Observations, rewards, ends, with the line search of then. On another processor the last bits differ from the
+    first step on, and with them, soon, all that follows: there the first step is compared."""
+    monkeypatch.setattr("dexsim.sim.make.MUJOCO_LINE_SEARCH", 20)
     threads = torch.get_num_threads()
     try:
         found, first = trace(name, steps)

@@ -99,7 +99,7 @@ def test_every_part_that_changes_is_kept():
             env.step(torch.full((23, 12), 0.5 * (-1) ** k))
         changed = {k for k, v in own.items() if not torch.equal(v, before[k]) and v.data_ptr() not in retained}
         computed = {"_action_in", "reward", "done", "time_out", "tip_force", "finger_force", "self_force", "palm_force",
-                    "d_rot", "d_pos", "reached", "dropped", "tipped", "nan_end"}  # fmt: skip
+                    "d_rot", "d_pos", "reached", "dropped", "_dropped", "tipped", "nan_end"}  # fmt: skip
         assert changed <= computed, changed - computed
 
 
