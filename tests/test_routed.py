@@ -71,6 +71,9 @@ def test_what_carries_nothing_is_left_out_and_what_bends_is_refused(tmp_path):
     spec, notes = mujoco.MjSpec.from_string(_routed(more=idle)), []
     assert routed.straighten(spec, notes) == {} and notes[-1] == "left out: tendons that carry nothing: drawn"
     (tmp_path / "jaws.xml").write_text(_routed(more=idle.replace('"drawn"', '"drawn" stiffness="5"')))
+    (tmp_path / "broken.xml").write_text(_routed().replace('"capsule" size="0.008"', '"capsule" size="0"'))
+    with pytest.raises(UserError, match=r"model .*broken.xml: .*size 0 must be positive"):
+        import_hand(tmp_path / "broken.xml", tmp_path / "hand", settings(), picture=False)
     with pytest.raises(UserError, match=r"tendon 'drawn' is routed over sites or geoms, off a line by \d+ % of its"):
         import_hand(tmp_path / "jaws.xml", tmp_path / "hand", settings(), picture=False)
 

@@ -91,7 +91,10 @@ def _source(
     notes: list[str] = []
     _one_tree(spec, path, notes)
     _not_in_force(spec, notes)
-    bent = {} if coupled == "independent" else routed.straighten(spec, notes)
+    try:
+        bent = {} if coupled == "independent" else routed.straighten(spec, notes)
+    except (ValueError, RuntimeError) as error:  # of a file that MuJoCo does not compile
+        raise UserError(f"model {path}: {_said(error)}") from error
     said = drives.read(spec)
     tied, passive = ties.read(spec, path, coupled, said.moved, bent)
     if coupled == "independent":
