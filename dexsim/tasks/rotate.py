@@ -31,7 +31,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
     """
 
     holds = "palm", (0.045, 0.06)
-    choices = {"perception": ("imu", "proprioception"), "critic": ("paper", "privileged"),
+    choices = {"perception": ("imu", "proprioception"), "critic": ("paper", "privileged", "placed"),
                "observe.orientation": ("6d", "quaternion", "none")}  # fmt: skip
 
     goal, home = memory(4, reset=False), memory(3, reset=False)
@@ -67,7 +67,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         rows["follower_angle"] = dict.fromkeys(("actor", "critic"), bool(self.hand.sensed))
         rows["joint_velocity"] = {"actor": blind and o.get("joint_velocity", True)}
         rows["relative_orientation"] = {"actor": not blind and o["orientation"] != "none"}
-        return rows | {"privileged": {"critic": t["critic"] == "privileged"}}
+        return rows | {"privileged": {"critic": t["critic"] != "paper"}}
 
     def prepare_task(self) -> None:
         t, dev = self.task, self.device
@@ -256,14 +256,14 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     @observe("SI", only="critic")
     def privileged(self) -> dict[str, torch.Tensor]:
-        """ours, with task.critic=privileged"""
-        o = self.objects
+        """ours, with task.critic=privileged or placed: drift does not tell a start at the palm's edge from others"""
+        o, placed = self.objects, self.task["critic"] == "placed"
         return {
             "drift": self.object_pose[:, :3] - self.home, "object_size": o.size[:, :1], "object_mass": o.mass,
             "object_com": o.com, "object_friction": o.friction, "contact_damping": o.damping_ratio,
             "finger_force": self.finger_force, "palm_force": self.palm_force, "torque": self.torque,
             "target_error": self.target - self.q,
-        }  # fmt: skip
+        } | ({"object_centre": self.object_pose[:, :3]} if placed else {})  # fmt: skip
 
     # -- what the log shows
     @metric("1/min", now=True)
