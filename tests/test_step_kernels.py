@@ -204,15 +204,17 @@ def test_actions_become_targets(env, mode):
 
 
 def test_a_lead_that_follows_from_the_torque_loses_none_of_it(env):
-    """Targets run ahead to where the drive is at its limit, and no further: the drive pushes as hard as it can."""
+    """Targets run ahead to where the loosest drive that is drawn is at its limit, and no further."""
     assert env.task["action"]["lead"] is None, "the default"
     try:
         limit, kp = (env.servo.nominal[:, INDEX[k]] for k in ("torque_limit", "kp"))
-        torch.testing.assert_close(env.lead(), (limit / kp).float())
+        ahead = torch.minimum((1.05 * limit / (0.75 * kp)).float(), env.q_high - env.q_low)
+        torch.testing.assert_close(env.lead(), ahead)
+        limit, kp = (env.servo.params[..., INDEX[k]] for k in ("torque_limit", "kp"))
+        assert (torch.minimum((limit / kp).float(), env.q_high - env.q_low) <= ahead).all()
         env.q.copy_(env.q_low.expand(N, -1)), env.target.copy_(env.q)
         for _ in range(40):
             env.act(torch.ones(N, 12))
-        ahead = torch.minimum((limit / kp).float(), env.q_high - env.q_low)
         torch.testing.assert_close(env.target - env.q, ahead.expand(N, -1))
     finally:
         env.reset_all()

@@ -153,9 +153,6 @@ class Servo:
             torch.as_tensor(sides["position"], device=self.params.device) if any(sides["position"]) else None
         )
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
-        full = 1.0 if table.drive == "voltage" else self.torque_max
-        # [J] rad, the error of position at which the drive as stated is at its limit; inf without a gain
-        self.saturation = full / as_tensor(nominal[:, INDEX["kp"]])
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
         if "load" in self.features:

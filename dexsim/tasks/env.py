@@ -285,12 +285,13 @@ class HandEnv(Kept):
 
     def lead(self) -> torch.Tensor:
         """Return how far targets may run ahead of the measured angles [J] rad: what the task says, or, where that is
-        null, to where the drive's torque reaches its limit. A target that is farther away pushes no harder in
-        simulation; on a hand that is stiffer than its model it does, and unwinding it takes time everywhere."""
+        null, to where the torque of the loosest drive that is drawn reaches its limit. A target that is farther away
+        pushes no harder in simulation; on a hand that is stiffer than its model it does, and unwinding it takes time
+        everywhere."""
         said, J = self.task["action"].get("lead", 0.0), len(self.hand.joints)
         if said is not None:
             return torch.full((J,), float(said), device=self.device)
-        return torch.minimum(self.servo.saturation[:J].float(), (self.q_high - self.q_low)[:J])
+        return torch.minimum(self.servo_random.saturation()[:J].float(), (self.q_high - self.q_low)[:J])
 
     def _log(self, terms: dict, ends: dict, means: torch.Tensor) -> None:
         """means: of the reward terms, of how worlds ended, over all worlds."""

@@ -19,9 +19,10 @@ class Episodes(Built):
     """Worlds that begin anew where a mask says so; see `HandEnv`."""
 
     # what `Task` has: where mask [N] holds, a new episode (object, servo, state through `place`); groups of
-    # observations [N, D], advance: a control step has passed (sensors with memory move on)
+    # observations [N, D], advance: a control step has passed (sensors with memory move on); what drives are drawn
     begin_episodes: Callable[[torch.Tensor], None]
     observe: Callable[..., dict[str, torch.Tensor]]
+    servo_random: servos.ServoRandomizer
 
     def reset_all(self) -> None:
         """Begin an episode in every world."""

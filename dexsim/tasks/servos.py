@@ -117,6 +117,17 @@ class ServoRandomizer:
                 f"must lie in [{col.low:g}, {top:g}]"
             )
 
+    def saturation(self) -> torch.Tensor:
+        """Return the error of position [J] rad at which any drive that may be drawn is at its limit; inf without a
+        gain."""
+
+        def ends(name: str) -> tuple[torch.Tensor, torch.Tensor]:
+            c, (low, high, _) = INDEX[name], self.sampler.ranges.get(f"servo.{name}", (1.0, 1.0, False))
+            given, fitted = self.servo.nominal[:, c], self.fitted[:, c]
+            return torch.where(fitted, self.low[:, c], low * given), torch.where(fitted, self.high[:, c], high * given)
+
+        return (1.0 if self.servo.table.drive == "voltage" else ends("torque_limit")[1]) / ends("kp")[0]
+
     def draw(self, mask: torch.Tensor) -> None:
         """Draw new parameters in the worlds that mask [N] selects; others keep theirs."""
         n, joints, columns = self.servo.params.shape
