@@ -103,6 +103,19 @@ def test_the_plain_model_follows_what_it_can_state(fitted):
     assert "plain least squares" in baseline.text(data, "mrad") and baseline.text({}, "mrad") == ""
 
 
+def test_figures_that_no_recording_tells_stay_as_they_are_believed(monkeypatch):
+    """A motion that comes nowhere near a drive's limits says nothing of them: neither twice nor half is written."""
+    strong = {"kp": 3.0, "kd": 0.1, "torque_limit": 20.0, "no_load_speed": 60.0}
+    monkeypatch.setitem(globals(), "BELIEVED", BELIEVED | {"joints": {"*": strong}})
+    case = case_of(*(moved(None, seed=k, kp=3.9, delay=0.02) for k in (0, 1)))
+    plain = baseline.judged(case, baseline.fitted(case, [0]), [1])
+    assert plain.value["kp"] == pytest.approx(3.9, rel=0.1) and plain.error < 0.1 * plain.error_before
+    assert (plain.value["torque_limit"], plain.value["no_load_speed"]) == (20.0, 60.0)
+    assert not {"torque_limit", "no_load_speed"} & set(plain.at_bound)
+    case = case_of(*(moved(None, seed=k) for k in (0, 1)))  # as it is believed: nothing is fitted
+    assert baseline.judged(case, baseline.fitted(case, [0]), [1]).value["kp"] == 3.0
+
+
 def test_the_plain_model_is_written_as_it_was_fitted(fitted):
     _, _, plain = fitted
     servo, spec = ServoTable.from_dict(BELIEVED), mujoco.MjSpec.from_string(PENDULUM)

@@ -41,6 +41,7 @@ WIDER = 2.0  # x: a stated range may be off by as much
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
 MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
 OFFSET = 1.0  # of a joint's typical torque
+COSTS = 0.01  # of the loss: figures that do less than this together stay as they are believed
 UNSTATED = ("braking_slope",)  # what is believed of an unknown drive is not the servo table's default (`plant.case`)
 UNITS = {
     "torque_limit": "N.m",
@@ -171,8 +172,22 @@ def fitted(
     best = tried[int(np.argmin(runs.loss(runs.residuals(params, tried))))]
     if passed():
         return params, best
-    slopes = slopes_of(runs.fit(params, x0=best, iterations=0))
-    return params, runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False).x
+    told = _told(runs, params, start, best)
+    few, rest = [params[i] for i in told], np.setdiff1d(np.arange(len(params)), told)
+    runs.fixed = tuple((name, float(start[i])) for i in rest if params[i].mode == "set" for name in params[i].columns)
+    slopes = slopes_of(runs.fit(few, x0=best[told], iterations=0))
+    start[told] = runs.fit(few, x0=best[told], iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False).x
+    return params, start
+
+
+def _told(runs: Fitter, params: list[Param], start: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Return numbers of the figures of a fit (best [P]) that recordings tell: without the others, which are put back to
+    what is believed (start [P]), the loss is the same to `COSTS`. A limit that no motion reaches is none of them."""
+    loss = lambda x: runs.loss(runs.residuals(params, x))  # noqa: E731
+    order = np.argsort(loss(np.where(np.eye(len(params), dtype=bool), start, best)), kind="stable")
+    back = np.argsort(order)[None] < np.arange(len(params) + 1)[:, None]  # the first 0, 1, .. P of them
+    left = loss(np.where(back, start, best))
+    return np.sort(order[int(np.flatnonzero(left <= (1 + COSTS) * left[0])[-1]) :])
 
 
 def judged(
