@@ -116,23 +116,24 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     low, high = points.min(0) - margin, points.max(0) + margin
     n = np.ceil((high - low) / spacing).astype(int) + 1
     out = np.empty(tuple(n), dtype=np.float32)
-    # By blocks within blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest in
-    # it.
 
-    def block(first: np.ndarray, size: int, last: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Return those of the planes `near` that can be highest in the block of `size` samples from `first` on."""
+    # By blocks within blocks: of the planes, few can be highest in one.
+    def block(first: np.ndarray, last: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return those of the planes `near` that may rise over the one that is highest in the middle of a block."""
         value = near[:, :3] @ (low + spacing * (first + last - 1) / 2) + near[:, 3]
-        return near[value >= value.max() - np.sqrt(3.0) * size * spacing]
+        top = value.argmax()
+        rise = np.abs(near[:, :3] - near[top, :3]) @ (0.5 * spacing * (last - first))
+        return near[value + rise >= value[top]]
 
     outer, inner = 12, 6
     for corner in np.ndindex(*(-(-n // outer))):
         start = np.array(corner) * outer
         end = np.minimum(start + outer, n)
-        around = block(start, outer, end, planes)
+        around = block(start, end, planes)
         for part in np.ndindex(*(-(-(end - start) // inner))):
             first = start + np.array(part) * inner
             last = np.minimum(first + inner, end)
-            near = block(first, inner, last, around)
+            near = block(first, last, around)
             cells = np.stack(
                 np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1
             )
