@@ -101,6 +101,8 @@ def test_sizes():
     assert obs["actor"].shape == (4, 65) and obs["critic"].shape == (4, 149)
     tables = env.describe()["observations"]
     assert sum(r[1] for r in tables["actor"]) == 65 and sum(r[1] for r in tables["critic"]) == 149
+    placed = make("task.critic=placed")
+    assert torch.equal(placed.get_observations()["critic"][:, -3:], placed.object_pose[:, :3])
 
 
 @pytest.mark.parametrize(
