@@ -204,7 +204,7 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     from dexsim.deploy import measure
 
     of = measure.of(env.task["name"])
-    terms = None if hasattr(of, "SIGNALS") else of.Observation(env)
+    terms = None if hasattr(of, "ROWS") else of.Observation(env)
     for row in env._sensed if terms else ():  # without the noise, delay and dropout of their readings
         row.noise, row.dropout, row.delay = 0.0, 0.0, (0.0, 0.0)
     series: dict[str, list] = {}
@@ -213,7 +213,7 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
         env.reset_all()
         begins = True
         for _ in range(steps):
-            obs, signals = env.get_observations(), terms.of_env() if terms else of.signals_of(env)._asdict()
+            obs, signals = env.get_observations(), terms.of_env() if terms else of.signals_of(env)
             now = {f"signal_{name}": value[0].clone() for name, value in signals.items()}
             now |= {"observation": obs["actor"][0], "begins": torch.tensor(begins), "q": env.q[0].clone(),
                     "before": env.target[0].clone()}  # fmt: skip
@@ -246,7 +246,7 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, gol
     hand, (pads, taxels) = env.hand, touch_shape(env.hand)
     task, cfg = env.task, data["config"]
     of = measure.of(task["name"])
-    own, labels = of.parts(env), of.SIGNALS.ROWS if hasattr(of, "SIGNALS") else {}
+    own, labels = of.parts(env), getattr(of, "ROWS", {})
     scaling = own.pop("scaling", {})
     if "terms" in own:
         own["terms"]["sha256"] = bundle.sha256(policy.with_name(bundle.TERMS))
@@ -373,22 +373,17 @@ def _in_order(b: Any, observation: Any, begins: list[bool]) -> Any:
 def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
     """Return the golden observations [n, D], built from the golden signals as the loop builds them."""
     import numpy as np
-    import torch
 
-    if hasattr(of, "SIGNALS"):
-        own = of.SIGNALS
-        there = {k: rows[f"signal_{k}"] for k in own.Signals._fields if f"signal_{k}" in rows}  # an older one has fewer
-        signals = own.Signals(**{k: torch.from_numpy(x) for k, x in there.items()})
-        return of.build(signals, b.manifest).numpy()
     from dexsim.calibration.file import Calibration
 
     built = of.Measured(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",
                                                 b.manifest["normalization"]["tau_max"], b.hand))  # fmt: skip
+    signals = {k.removeprefix("signal_"): x.astype(np.float32) for k, x in rows.items() if k.startswith("signal_")}
     out = []
-    for k, begins in enumerate(rows["begins"]):
-        if begins:
+    for k in range(len(rows["q"])):
+        if "begins" not in rows or rows["begins"][k]:
             built.reset()
-        out.append(built.built({name: rows[f"signal_{name}"][k] for name in built.names})[0])
+        out.append(built.built({name: x[k] for name, x in signals.items()})[0])
     return np.stack(out)
 
 

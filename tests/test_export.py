@@ -8,12 +8,12 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from bundles import make_checkpoint
 
 from dexsim import export
 from dexsim.deploy import bundle
+from dexsim.deploy.of_grasp import Measured
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.tasks import observations
@@ -144,14 +144,17 @@ def test_module_checks_in_its_own_process(made):
 
 def test_builder_places_every_signal():
     """Each signal set to a value of its own lands in its own slice, scaled as the table says."""
-    one = lambda k, *shape: torch.full((2, *shape), float(k))  # noqa: E731
-    s = observations.Signals(
-        one(1, 12), one(2, 12), one(3, 2), one(4), one(5), one(6, 5), one(7, 5, 3), one(8, 5, 3), one(9)
-    )
+    one = lambda k, *shape: np.full(shape, float(k), np.float32)  # noqa: E731
+    given = dict(
+        joint_position=one(1, 12), joint_torque=one(2, 12), object_xy=one(3, 2), object_z=one(4), object_vz=one(5),
+        touch_force=one(6, 5), touch_centre=one(7, 5, 3), fingertip=one(8, 5, 3), command=one(9),
+    )  # fmt: skip
     widths = {"joint_angle": 12, "joint_torque": 12, "object_position": 3, "object_velocity": 3, "contact_force": 5,
               "contact_centre": 15, "fingertip_position": 15, "force_command": 1}  # fmt: skip
-    out, at = observations.build(s, [*widths], 2.0), observations.slices([*widths.items()])
-    assert out.shape == (2, 66)
+    measured = Measured.__new__(Measured)
+    measured.manifest = {"observation": [{"name": name} for name in widths], "normalization": {"force_max_N": 2.0}}
+    out, at = measured.built(given), observations.slices([*widths.items()])
+    assert out.shape == (1, 66)
     for name, want in (("joint_angle", 1), ("joint_torque", 2), ("contact_force", 3), ("contact_centre", 7),
                        ("fingertip_position", 8), ("force_command", 9)):  # fmt: skip
         assert (out[:, at[name]] == want).all(), name

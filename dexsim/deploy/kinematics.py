@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-import torch
 
 from dexsim.deploy.driver import HandState
 from dexsim.errors import UserError
@@ -66,14 +65,14 @@ class HandKinematics:
         self._last = state.time, q
         return self._speed
 
-    def followers(self, state: HandState) -> torch.Tensor:
-        """Return angles [1, S] rad of measured joints without a drive. Raises UserError where the driver does not
+    def followers(self, state: HandState) -> np.ndarray:
+        """Return angles [S] rad of measured joints without a drive. Raises UserError where the driver does not
         read them."""
         if not self._sensed:
-            return torch.zeros(1, 0)
+            return np.zeros(0)
         if state.follower is None:
             raise UserError(f"the driver reads no angle of {', '.join(self._sensed)}, which this policy observes")
-        return torch.as_tensor(np.asarray(state.follower, np.float32))[None]
+        return state.follower
 
     def touch(
         self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True

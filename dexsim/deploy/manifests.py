@@ -92,7 +92,7 @@ class Reached(msgspec.Struct):
 
 
 class Observe(msgspec.Struct):
-    """Which rows the rotation's observation has (`observations_rotate.rows`)."""
+    """Which rows the rotation's observation has."""
 
     orientation: Literal["6d", "quaternion", "none"]
     force_weighted: bool = True
@@ -232,7 +232,7 @@ def _rows(m: Manifest, source: object, hand: Hand) -> None:
     a network of the bundle's own."""
     if m.terms is not None:
         return
-    known, J, P = measure.of(m.task).SIGNALS.ROWS, len(hand.joints), len(hand.pads)
+    known, J, P = measure.of(m.task).ROWS, len(hand.joints), len(hand.pads)
     widths: dict[str, tuple[int, ...]] = {
         "follower_angle": (len(hand.sensed),), "object_position": (3,), "object_velocity": (3,),
         "relative_orientation": (4, 6), "contact_force": (P,), "contact_centre": (3 * P,),

@@ -9,24 +9,22 @@ import torch
 
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.manifests import floats
-from dexsim.deploy.measure import PLACE, Measure, commanded, tensor
+from dexsim.deploy.measure import COMMON, PLACE, Given, Measure, commanded, floats32
 from dexsim.errors import UserError
 from dexsim.tasks import observations
 
 OPTIONS = ("vision", "place", "shape")
-SIGNALS = observations
+ROWS = COMMON | {
+    "joint_torque": ("tau/tau_max", "joint", "joints"), "object_position": ("m", "palm", "x y z"),
+    "object_velocity": ("m/s", "palm", "x y z"), "contact_force": ("F/F_max", "taxel, along the normal", "fingers"),
+    "force_command": ("F/F_max", "none", "one"),
+}  # fmt: skip
 
 
 def check(m: Any, source: object, again: str) -> None:
     """Raise UserError for a manifest that lacks what this task needs."""
     if m.normalization.force_max_N is None:
         raise UserError(f"{source}: lacks normalization.force_max_N, which task={m.task} needs; {again}")
-
-
-def build(s: observations.Signals, m: dict[str, Any]) -> torch.Tensor:
-    """Return the observation [N, D] that a manifest states."""
-    names = [row["name"] for row in m["observation"]]
-    return observations.build(s, names, float(m["normalization"]["force_max_N"]))
 
 
 def parts(env: Any) -> dict[str, Any]:
@@ -47,7 +45,7 @@ def parts(env: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def signals_of(env: Any) -> observations.Signals:
+def signals_of(env: Any) -> dict[str, torch.Tensor]:
     """Return what the last observation of a simulated task was built from, noise and all."""
     s = env.sensed
     followers = env.q[:, :0]
@@ -55,9 +53,12 @@ def signals_of(env: Any) -> observations.Signals:
         widths = {name: width for name, width, _ in env.describe()["observations"]["actor"]}
         parts = env.obs["actor"].split([*widths.values()], 1)
         followers = dict(zip(widths, parts, strict=True))["follower_angle"].clone()
-    return observations.Signals(
-        s.joint_position, s.joint_torque, env.first_xy, env.z_seen, env.height_speed(), env.touch.force[:, : env.pads],
-        env.touch.centre[:, : env.pads], s.tip, env.force_command(), followers)  # fmt: skip
+    return {
+        "joint_position": s.joint_position, "joint_torque": s.joint_torque, "object_xy": env.first_xy,
+        "object_z": env.z_seen, "object_vz": env.height_speed(), "touch_force": env.touch.force[:, : env.pads],
+        "touch_centre": env.touch.centre[:, : env.pads], "fingertip": s.tip, "command": env.force_command(),
+        "follower": followers,
+    }  # fmt: skip
 
 
 class Measured(Measure):
@@ -68,34 +69,34 @@ class Measured(Measure):
     def reset(self) -> None:
         """Begin a new episode: the next object position is the first."""
         self._xy: np.ndarray | None = None
-        self._z: torch.Tensor | None = None
+        self._z = np.float32(0.0)
 
     def commanded(self, given: Any) -> list[float]:
         """Return the commanded force, a share of F_max (0.5 for None). Raises UserError."""
         return commanded(given, [0.5], str(self.manifest["task"]), 0.0, 1.0)
 
-    @torch.inference_mode()
-    def observe(
+    def signals(
         self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm
-        frame, which is needed; command: one number, 0..1."""
+    ) -> Given:
+        """See `Measure.observe`; seen [3] m: the object, palm frame, which is needed; command: 0..1. Of touch, all that
+        the hand feels; torque over tau_max, positive along positive joint position."""
         assert seen is not None
-        s = self.signals(state, seen, command)
-        return build(s, self.manifest).numpy(), s.touch_force[0].numpy()
-
-    def signals(self, state: HandState, place: np.ndarray, command: list[float]) -> observations.Signals:
-        """See `observe`; of touch, all that the hand feels."""
         tips, force, centre = self.touched(state)
         width = {row["name"]: row["stop"] - row["start"] for row in self.manifest["observation"]}
-        said = [*command] * width.get("force_command", 1)  # the thumb's own is the others'
+        z = np.float32(seen[2])
         if self._xy is None:
-            self._xy = np.array(place[:2], float)
-        z = tensor([place[2]])[0]
-        vz = torch.zeros_like(z) if self._z is None else observations.height_speed(z, self._z, self.period)
-        self._z = z
-        return observations.Signals(
-            tensor(state.position), tensor(self.calibration.torque_norm(np.asarray(state.current, float) * 1e-3)),
-            tensor(self._xy), z, vz,
-            tensor(force), tensor(centre), tensor(tips),
-            tensor(said), self.hand.followers(state))  # fmt: skip
+            self._xy, self._z = np.array(seen[:2], float), z
+        vz, self._z = observations.height_speed(z, self._z, self.period), z
+        return floats32(
+            joint_position=state.position, object_xy=self._xy, object_z=z, object_vz=vz, touch_force=force,
+            joint_torque=self.calibration.torque_norm(np.asarray(state.current, float) * 1e-3), touch_centre=centre,
+            fingertip=tips, follower=self.hand.followers(state),
+            command=[*command] * width.get("force_command", 1))  # the thumb's own is the others'  # fmt: skip
+
+    def built(self, given: Given) -> np.ndarray:
+        xy, z, vz = (np.atleast_1d(given[k]) for k in ("object_xy", "object_z", "object_vz"))
+        return self.row(given, {
+            "joint_torque": given["joint_torque"], "object_position": np.concatenate([xy, z]),
+            "object_velocity": np.concatenate([np.zeros_like(xy), vz]), "force_command": given["command"],
+            "contact_force": given["touch_force"] / np.float32(self.manifest["normalization"]["force_max_N"]),
+        })[None]  # fmt: skip

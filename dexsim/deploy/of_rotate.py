@@ -13,13 +13,17 @@ from dexsim import rotation
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.manifests import Observe, grip
-from dexsim.deploy.measure import ORIENTATION, Measure, tensor
+from dexsim.deploy.measure import COMMON, ORIENTATION, Given, Measure, floats32, tensor
 from dexsim.errors import UserError
 from dexsim.tasks import observations_rotate
 from dexsim.typed import convert
 
 OPTIONS = ("imu",)
-SIGNALS = observations_rotate
+ROWS = COMMON | {
+    "joint_velocity": ("rad/s", "joint", "joints"), "last_action": ("1", "joint", "joints"),
+    "relative_orientation": (
+        "1", "object", "6d: the matrix's first two columns, one after the other; quaternion: w x y z"),
+}  # fmt: skip
 
 
 def check(m: Any, source: object, again: str) -> None:
@@ -29,11 +33,6 @@ def check(m: Any, source: object, again: str) -> None:
     convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", again)
     if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
         raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {again}")
-
-
-def build(s: observations_rotate.Signals, m: dict[str, Any]) -> torch.Tensor:
-    """Return the observation [N, D] that a manifest states."""
-    return observations_rotate.build(s, [row["name"] for row in m["observation"]], m["task_settings"])
 
 
 def parts(env: Any) -> dict[str, Any]:
@@ -63,17 +62,20 @@ def parts(env: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def signals_of(env: Any) -> observations_rotate.Signals:
+def signals_of(env: Any) -> dict[str, torch.Tensor]:
     """Return what the last observation of a simulated task was built from, noise and all."""
     widths = {name: width // env.history for name, width, _ in env.describe()["observations"]["actor"]}
     frames = env.obs["actor"].view(env.num_envs, env.history, -1).clone()
     row = dict(zip(widths, frames[:, 0].split([*widths.values()], 1), strict=True))
     blind = env.task["perception"] == "proprioception"
-    return observations_rotate.Signals(
-        row.get("joint_angle", env.q), row.get("joint_velocity", env.qd), env.seen.clone(), env.goal_seen(), env.sent(),
-        env.contact_force(), env.contact_centre().flatten(1), row.get("fingertip_position", env.tips.flatten(1)),
-        torch.roll(frames, -1, 1) if blind else frames[:, :0], env.episode_length_buf == 0,
-        row.get("follower_angle", env.q[:, :0]))  # fmt: skip
+    return {
+        "joint_position": row.get("joint_angle", env.q), "joint_velocity": row.get("joint_velocity", env.qd),
+        "orientation": env.seen.clone(), "goal": env.goal_seen(), "sent": env.sent(),
+        "touch_force": env.contact_force(), "touch_centre": env.contact_centre().flatten(1),
+        "fingertip": row.get("fingertip_position", env.tips.flatten(1)),
+        "past": torch.roll(frames, -1, 1) if blind else frames[:, :0], "fresh": env.episode_length_buf == 0,
+        "follower": row.get("follower_angle", env.q[:, :0]),
+    }  # fmt: skip
 
 
 class Measured(Measure):
@@ -97,46 +99,40 @@ class Measured(Measure):
         """Begin a new episode: the next orientation gives the first goal."""
         self.goal: torch.Tensor | None = None
         self.goals = 0
-        self._past: torch.Tensor | None = None
+        self._past: np.ndarray | None = None
         self.hand.forget()
 
-    @torch.inference_mode()
-    def observe(
-        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation
-        w x y z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
-        s = self.signals(state, seen, target, action)
-        out = build(s, self.manifest)
-        if self.task["perception"] == "proprioception":
-            self._past = out.view(1, -1, self.frame)
-        return out.numpy(), s.touch_force[0].numpy()
-
     def signals(
-        self, state: HandState, seen: np.ndarray | None, target: np.ndarray, action: np.ndarray
-    ) -> observations_rotate.Signals:
-        """See `observe`; moves the goal on where it is reached."""
-        imu = self.task["perception"] == "imu"
+        self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
+    ) -> Given:
+        """See `Measure.observe`; moves the goal on where it is reached. seen [4]: the object's orientation w x y z as
+        its IMU says, in whose frame the goal is; past [H, D]: the last H frames, the newest first (without an IMU);
+        fresh: an episode begins."""
         q = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
-        if imu:
+        if self.needs is not None:
             q = rotation.normalize(tensor(seen))
             self._aim(q)
         tips, force, centre = self.touched(state, self.task["observe"]["force_weighted"])
-        fresh = not imu and self._past is None
-        past = (
-            torch.zeros(1, 0, 0)
-            if imu
-            else torch.zeros(1, int(self.task["history"]), self.frame)
-            if self._past is None
-            else self._past
-        )
+        none = np.zeros((0, 0)) if self.needs is not None else np.zeros((int(self.task["history"]), self.frame))
         sent = observations_rotate.sent(
             tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), tensor(target), self._middle, self._half,
             self.task["observe"].get("last_action", "step"))  # fmt: skip
-        return observations_rotate.Signals(
-            tensor(state.position), tensor(self.hand.velocity(state)), q, q if self.goal is None else self.goal, sent,
-            tensor(force), tensor(centre), tensor(tips), past, torch.tensor([fresh]),
-            self.hand.followers(state))  # fmt: skip
+        return floats32(
+            joint_position=state.position, joint_velocity=self.hand.velocity(state), orientation=q[0], sent=sent[0],
+            goal=(q if self.goal is None else self.goal)[0], touch_force=force, touch_centre=centre, fingertip=tips,
+            past=none if self._past is None else self._past, fresh=self._past is None,
+            follower=self.hand.followers(state))  # fmt: skip
+
+    def built(self, given: Given) -> np.ndarray:
+        relative = observations_rotate.relative(
+            tensor(given["orientation"]), tensor(given["goal"]), self.task["observe"]["orientation"])  # fmt: skip
+        frame = self.row(given, {"joint_velocity": given["joint_velocity"], "last_action": given["sent"],
+                                 "relative_orientation": relative.numpy()})[None]  # fmt: skip
+        if self.needs is not None:
+            return frame
+        past = np.tile(frame, (len(given["past"]), 1)) if given["fresh"] else given["past"]
+        self._past = np.concatenate([frame, past[:-1]]).astype(np.float32)
+        return self._past.reshape(1, -1)
 
     def _aim(self, q: torch.Tensor) -> None:
         """Set the first goal, or the next where this one is reached."""

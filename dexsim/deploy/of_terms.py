@@ -16,7 +16,7 @@ import torch
 
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import HandState
-from dexsim.deploy.measure import POSE, Measure, commanded
+from dexsim.deploy.measure import POSE, Given, Measure, commanded, floats32
 from dexsim.errors import UserError
 from dexsim.tasks.task import STATE, Task
 from dexsim.tasks.terms import Memory
@@ -195,26 +195,23 @@ class Measured(Measure):
         usual = [float(x) for v in self.commands.values() for x in v]
         return commanded(given, usual, str(self.manifest["task"]))
 
-    def observe(
+    def signals(
         self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return one control step: (observation [1, D] float32, touch forces [P] N). seen [7]: the object's pose, where
-        the policy needs it."""
+    ) -> Given:
+        """See `Measure.observe`; seen [7]: the object's pose, where the policy needs it."""
         c = self.calibration
         tips, force, centre = self.touched(state)
         numbers = iter(command)
-        now = {
-            "q": state.position, "qd": self.hand.velocity(state), "target": target,
-            "torque": c.torque_norm(np.asarray(state.current, float) * 1e-3) * self.tau_max,
-            "action": np.clip(np.nan_to_num(action), -1.0, 1.0), "touch_force": force, "touch_centre": centre,
-            "tips": tips, "age": self._steps * self.period, "object_pose": seen,
-        } | {f"command {k}": [next(numbers) for _ in v] for k, v in self.commands.items()}  # fmt: skip
-        self._steps += 1
-        return self.built({name: np.asarray(now[name], np.float32) for name in self.names}), force
+        age, self._steps = self._steps * self.period, self._steps + 1
+        return floats32(
+            q=state.position, qd=self.hand.velocity(state), target=target,
+            torque=c.torque_norm(np.asarray(state.current, float) * 1e-3) * self.tau_max,
+            action=np.clip(np.nan_to_num(action), -1.0, 1.0), touch_force=force, touch_centre=centre, tips=tips,
+            age=age, object_pose=seen, **{f"command {k}": [next(numbers) for _ in v] for k, v in self.commands.items()}
+        )  # fmt: skip
 
-    def built(self, given: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the observation [1, D] of signals; moves the past on."""
-        feed = {_input(k): given[k].reshape(1, *self.shapes[k]).astype(np.float32) for k in self.names}
+    def built(self, given: Given) -> np.ndarray:
+        feed = {_input(k): given[k].reshape(1, *self.shapes[k]) for k in self.names}
         flat = self.session.run(["rows"], feed)[0][0]
         fresh, rows, at = not self._frames, [], 0
         for k, row in enumerate(self.terms["rows"]):

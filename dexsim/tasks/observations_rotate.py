@@ -1,5 +1,4 @@
-"""The rotation policy's observation, built from named measured signals: the one builder of the simulated task and of
-the real-time loop, as `observations.py` is for the grasp.
+"""What simulation and real-time loop compute alike of the rotation's observation and goals.
 
 Torch only, no branches on values, no allocation beyond its results: it can be part of a CUDA graph.
 """
@@ -8,60 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
 from dexsim import rotation
 from dexsim.errors import UserError
-
-ROWS = {
-    "joint_angle": ("rad", "joint", "joints"), "follower_angle": ("rad", "joint", "joints without a drive"),
-    "joint_velocity": ("rad/s", "joint", "joints"), "last_action": ("1", "joint", "joints"),
-    "relative_orientation": (
-        "1", "object", "6d: the matrix's first two columns, one after the other; quaternion: w x y z"),
-    "contact_force": ("N", "taxel, along the normal", "fingers"),
-    "contact_centre": ("m", "palm", "fingers, x y z each"), "fingertip_position": ("m", "palm", "fingers, x y z each"),
-}  # fmt: skip
-"""Unit, frame and order of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
-
-
-class Signals(NamedTuple):
-    """What is measured, N hands at once. joint_position [N, J] rad; joint_velocity [N, J] rad/s (used without an IMU
-    only); orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, J], see
-    `sent`; touch_force [N, P] N, touch_centre [N, P, 3], fingertip [N, F, 3] m, palm frame (P = 0 without touch); past
-    [N, H, D]: the last H frames, newest first (perception=proprioception, else empty); fresh [N] bool: an episode
-    begins; follower [N, S] rad: measured joints without a drive (None: none)."""
-
-    joint_position: torch.Tensor
-    joint_velocity: torch.Tensor
-    orientation: torch.Tensor
-    goal: torch.Tensor
-    sent: torch.Tensor
-    touch_force: torch.Tensor
-    touch_centre: torch.Tensor
-    fingertip: torch.Tensor
-    past: torch.Tensor
-    fresh: torch.Tensor
-    follower: torch.Tensor | None = None
-
-
-def build(s: Signals, names: Sequence[str], task: Mapping[str, Any]) -> torch.Tensor:
-    """Return the rows of these names, one after another [N, D], under a task's `observe` and `perception`. With
-    perception=proprioception the newest frame is put before `past`, whose oldest is left out; a fresh episode's history
-    is its first frame."""
-    rows = {
-        "joint_angle": s.joint_position, "joint_velocity": s.joint_velocity, "last_action": s.sent,
-        "contact_centre": s.touch_centre.flatten(1), "contact_force": s.touch_force,
-        "fingertip_position": s.fingertip.flatten(1),
-        "follower_angle": s.joint_position[:, :0] if s.follower is None else s.follower,
-        "relative_orientation": relative(s.orientation, s.goal, task["observe"]["orientation"]),
-    }  # fmt: skip
-    frame = torch.cat([rows[name] for name in names], 1)
-    if task["perception"] != "proprioception":
-        return frame
-    moved = torch.cat([frame[:, None], s.past[:, :-1]], 1)
-    return torch.where(s.fresh[:, None, None], frame[:, None].expand_as(moved), moved).flatten(1)
 
 
 def sent(
