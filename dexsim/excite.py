@@ -42,9 +42,6 @@ KEYS = typed.defaults(USAGE) | {"out": ""}
 
 def main(argv: Sequence[str]) -> int:
     """Make and write a plan; returns the exit status. Raises UserError."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE, end="")
-        return 0 if argv else 2
     given = KEYS | typed.settings(argv, KEYS)
 
     from dexsim import files, outputs

@@ -41,9 +41,6 @@ OPSET = 17
 
 def main(argv: Sequence[str]) -> int:
     """Returns the exit status. Raises UserError."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE, end="")
-        return 0 if argv else 2
     given = settings(argv, KEYS, ("agent.",))
     if "task" in given:
         from dexsim.tasks import registry

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,6 @@ settings (key=default):
 
 def main(argv: Sequence[str]) -> int:
     """Returns the exit status. Raises UserError."""
-    if not argv or any(a in ("-h", "--help", "help") for a in argv):
-        print(USAGE, end="")
-        return 0 if argv else 2
     given = {"scale": "1", "hulls": str(own.PARTS), "out": "", "picture": "true"}
     meshes, own_settings = typed.words(argv, given)
     given |= own_settings
@@ -130,9 +126,3 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
     )
     figure.colorbar(drawn, ax=axes, label="mm (inside < 0)", shrink=0.8)
     files.picture(figure, picture)
-
-
-if __name__ == "__main__":
-    from dexsim.console.ending import guard
-
-    sys.exit(guard(main, sys.argv[1:]))

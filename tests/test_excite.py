@@ -13,6 +13,7 @@ from rig import pendulum_spec
 
 from dexsim import excite
 from dexsim.actuator.table import ServoTable
+from dexsim.cli.main import main
 from dexsim.errors import UserError
 from dexsim.recording import excitation, read, safety
 from dexsim.recording.excitation import Limits
@@ -277,7 +278,7 @@ def test_links_that_no_drive_carries_are_said_at_once(monkeypatch):
 
 
 def test_help(capsys):
-    assert excite.main(["--help"]) == 0
+    assert main(["excite", "--help"]) == 0
     text = capsys.readouterr().out
     for key in excite.KEYS:
         assert f"{key}=" in text

@@ -10,7 +10,7 @@ from pathlib import Path
 from dexsim import typed
 from dexsim.errors import UserError
 
-USAGE = """usage: dexsim demo [key=value ...]
+HELP = """usage: dexsim demo [key=value ...]
 
 See both halves of dexsim work, on any machine: hide an effect in a simulated joint and find it (out/demo/report.html),
 then play a trained grasp in the browser, to push, drop and press, until Ctrl-C.
@@ -22,7 +22,7 @@ settings (key=default):
   browser=true      open both pages; false: only say where they are
   seconds=          end by itself after this many
 """
-KEYS = typed.defaults(USAGE)
+KEYS = typed.defaults(HELP)
 
 
 def main(argv: list[str]) -> int:
@@ -30,7 +30,7 @@ def main(argv: list[str]) -> int:
     from dexsim.learning import policies
 
     if {"-h", "--help"} & set(argv):
-        print(USAGE.format(policies=", ".join(policies.included())), end="")
+        print(HELP.format(policies=", ".join(policies.included())), end="")
         return 0
     given = KEYS | typed.settings(argv, KEYS)
     typed.one_of("policy", given["policy"], policies.included())

@@ -68,9 +68,6 @@ OWN = (*SECOND, *typed.defaults(USAGE), "task")
 def main(argv: Sequence[str]) -> int:
     """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP. Raises
     UserError."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE, end="")
-        return 0 if argv else 2
     if argv[0] == "check":
         from dexsim.cli import first_hour
 

@@ -43,9 +43,6 @@ SHARED_MIN = 256 << 20
 
 def main(argv: list[str]) -> int:
     """Print a line for each check; returns 0, or 1 where dexsim cannot run. Raises UserError."""
-    if argv in (["-h"], ["--help"]):
-        print(USAGE, end="")
-        return 0
     if argv:
         raise UserError(f"{argv[0]}: dexsim doctor takes no settings")
     print(f"dexsim {VERSION} on {platform.platform()} {platform.machine()}, Python {platform.python_version()}\n")

@@ -9,6 +9,7 @@ import sys
 from dataclasses import dataclass
 
 from dexsim import door
+from dexsim.console import program
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.version import VERSION
@@ -16,22 +17,26 @@ from dexsim.version import VERSION
 
 @dataclass(frozen=True)
 class Command:
-    """One sub-command. where: "module:function" of (arguments) -> exit status; about: one line for the first screen."""
+    """One sub-command. where: "module:function" of (arguments) -> exit status; about: one line for the first screen;
+    bare: whether it runs without any argument, else that asks for the page `USAGE` of its module."""
 
     where: str
     about: str
+    bare: bool = False
     # whether joints are searched side by side: threads of the linear algebra would take the cores from them (read by
     # OpenBLAS when NumPy loads, so it must be said before)
     side_by_side: bool = False
 
 
 COMMANDS: dict[str, Command] = {
-    "demo": Command("dexsim.cli.demo:main", "find a hidden effect, then play a trained hand in the browser", True),
+    "demo": Command(
+        "dexsim.cli.demo:main", "find a hidden effect, then play a trained hand in the browser", side_by_side=True
+    ),
     "train": Command("dexsim.cli.commands:train", "train a policy in many simulated worlds at once"),
     "play": Command(
         "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
     ),
-    "tasks": Command("dexsim.cli.tasks:main", "list the tasks, those of installed packages too"),
+    "tasks": Command("dexsim.cli.tasks:main", "list the tasks, those of installed packages too", True),
     "diagnose": Command(
         "dexsim.gap.command:main",
         "find the physics that the simulator leaves out of your recordings",
@@ -46,10 +51,14 @@ COMMANDS: dict[str, Command] = {
     "import-object": Command("dexsim.import_object:main", "make an object to grasp of a mesh file"),
     "export": Command("dexsim.export:main", "write a policy as one folder that a robot can run"),
     "deploy": Command("dexsim.cli.deploy:main", "run an exported policy on a hand, real or simulated"),
-    "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from"),
-    "doctor": Command("dexsim.cli.doctor:main", "say what this machine has and lacks, for a report of a bug"),
+    "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from",
+                             True),  # fmt: skip
+    "doctor": Command("dexsim.cli.doctor:main", "say what this machine has and lacks, for a report of a bug", True),
     "nan-dump": Command("dexsim.tasks.nan_replay:main", "repeat the step at which a world stopped being finite"),
 }
+HELP = ("-h", "--help", "help")
+PARTS = ("check", "skin")
+"""Commands of `deploy` and `import-hand`, which have pages of their own."""
 RARER = ("stable-grasps", "doctor", "nan-dump")
 FIRST_SCREEN = """usage: dexsim COMMAND [key=value ...]
 
@@ -89,7 +98,7 @@ def dispatch(argv: list[str]) -> int:
         return 0
     if argv[:1] == ["help"] and len(argv) > 1:
         argv = [argv[1], "--help"]
-    if not argv or argv[0] in ("-h", "--help", "help"):
+    if not argv or argv[0] in HELP:
         print(first_screen(), end="")
         return 0 if argv else 2
     name = argv[0]
@@ -100,14 +109,15 @@ def dispatch(argv: list[str]) -> int:
     if COMMANDS[name].side_by_side:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     module, _, function = COMMANDS[name].where.partition(":")
-    status: int = getattr(importlib.import_module(module), function)(door.take(argv[1:]))
+    loaded, given = importlib.import_module(module), door.take(argv[1:])
+    asked = any(a in HELP for a in given) and given[0] not in PARTS if given else not COMMANDS[name].bare
+    if asked and (page := getattr(loaded, "USAGE", None)) is not None:
+        print(program.words(page), end="")
+        return 0 if given else 2
+    status: int = getattr(loaded, function)(given)
     return status
 
 
 def main(argv: list[str] | None = None) -> int:
     """Return the console command `dexsim`, `python -m dexsim` and the scripts at the top; returns the exit status."""
     return guard(dispatch, sys.argv[1:] if argv is None else argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -33,9 +33,6 @@ KEYS = typed.defaults(USAGE)
 
 def main(argv: Sequence[str]) -> int:
     """Record until the time is over; returns the exit status. Raises UserError."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE, end="")
-        return 0 if argv else 2
     given = KEYS | typed.settings(argv, KEYS)
     for key in ("ros2", "out"):
         if not given.get(key):

@@ -41,9 +41,6 @@ USUAL = {"out": "out/stable_grasps.npz", "count": "2000", "worlds": "256", "seed
 
 def main(argv: list[str]) -> int:
     """Returns the exit status. Raises UserError."""
-    if any(a in ("-h", "--help", "help") for a in argv):
-        print(USAGE, end="")
-        return 0
     mine = [a for a in argv if a.partition("=")[0] in USUAL]
     own, known = USUAL | typed.settings(mine, USUAL), tasks()
     task, usual = known[typed.one_of("hold", own["hold"], [*known])]

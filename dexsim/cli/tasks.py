@@ -16,8 +16,7 @@ class is named in full, task=module:Class; the current folder is looked in too.
 def main(argv: list[str]) -> int:
     """Print the table; returns 0."""
     if argv:
-        print(USAGE, end="")
-        return 0 if argv[0] in ("-h", "--help", "help") else 2
+        raise UserError(f"{argv[0]}: dexsim tasks takes no settings")
     rows = []
     for entry in registry.entries():
         try:

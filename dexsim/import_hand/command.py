@@ -50,9 +50,6 @@ PLACES = ("palm.", "poses.", "fingers.", "joints.", "places.", "opposing", "hand
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; return the exit status. Raises UserError."""
-    if not argv or argv[0] in ("-h", "--help", "help") or "--help" in argv:
-        print(USAGE, end="")
-        return 0 if argv else 2
     if argv[0] == "check":
         from dexsim.import_hand import moves
 

@@ -15,7 +15,7 @@ from dexsim.errors import UserError
 if TYPE_CHECKING:
     from dexsim.recording.schema import Recording
 
-HELP = """usage: dexsim convert IN ... out=OUT [format=mcap|lerobot] [fps=HZ] [units.QUANTITY=UNIT ...]
+USAGE = """usage: dexsim convert IN ... out=OUT [format=mcap|lerobot] [fps=HZ] [units.QUANTITY=UNIT ...]
                       [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]
 
 Writes recordings in SI units: as MCAP in dexsim's own topics (out=FILE.mcap for one, out=FOLDER for several), or as a
@@ -129,9 +129,6 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.recording.arguments import read_arguments
     from dexsim.recording.reader import read
 
-    if not argv or argv[0] in ("-h", "--help"):
-        print(HELP, end="")
-        return 0 if argv else 2
     taken = [a for a in argv if a.startswith(("out=", "format=", "fps="))]
     own = typed.settings(taken, ("out", "format", "fps"))
     if not own.get("out"):

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -148,10 +147,3 @@ def load(path: Path) -> dict[str, np.ndarray]:
     except (ValueError, KeyError) as error:
         raise UserError(f"{path}: not a dump of a world ({type(error).__name__}: {error})") from None
     return data
-
-
-if __name__ == "__main__":  # python -m dexsim.tasks.nan_dump FILE
-    from dexsim.console.ending import guard
-    from dexsim.tasks.nan_replay import main
-
-    sys.exit(guard(main, sys.argv[1:]))

@@ -61,9 +61,6 @@ def replay(path: Path, device: str = "cpu", engine: str = "auto") -> HandEnv:
 
 def main(argv: list[str]) -> int:
     """Prints the state before and after; returns 0."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE, end="")
-        return 0 if argv else 2
     files = [a for a in argv if "=" not in a]
     given = typed.settings([a for a in argv if "=" in a], ("engine", "device"))
     if len(files) != 1:

@@ -5,7 +5,6 @@ A file of them holds `GraspSet`; `dexsim.tasks.make_grasps` makes them.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -148,10 +147,3 @@ def held_poses(hand: Hand, path: str | Path | None = None) -> GraspSet:
             f" {len(hand.joints)}; make them with dexsim stable-grasps hand={hand.folder} out=PATH"
         )
     return found.derived(hand.mirror, hand.scale) if path is None else found
-
-
-if __name__ == "__main__":  # python -m dexsim.tasks.stable_grasps out=poses.npz
-    from dexsim.cli.stable_grasps import main
-    from dexsim.console.ending import guard
-
-    sys.exit(guard(main, sys.argv[1:]))
