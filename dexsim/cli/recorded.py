@@ -173,7 +173,7 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
     import mujoco
 
     from dexsim.console.ticker import Ticker
-    from dexsim.view.video import Clip, NoRenderer, render
+    from dexsim.view.video import Clip, drawn, render
 
     model = m.spec.compile()
     frames = result.t[0] + np.arange(len(result.qpos)) * result.frame_s
@@ -203,9 +203,4 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
             "azimuth": 120.0,
             "elevation": -20.0,
         }
-    try:
-        render(clips, path, result.frame_s, names, camera=camera, progress=Ticker("frames"))
-    except NoRenderer as error:  # the numbers stand without it
-        print(error)
-        return False
-    return True
+    return drawn(lambda: render(clips, path, result.frame_s, names, camera=camera, progress=Ticker("frames")))

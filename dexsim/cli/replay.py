@@ -54,17 +54,11 @@ def replay(
 
 def _video(env: Any, frames: dict[str, Any], path: Path) -> bool:
     """Return whether it could be made."""
-    from dexsim.view.video import NoRenderer, clips_of, render
+    from dexsim.view.video import clips_of, drawn, render
 
-    try:
-        render(
-            clips_of(frames), path, float(frames.get("dt", env.dt)), frames.get("names", ()),
-            float(frames.get("full", 10.0)), camera=frames.get("camera"), progress=Ticker("frames"),
-        )  # fmt: skip
-    except NoRenderer as error:  # the metrics stand without it
-        print(error)
-        return False
-    return True
+    return drawn(lambda: render(
+        clips_of(frames), path, float(frames.get("dt", env.dt)), frames.get("names", ()),
+        float(frames.get("full", 10.0)), camera=frames.get("camera"), progress=Ticker("frames")))  # fmt: skip
 
 
 def _plain(value: Any) -> Any:

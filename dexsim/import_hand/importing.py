@@ -579,9 +579,6 @@ def _drop_region(stage: Path, hand: dict[str, Any], drops: int, tell: Callable[[
 
 def _picture(hand: Hand, stage: Path, tell: Callable[[str], None]) -> None:
     from dexsim.import_hand import picture
-    from dexsim.view.video import NoRenderer
+    from dexsim.view.video import drawn
 
-    try:
-        picture.draw(hand, stage / "picture.png")
-    except NoRenderer as error:
-        tell(f"no picture: {error}")
+    drawn(lambda: picture.draw(hand, stage / "picture.png"), tell, "no picture: ")

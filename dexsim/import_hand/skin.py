@@ -292,12 +292,9 @@ def add(folder: Path, requested: str, say: Callable[[str], None] = lambda text: 
 def show(hand: Hand, folder: Path, say: Callable[[str], None]) -> None:
     """Write hand_skin.png, or say why not."""
     from dexsim.import_hand.picture import draw_skin
-    from dexsim.view.video import NoRenderer
+    from dexsim.view.video import drawn
 
-    try:
-        draw_skin(hand, folder / "hand_skin.png")
-    except NoRenderer as error:
-        say(f"no picture: {error}")
+    drawn(lambda: draw_skin(hand, folder / "hand_skin.png"), say, "no picture: ")
 
 
 def main(argv: list[str]) -> int:

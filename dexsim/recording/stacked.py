@@ -12,8 +12,9 @@ not used.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
 
 import numpy as np
@@ -62,51 +63,43 @@ class _Cursor:
 def joint_state(data: bytes) -> list[Span] | None:
     """Stamp (two), position, velocity, effort of a sensor_msgs/JointState; None where it is none."""
     c = _Cursor(data, 12)
-    try:
+    c.string()
+    for _ in range(c.count()):
         c.string()
-        for _ in range(c.count()):
-            c.string()
-        found = [c.numbers(c.count(), "<f8") for _ in range(3)]
-    except struct.error:
-        return None
-    return [*STAMP, *found] if _whole(c) else None
+    return _whole(c, [*STAMP, *(c.numbers(c.count(), "<f8") for _ in range(3))])
 
 
 def multi_array(data: bytes) -> list[Span] | None:
     """Return the values of a std_msgs/Float32MultiArray; None where it is none."""
     c = _Cursor(data)
-    try:
-        for _ in range(c.count()):
-            c.string()
-            c.count(), c.count()
-        c.count()
-        found = [c.numbers(c.count(), "<f4")]
-    except struct.error:
-        return None
-    return found if _whole(c) else None
+    for _ in range(c.count()):
+        c.string()
+        c.count(), c.count()
+    c.count()
+    return _whole(c, [c.numbers(c.count(), "<f4")])
 
 
 def plain(data: bytes, count: int) -> list[Span] | None:
     """Stamp (two) and the `count` float64 that follow the header of a message without anything else; None where it is
     none."""
     c = _Cursor(data, 12)
-    try:
-        c.string()
-    except struct.error:
-        return None
-    found = c.numbers(count, "<f8")
-    return [*STAMP, found] if _whole(c) else None
+    c.string()
+    return _whole(c, [*STAMP, c.numbers(count, "<f8")])
 
 
-def _whole(c: _Cursor) -> bool:
-    return c.data[:2] == LITTLE and c.at <= len(c.data)
+def _whole(c: _Cursor, found: list[Span]) -> list[Span] | None:
+    return found if c.data[:2] == LITTLE and c.at <= len(c.data) else None
 
 
-def take(messages: Sequence[bytes], spans: Sequence[Span]) -> list[np.ndarray] | None:
-    """Return the numbers [T, n] of each span of T messages; None where they differ in length, or in any byte that is
-    not of these numbers."""
+def take(messages: Sequence[bytes], layout: Callable[[bytes], list[Span] | None]) -> list[np.ndarray] | None:
+    """Return the numbers [T, n] of each span of T messages; None where they have no such layout, differ in length, or
+    in any byte that is not of these numbers."""
     size = len(messages[0])
-    if not size or any(len(m) != size for m in messages):
+    try:
+        spans = layout(messages[0])
+    except struct.error:  # it ends before its numbers do
+        return None
+    if spans is None or not size or any(len(m) != size for m in messages):
         return None
     # what lies between the numbers must be what the first message has there
     edges = [0, *(x for at, count, kind in sorted(spans) for x in (at, at + count * int(kind[-1]))), size]
@@ -140,8 +133,7 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
 
 def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
     """Return joint states of one layout; None where they are not. one: the first, as the standard decoder reads it."""
-    spans = joint_state(messages[0])
-    found = None if spans is None else take(messages, spans)
+    found = take(messages, joint_state)
     if found is None:
         return None
     seconds, rest, position, velocity, effort = found
@@ -155,8 +147,7 @@ def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
 
 def array_rows(messages: Sequence[bytes], one: Array) -> list[Array] | None:
     """Return arrays of one layout; None where they are not. one: the first, as the standard decoder reads it."""
-    spans = multi_array(messages[0])
-    found = None if spans is None else take(messages, spans)
+    found = take(messages, multi_array)
     if found is None:
         return None
     values = found[0].astype(float)
@@ -175,8 +166,7 @@ class Plain:
 
     def rows(self, messages: Sequence[bytes], one: Vector) -> list[Vector] | None:
         """Return vectors of one layout; None where they are not. one: the first, as it is read by itself."""
-        spans = plain(messages[0], self.count)
-        found = None if spans is None else take(messages, spans)
+        found = take(messages, partial(plain, count=self.count))
         if found is None:
             return None
         seconds, rest, numbers = found

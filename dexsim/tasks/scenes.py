@@ -24,6 +24,7 @@ from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
 from dexsim.hand.model import HAND_BIT, OBJECT_BIT
 from dexsim.sim.scene import OBJECT
+from dexsim.surface import geom_surface
 from dexsim.tactile.shapes import TouchShape, bake_convex
 
 Vector = tuple[float, float, float]
@@ -332,37 +333,12 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[int]:
 
 def _part(model: mujoco.MjModel, body: int, tree: str) -> Part:
     """Return what pads feel of a body: the convex hull of its colliding geoms."""
-    points = np.concatenate([_corners(model, g) for g in _colliding(model, body)])
+    surfaces = {g: geom_surface(model, g)[0] for g in _colliding(model, body)}
+    if (flat := next((g for g, x in surfaces.items() if not len(x)), None)) is not None:
+        kind = mujoco.mjtGeom(model.geom_type[flat]).name[7:].lower()
+        raise UserError(f"scene: geom {model.geom(flat).name or flat} is a {kind}, which is not felt")
+    points = np.concatenate([*surfaces.values()])
     name = f"{tree}/{model.body(body).name}"
     span = float(np.ptp(points, 0).max())
     grid = bake_convex(points, spacing=max(0.5e-3, span / 120), margin=max(2e-3, span / 40))
     return Part(name, TouchShape(name, "grid", grid), np.array([1.0, 0.0, 0.0]))
-
-
-def _corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Points [P, 3] whose convex hull is a geom's, nearly so where it is round, in the frame of its body."""
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-    t = mujoco.mjtGeom
-    sphere = np.array([[np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)]
-                       for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
-                       for b in np.linspace(-np.pi / 2, np.pi / 2, 13)])  # fmt: skip
-    if kind == t.mjGEOM_MESH:
-        m = model.geom_dataid[geom]
-        points = model.mesh_vert[model.mesh_vertadr[m] : model.mesh_vertadr[m] + model.mesh_vertnum[m]].astype(float)
-    elif kind == t.mjGEOM_BOX:
-        points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
-    elif kind == t.mjGEOM_SPHERE:
-        points = size[0] * sphere
-    elif kind == t.mjGEOM_ELLIPSOID:
-        points = size * sphere
-    elif kind == t.mjGEOM_CAPSULE:
-        points = np.concatenate([size[0] * sphere + [0, 0, z] for z in (-size[1], size[1])])
-    elif kind == t.mjGEOM_CYLINDER:
-        a = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        ring = size[0] * np.stack([np.cos(a), np.sin(a), 0 * a], 1)
-        points = np.concatenate([ring + [0, 0, z] for z in (-size[1], size[1])])
-    else:
-        raise UserError(f"scene: geom {model.geom(geom).name or geom} is a {kind.name[7:].lower()}, which is not felt")
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, model.geom_quat[geom])
-    return points @ mat.reshape(3, 3).T + model.geom_pos[geom]

@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 TABLE, ARM = np.array([0.62, 0.66, 0.71, 1.0]), np.array([0.35, 0.38, 0.42, 1.0])
 PUSH = np.array([0.88, 0.15, 0.13, 1.0])
@@ -19,13 +20,7 @@ FULL_TAXEL = 0.25  # N, of the brightest taxel
 
 def turn_down(gravity: np.ndarray) -> np.ndarray:
     """Return the rotation [3, 3] that takes a direction of gravity [3] to straight down."""
-    down = gravity / max(float(np.linalg.norm(gravity)), 1e-9)
-    axis, cosine = np.cross(down, [0.0, 0.0, -1.0]), float(-down[2])
-    if np.linalg.norm(axis) < 1e-9:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + cosine)
+    return Rotation.align_vectors([[0.0, 0.0, -1.0]], [gravity if np.any(gravity) else [0.0, 0.0, -1.0]])[0].as_matrix()
 
 
 class Decor:

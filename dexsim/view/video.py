@@ -53,6 +53,16 @@ class NoRenderer(UserError):
     """No OpenGL backend works on this machine."""
 
 
+def drawn(draw: Callable[[], object], say: Callable[[str], object] = print, what: str = "") -> bool:
+    """Return whether something could be drawn; where no OpenGL works, that is said, and all else stands without it."""
+    try:
+        draw()
+    except NoRenderer as error:
+        say(f"{what}{error}")
+        return False
+    return True
+
+
 def clips_of(frames: dict[str, Any]) -> list[Clip]:
     """Return the clips from the ``frames`` of ``env.evaluate``: lists ``model``, ``qpos`` and, where there are any,
     ``overlay`` (dicts with ``force``, ``command``, ``text``, ``push``, ``taxels``, ``layout``, ``gravity``) and

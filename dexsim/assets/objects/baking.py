@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -17,14 +17,20 @@ UNIT = 2e-6  # m, step of the stored distances (16 bits reach 65 mm)
 
 def bake_grid(hulls: Sequence[np.ndarray], spacing: float = SPACING, margin: float = MARGIN) -> Grid:
     """Return the grid of exact distances to the union of `hulls`, rounded to `UNIT`."""
+    return sampled(lambda points: np.round(signed_distance(hulls, points) / UNIT) * UNIT, hulls, spacing, margin)
+
+
+def sampled(
+    distance: Callable[[np.ndarray], np.ndarray], hulls: Sequence[np.ndarray], spacing: float, margin: float
+) -> Grid:
+    """Return a grid of distance(points [P, 3]) [P] m around hulls [V, 3]."""
     points = np.concatenate(hulls)
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     shape = np.ceil((high - low) / spacing).astype(int) + 1
     origin = (low + high) / 2 - spacing * (shape - 1) / 2
     axes = [origin[k] + spacing * np.arange(shape[k]) for k in range(3)]
     samples = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    data = np.round(signed_distance(hulls, samples) / UNIT).reshape(shape) * UNIT
-    return Grid(origin, spacing, data.astype(np.float32))
+    return Grid(origin, spacing, distance(samples).reshape(shape).astype(np.float32))
 
 
 def grid_error(hulls: Sequence[np.ndarray], grid: Grid, band: float = 2e-3, n: int = 4000) -> tuple[float, float]:

@@ -4,11 +4,12 @@ surface. (`geometry.signed_distance` is exact, for a few hulls that overlap wher
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from dexsim.assets.objects.baking import MARGIN
+from dexsim.assets.objects.baking import MARGIN, sampled
 from dexsim.assets.objects.shape import Grid
 from dexsim.surface import across, spread
 
@@ -62,13 +63,7 @@ def boundary(hulls: Sequence[np.ndarray], step: float, seed: int = 0) -> np.ndar
 
 def grid(hulls: Sequence[np.ndarray], spacing: float, margin: float = MARGIN) -> Grid:
     """Return the grid of `distance`."""
-    points = np.concatenate(hulls)
-    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-    shape = np.ceil((high - low) / spacing).astype(int) + 1
-    origin = (low + high) / 2 - spacing * (shape - 1) / 2
-    axes = [origin[k] + spacing * np.arange(shape[k]) for k in range(3)]
-    samples = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return Grid(origin, spacing, distance(hulls, samples).reshape(shape).astype(np.float32))
+    return sampled(partial(distance, hulls), hulls, spacing, margin)
 
 
 def grid_error(hulls: Sequence[np.ndarray], baked: Grid, band: float = 2e-3, n: int = 4000) -> tuple[float, float]:
