@@ -4,7 +4,9 @@ place and renamed, so that a kill leaves what was; what it leaves unfinished goe
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
+import math
 import os
 import re
 import shutil
@@ -13,11 +15,11 @@ import stat
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dexsim import guard, system
+from dexsim import guard, system, typed
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
@@ -67,6 +69,37 @@ def text(path: Path, what: str, most: int = MAX_TEXT, other: str | None = None) 
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise UserError(f"{what} {path} is not UTF-8 text (byte {error.start})") from None
+
+
+def table(
+    path: Path, what: str, needs: Sequence[str], also: Sequence[str] = (), words: Collection[str] = (),
+    whole: bool = False,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Return columns [n] of a CSV file by name: those that it `needs`, and of `also` those that are there (whole: all
+    or none, and no others); finite numbers, texts of `words`. Lines that begin with # are left out. Raises UserError,
+    with the column or the line."""
+    import numpy as np
+
+    lines = [(k, s) for k, s in enumerate(text(path, what).splitlines(), 1) if s.strip() and not s.startswith("#")]
+    head, *rows = csv.reader(s for _, s in lines) if lines else [[]]
+    has = [name.strip() for name in head]
+    if whole and has not in ([*needs], [*needs, *also]):
+        fits = f"must be {','.join(needs)} or {','.join((*needs, *also))}"
+        raise UserError(f"{what} {path}: columns {', '.join(has) or 'none'}; {fits}")
+    if missing := [name for name in needs if name not in has]:
+        raise UserError(f"{what} {path}: no column {', '.join(missing)}; needed: {', '.join(needs)};"
+                        f" it has: {', '.join(has) or 'none'}")  # fmt: skip
+    out = {}
+    for k, name in enumerate(has):
+        if name in (*needs, *also):
+            out[name] = cells = np.array([row[k] if k < len(row) else "" for row in rows], object)
+            if name in words:
+                continue
+            for (line, _), cell in zip(lines[1:], cells, strict=True):
+                if not math.isfinite(typed.real(cell)):
+                    raise UserError(f"{what} {path}: line {line}: {name} is {cell!r}, must be a finite number")
+            out[name] = cells.astype(float)
+    return out
 
 
 def mapping(path: Path, what: str, most: int = MAX_TEXT) -> dict[str, Any]:

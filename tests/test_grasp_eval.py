@@ -201,7 +201,7 @@ def test_the_hand_is_carried_along_a_path_of_ones_own(tmp_path):
 @pytest.mark.parametrize("rows, head, said", [
     ("0,0,0,0\n1,0,0,0\n2,0,0,0", "t,x,y,z", "3 rows; at least 4"),
     ("0,0,0\n1,0,0", "t,x,y", "columns t, x, y; must be t,x,y,z"),
-    ("0,0,0,0\n1,0,0,up\n2,0,0,0\n3,0,0,0", "t,x,y,z", "line 3 has something else than 4 finite numbers"),
+    ("0,0,0,0\n1,0,0,up\n2,0,0,0\n3,0,0,0", "t,x,y,z", "line 3: z is 'up', must be a finite number"),
     ("0,0,0,0\n1,0,0,0\n1,0,0,0\n3,0,0,0", "t,x,y,z", "column t must begin at 0, grow"),
     ("0,0,0,0\n1,0,0,300\n2,0,0,300\n3,0,0,300", "t,x,y,z", "m/s2 at t = .* allowed 100"),
     ("0,0,0,0,0,0,0\n1,0,0,0,0,3,0\n2,0,0,0,0,0,0\n3,0,0,0,0,0,0", "t,x,y,z,rx,ry,rz", "rad/s at t = .* allowed 2.5"),

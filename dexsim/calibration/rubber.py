@@ -7,7 +7,6 @@ mooney_rivlin).
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +14,6 @@ import numpy as np
 
 from dexsim import files
 from dexsim.errors import UserError
-
-"""Of a curve's file."""
 
 TRELOAR_1944 = np.array([
     [1.000, 0.00], [1.020, 0.26], [1.125, 1.37], [1.240, 2.30], [1.390, 3.23], [1.585, 4.16], [1.900, 5.10],
@@ -150,14 +147,9 @@ def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
     if str(path) == "treloar":
         return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()
-    lines = files.text(path, "curve=").splitlines()
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    for kind, names in (("press", ("depth_m", "force_N")), ("stress", ("stretch", "stress_Pa"))):
-        if rows and set(names) <= set(rows[0]):
-            try:
-                x, y = (np.array([float(r[n]) for r in rows]) for n in names)
-                return kind, x, y
-            except (TypeError, ValueError):
-                raise UserError(f"curve={path}: {names[0]} and {names[1]} must be numbers in every row") from None
-    has = ", ".join(rows[0]) if rows else "no rows"
-    raise UserError(f"curve={path}: needs the columns depth_m, force_N or stretch, stress_Pa; it has {has}")
+    kinds = {"press": ("depth_m", "force_N"), "stress": ("stretch", "stress_Pa")}
+    found = files.table(path, "curve", (), [name for names in kinds.values() for name in names])
+    for kind, names in kinds.items():
+        if set(names) <= found.keys():
+            return kind, found[names[0]], found[names[1]]
+    raise UserError(f"curve={path}: needs the columns depth_m, force_N or stretch, stress_Pa")

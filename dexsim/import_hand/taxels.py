@@ -112,25 +112,15 @@ def _smooth(normals: np.ndarray, rows: int, columns: int) -> np.ndarray:
 def read(path: Path) -> dict[str, Pad]:
     """Return a person's taxels: columns finger, x, y, z [m], nx, ny, nz in the tip body's frame, and area [m2] where it
     is known. Raises UserError, with the line."""
-    rows = list(csv.DictReader(io.StringIO(files.text(path, "taxels"))))
     need = ("finger", "x", "y", "z", "nx", "ny", "nz")
-    missing = [c for c in need if not rows or c not in rows[0]]
-    if missing:
-        raise UserError(
-            f"taxels {path}: no column {', '.join(missing)}; needed: {', '.join(need)} (m, tip body's frame)"
-        )
-    by: dict[str, list[list[float]]] = {}
-    for line, row in enumerate(rows, 2):
-        try:
-            values = [float(row[c]) for c in need[1:]] + [float(row.get("area") or 0.0)]
-        except (TypeError, ValueError):
-            raise UserError(f"taxels {path}: line {line}: x ... nz must be numbers") from None
-        if not np.isfinite(values).all() or np.linalg.norm(values[3:6]) < 1e-6:
-            raise UserError(f"taxels {path}: line {line}: must be finite, the normal with a length")
-        by.setdefault(str(row["finger"]), []).append(values)
+    found = files.table(path, "taxels", need, ("area",), ("finger",))
+    found.setdefault("area", np.zeros(len(found["x"])))
+    every = np.stack([found[c] for c in (*need[1:], "area")], 1)
+    if not len(every) or (np.linalg.norm(every[:, 3:6], axis=1) < 1e-6).any():
+        raise UserError(f"taxels {path}: has no lines, or one whose nx, ny, nz are all 0: a normal must have a length")
     out = {}
-    for finger, lines in by.items():
-        table = np.array(lines)
+    for finger in dict.fromkeys(found["finger"].tolist()):
+        table = every[found["finger"] == finger]
         normal = unit(table[:, 3:6])
         helper = np.eye(3)[np.abs(normal.mean(0)).argmin()]
         tangent = unit(np.cross(np.cross(normal, helper), normal))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -195,9 +193,8 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     ignored. Lines that begin with # are comments. Returns a dict for `TaxelLayout.build`.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"taxel file {path}: not found")
-    point, normal, tx, area = (None if x is None else x.copy() for x in _columns(path, files.text(path, "taxel file")))
+    files.check(path, "taxel file")
+    point, normal, tx, area = (None if x is None else x.copy() for x in _columns(path, path.stat().st_mtime_ns))
     return {
         "name": name or path.stem,
         "body": body,
@@ -205,41 +202,21 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
         "point": point,
         "normal": normal,
         "tx": tx,
-        "area": None if area is None else area[:, 0],
+        "area": area,
     }
 
 
 @lru_cache(maxsize=32)  # fingers share a file, and environments of a process a hand
-def _columns(path: Path, text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return points and normals [n, 3], directions [n, 3] and areas [n, 1] of a taxel file's text. Raises
+def _columns(path: Path, stamp: int) -> list[np.ndarray | None]:
+    """Return points, normals and directions [n, 3] and areas [n] of a taxel file; None where it has none. Raises
     UserError."""
-    lines = [s for s in text.splitlines() if s.strip() and not s.startswith("#")]
-    rows = list(csv.DictReader(lines))
-    if not rows:
+    needs, also = ("x", "y", "z", "nx", "ny", "nz"), ("tx", "ty", "tz", "area")
+    found = files.table(path, "taxel file", needs, also)
+    if not len(found["x"]):
         raise UserError(f"taxel file {path}: no taxels in it; expected a header line and one line a taxel")
-    header = set(rows[0])
-
-    def read(names: Sequence[str], needed: bool) -> np.ndarray | None:
-        missing = [n for n in names if n not in header]
-        if missing:
-            if needed:
-                has = ", ".join(sorted(h for h in header if h))
-                raise UserError(f"taxel file {path}: column '{missing[0]}' is missing; it has: {has}")
-            return None
-        out = np.zeros((len(rows), len(names)))
-        for i, row in enumerate(rows):
-            for j, n in enumerate(names):
-                try:
-                    out[i, j] = float(row[n])
-                except (TypeError, ValueError):
-                    raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]!r}, not a number") from None
-                if not math.isfinite(out[i, j]):
-                    raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]}, must be finite")
-        return out
-
-    point, normal = read(["x", "y", "z"], True), read(["nx", "ny", "nz"], True)
-    assert point is not None and normal is not None
-    return point, normal, read(["tx", "ty", "tz"], False), read(["area"], False)
+    parts = needs[:3], needs[3:], also[:3]
+    out = [np.stack([found[n] for n in names], 1) if set(names) <= found.keys() else None for names in parts]
+    return [*out, found.get("area")]
 
 
 def hand_layout(hand: Hand) -> TaxelLayout | None:

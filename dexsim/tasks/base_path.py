@@ -11,8 +11,6 @@ vector from the start], along the axes that the palm frame has at the start: x a
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,26 +101,12 @@ def along(path: Path) -> tuple[Callable[[float], np.ndarray], float]:
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [K], places [K, 3], rotation vectors [K, 3]."""
     where = f"task.evaluation.base={path}"
-    rows = csv.DictReader(io.StringIO(files.text(path, "path of the base")))
-    known, have = ("t", "x", "y", "z", "rx", "ry", "rz"), [str(c).strip() for c in rows.fieldnames or ()]
-    if have not in ([*known], [*known[:4]]):
-        raise UserError(
-            f"{where}: columns {', '.join(have) or 'none'}; must be t,x,y,z or t,x,y,z,rx,ry,rz (s, m, rad)"
-        )
-    values = []
-    for k, row in enumerate(rows):
-        try:
-            values.append([float(v) for v in row.values()])
-            good = len(values[-1]) == len(have) and bool(np.isfinite(values[-1]).all())
-        except (TypeError, ValueError):
-            good = False
-        if not good:
-            raise UserError(f"{where}: line {k + 2} has something else than {len(have)} finite numbers")
-    if len(values) < LEAST_ROWS:
-        raise UserError(f"{where}: {len(values)} rows; at least {LEAST_ROWS}")
-    table = np.array(values)
-    t = table[:, 0]
+    known = ("t", "x", "y", "z", "rx", "ry", "rz")
+    found = files.table(path, "path of the base", known[:4], known[4:], whole=True)
+    t = found["t"]
+    if len(t) < LEAST_ROWS:
+        raise UserError(f"{where}: {len(t)} rows; at least {LEAST_ROWS}")
     if t[0] != 0 or (np.diff(t) <= 0).any() or t[-1] > MOST_S:
         raise UserError(f"{where}: column t must begin at 0, grow with every row, and end by {MOST_S:g} s")
-    x = table[:, 1:4]
-    return t, x, table[:, 4:] if len(have) > 4 else np.zeros_like(x)
+    x, turn = (np.stack([found.get(c, np.zeros(len(t))) for c in part], 1) for part in (known[1:4], known[4:]))
+    return t, x, turn
