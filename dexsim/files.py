@@ -169,6 +169,15 @@ def beside(path: Path) -> Iterator[Path]:
         _remove(part)
 
 
+def write(path: Path, content: str, what: str) -> None:
+    """Write a text file, replacing the old one only once the new one is whole. Raises UserError, which names `what`."""
+    try:
+        with beside(path) as part:
+            part.write_text(content, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be written: {error.strerror}") from None
+
+
 def picture(figure: Any, path: Path, dpi: float | str = "figure") -> None:
     """Save a matplotlib figure in the format of the path's ending; it is empty afterwards.
 

@@ -208,11 +208,7 @@ def main(argv: list[str]) -> int:
         table = ServoTable.load(Path(own["in"]).expanduser())
         data = to_bam(table, own["joint"], number("armature", 0.0), own["actuator"])
         content, note = json.dumps(data, indent=2) + "\n", f"kp {table.value(own['joint'], 'kp').value:g} duty per rad"
-    try:
-        with files.beside(out) as part:
-            part.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"out={out}: cannot be written: {error.strerror}") from None
+    files.write(out, content, "out=")
     print(f"written  {out}; {note}")
     return 0
 

@@ -159,12 +159,7 @@ class ServoTable:
 
     def save(self, path: str | Path) -> None:
         """Writes the table as a `servo.yaml`, replacing the file only once the new one is complete."""
-        path = Path(path)
-        try:
-            with files.beside(path) as part:
-                part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, width=120), encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"servo file '{path}' cannot be written: {error}.") from None
+        files.write(Path(path), yaml.safe_dump(self.to_dict(), sort_keys=False, width=120), "servo file")
 
     # -- what holds for a joint ------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from dexsim import typed
+from dexsim.cli import help as help_page
 from dexsim.console import program
 from dexsim.errors import UserError
 
@@ -302,18 +303,11 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
 
 def _help(file: Path) -> str:
     what = "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml."
-    lines = ["usage: dexsim calibrate key=value ...", "", what, ""]
-    for line in file.read_text(encoding="utf-8").splitlines():
-        if ":" in line and not line.startswith("#"):
-            setting, _, comment = line.partition("  # ")
-            key, _, value = setting.partition(": ")
-            lines.append(f"  {key + '=' + value:<34} {comment}")
-    return "\n".join(
-        [
-            *lines,
-            "  meta.KEY=VALUE                     metadata that wins over what real= and touch= recordings say",
-            "  units.QUANTITY=UNIT                units of real= and touch=, as `dexsim audit` takes them",
-            "  remap.OURS=THEIRS                  names of topics, joints or columns there",
-            "",
-        ]
-    )
+    rows = [(f"{key}={value}", comment) for key, value, comment in help_page.settings(file)]
+    rows += [
+        ("meta.KEY=VALUE", "metadata that wins over what real= and touch= recordings say"),
+        ("units.QUANTITY=UNIT", "units of real= and touch=, as `dexsim audit` takes them"),
+        ("remap.OURS=THEIRS", "names of topics, joints or columns there"),
+    ]
+    lines = [f"  {setting:<34} {comment}" for setting, comment in rows]
+    return "\n".join(["usage: dexsim calibrate key=value ...", "", what, "", *lines, ""])

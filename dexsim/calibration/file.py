@@ -216,12 +216,7 @@ def save(path: str | Path, content: dict[str, Any], hand: Hand | None = None) ->
     """Write a calibration file, replacing the old one only once the new one is whole; it must load. hand: whose (the
     xHand)."""
     Calibration.from_dict(content, str(path), hand=hand)
-    path = Path(path)
-    try:
-        with files.beside(path) as part:
-            part.write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    files.write(Path(path), yaml.safe_dump(content, sort_keys=False, width=120), "calibration")
 
 
 def _content(raw: Any, where: str, hand: Hand) -> Content:

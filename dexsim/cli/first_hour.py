@@ -274,12 +274,11 @@ class Hour:
                 self.amps[j] = min(2 * self.amps[j], self.most)
                 self.s.move(_still(goal), took, self.amps)
             self.s.move(_still(goal), took, self.amps)
-            rose = a.position[-1, j] - c.position[-1, j]
             moving = np.abs(np.gradient(a.target[:, j])) > 1e-4
             push = float(np.median(a.current[moving, j])) if moving.any() else 0.0
             span = a.position[-1, j] - c.position[-1, j]
             name = self.hand.joints[j]
-            good = rose > 0.5 * reach and span > reach
+            good = span > reach
             ends = [float(c.position[-1, j]), float(a.position[-1, j])]
             for k, end in enumerate((low, high) if good else ()):  # as far as it goes, from the middle
                 to, far = goal.copy(), abs(end - goal[j]) / SPEED
@@ -290,7 +289,7 @@ class Hour:
                           "limit_mA": float(self.amps[j]), "reached_rad": ends}  # fmt: skip
             if not good:
                 step.verdict = "bad"
-                why = "the wrong way" if rose < -0.5 * reach else f"{abs(span):.2f} of {2 * reach:.2f} rad"
+                why = "the wrong way" if span < -0.5 * reach else f"{abs(span):.2f} of {2 * reach:.2f} rad"
                 step.text.append(f"{name} went {why}: is it free, and its order in the hand's file right?")
         step.text = step.text or [f"all {len(rows)} joints follow their targets, the right way"]
         short = []

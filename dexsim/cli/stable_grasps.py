@@ -36,7 +36,7 @@ def tasks() -> dict[str, tuple[str, list[float]]]:
     return {carries: (name, list(edges)) for name, (carries, edges) in held.items()}
 
 
-USUAL = {"out": "out/stable_grasps.npz", "count": "2000", "worlds": "256", "seed": "0", "sizes": "", "hold": "palm"}
+USUAL = typed.defaults(USAGE) | {"sizes": ""}
 
 
 def main(argv: list[str]) -> int:

@@ -6,7 +6,6 @@ Hydra's grammar expands the lists; each run is `dexsim train` in a process of it
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 import os
@@ -110,22 +109,22 @@ def _tasks(runs: list[list[str]], config_dir: Path) -> list[str]:
 def _collect(folder: Path) -> tuple[list[tuple], bool]:
     """Return a row for each job: name, settings, status, iterations, last step reward, seconds; and whether one
     failed."""
+    from dexsim.view.plots import read_progress
+
     rows, failed = [], False
     notes = sorted(folder.glob("jobs/*.json"), key=lambda p: int(p.stem))
     jobs_run = [json.loads(note.read_text("utf-8")) for note in notes]
     typed = [[x for x in note["commands"][0][1:] if not x.startswith("out=")] for note in jobs_run]
     common = set.intersection(*map(set, typed)) if len(jobs_run) > 1 else set()
     for note, job, own in zip(notes, jobs_run, typed):
-        progress: list[dict[str, str]] = []
-        if (run := folder / note.stem / "progress.csv").exists():
-            with open(run, newline="", encoding="utf-8") as file:
-                progress = list(csv.DictReader(file))
-        last = progress[-1] if progress else {}
-        tail = [float(r["step_reward"]) for r in progress[-10:]]
+        run = folder / note.stem / "progress.csv"
+        progress = read_progress(run) if run.exists() else {}
+        tail = progress.get("step_reward", [])[-10:]
         rows.append(
             (
-                note.stem, " ".join(x for x in own if x not in common), job["status"], int(last.get("iteration", 0)),
-                sum(tail) / len(tail) if tail else float("nan"), job["seconds"],
+                note.stem, " ".join(x for x in own if x not in common), job["status"],
+                int(progress["iteration"][-1]) if tail else 0, sum(tail) / len(tail) if tail else float("nan"),
+                job["seconds"],
             )
         )
         failed |= job["status"] != 0

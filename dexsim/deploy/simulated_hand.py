@@ -8,13 +8,11 @@ place.
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from dexsim import system
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
 from dexsim.deploy.fake_xhand import FakeXHand, Faults
@@ -269,8 +267,7 @@ class SimulatedCamera:
     """A depth camera beside the hand: MuJoCo's offscreen depth and segmentation of the object, 160 x 120 pixels.
 
     It looks along the palm's plane from the fingers' side, a little from above, so that the mask's centroid is at the
-    height of the object's middle. Needs OpenGL, chosen by MUJOCO_GL before MuJoCo is imported
-    (`choose_gl`); raises UserError without.
+    height of the object's middle. Raises UserError where no OpenGL opens.
     """
 
     WIDTH, HEIGHT, FOVY = 160, 120, 45.0
@@ -278,19 +275,15 @@ class SimulatedCamera:
     def __init__(self, env: Any):
         import mujoco
 
+        from dexsim.view.frames import renderer
+
         self._mujoco, self._env = mujoco, env
         self._model = env.drawn_model(0)
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self.WIDTH, self.HEIGHT
         self._model.vis.global_.fovy = self.FOVY
         self._data = mujoco.MjData(self._model)
         self._geoms = [self._model.geom(s).id for s in env.objects.scene.slots]
-        try:
-            self._renderer = mujoco.Renderer(self._model, self.HEIGHT, self.WIDTH)
-        except Exception as error:  # whatever a driver raises
-            raise UserError(
-                f"vision=camera: no OpenGL for offscreen rendering ({str(error).splitlines()[0]});"
-                f" {system.no_renderer()}; or use vision=truth"
-            ) from None
+        self._renderer = renderer(self._model, self.HEIGHT, self.WIDTH)
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = [0.05, 0.0, 0.05]
         self._view.distance, self._view.azimuth, self._view.elevation = 0.45, 200.0, -12.0
@@ -331,15 +324,6 @@ class SimulatedCamera:
         from dexsim.deploy.vision import centroid
 
         return centroid(self.frame(), self.pose)
-
-
-def choose_gl() -> str:
-    """Return the OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start. Raises
-    UserError where there is none."""
-    if (name := system.renderer()) is not None:
-        os.environ.update(system.renderer_environment(name))
-        return name
-    raise UserError(f"vision=camera: no OpenGL for offscreen rendering; {system.no_renderer()}; or use vision=truth")
 
 
 # -- the driver
@@ -411,7 +395,7 @@ class SimulatedXHand(BusDriver):
         camera: bool = False, shape: str | None = None, grip: dict[str, Any] | None = None, hang: float = HANG,
     ):  # fmt: skip
         registry.task_class(config)  # refused here where nobody that may has named it
-        self._camera, hand = camera, hand_of(config)
+        hand = hand_of(config)
         make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip))
         super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
 
@@ -420,11 +404,6 @@ class SimulatedXHand(BusDriver):
         """The hand itself, where it lives in this process."""
         assert isinstance(self.body, SimulatedBody)
         return self.body.hand
-
-    def open(self) -> dict[str, str]:
-        if self._camera and type(self.clock) is Clock:
-            choose_gl()
-        return super().open()
 
 
 def faked(
@@ -437,8 +416,6 @@ def faked(
     side = hand_of(config).handedness
     text = faults if "side=" in faults else f"side={side[0].upper()}," + faults
     package = fake_package(config, calibration, text, seed, camera, shape, grip)
-    if camera and clock is None:
-        choose_gl()
     driver = VendorXHand("auto", clock, package, serial, side, hang)
     driver.start = 180.0  # kernels compile on a first start
     return driver
