@@ -15,6 +15,7 @@ from dexsim import files, guard
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, readers, schema, timeline
+from dexsim.recording.audit import audit as find_faults
 from dexsim.recording.container import BAGS, Container, open_container
 from dexsim.recording.samples import JointRows, JointSample, Reader, Trajectory
 from dexsim.recording.schema import Finding, Recording, Series, States
@@ -107,9 +108,6 @@ def _read(
         limits = dict(zip(known.joints, known.limits.tolist(), strict=True)) | dict(limits or {})
     recording = reading.build(stated, joints, Units(units, limits, str(path), modelled))
     if audit:
-        # here, so that `python -m dexsim.recording.audit` does not find its module loaded by the package
-        from dexsim.recording.audit import audit as find_faults
-
         recording.findings += find_faults(recording)
     return recording
 

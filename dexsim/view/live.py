@@ -186,49 +186,32 @@ class LiveView:
             },
         )
 
-        @pause.on_update
-        def _(_: Any) -> None:
-            w.pause = bool(pause.value)
-            w.changed.set()
-
-        @buttons.on_click
-        def _(_: Any) -> None:
-            steps = BUTTONS.get(buttons.value)
-            if steps == 0:
-                w.restart = True
-            elif steps is not None:
-                w.pause = pause.value = True
-                w.steps = min(w.steps + steps, MOST_STEPS)
-            w.changed.set()
-
-        @speed.on_click
-        def _(_: Any) -> None:
-            w.speed = speed.value if speed.value in SPEEDS else w.speed
-            w.changed.set()
-
-        @world.on_update
-        def _(_: Any) -> None:
-            w.world = int(min(max(world.value, 0), self.env.num_envs - 1))
-            w.changed.set()
-
-        @policy.on_update
-        def _(_: Any) -> None:
-            w.policy = policy.value if policy.value in choices else None
-            w.changed.set()
-
-        @at.on_update
-        def _(_: Any) -> None:
-            names = self._names
-            if names:
-                w.policy = names[int(min(max(at.value, 0), len(names) - 1))]
+        def on(wish: str, value: Callable[[], Any]) -> Callable[[Any], None]:
+            def told(_: Any) -> None:
+                setattr(w, wish, value())
                 w.changed.set()
 
-        @own.on_update
-        @command.on_update
-        def _(_: Any) -> None:
+            return told
+
+        def pressed() -> int:
+            steps = BUTTONS[buttons.value]
+            w.restart |= not steps
+            if steps:
+                w.pause = pause.value = True
+            return min(w.steps + steps, MOST_STEPS)
+
+        def commanded() -> float | None:
             command.disabled = not own.value
-            w.command = min(max(float(command.value), 0.0), 1.0) if own.value else None
-            w.changed.set()
+            return float(command.value) if own.value else None
+
+        pause.on_update(on("pause", lambda: bool(pause.value)))
+        buttons.on_click(on("steps", pressed))
+        speed.on_click(on("speed", lambda: speed.value))
+        world.on_update(on("world", lambda: min(int(world.value), self.env.num_envs - 1)))
+        policy.on_update(on("policy", lambda: policy.value))
+        at.on_update(on("policy", lambda: self._names[: int(at.value) + 1][-1] if self._names else None))
+        own.on_update(on("command", commanded))
+        command.on_update(on("command", commanded))
 
     def _show_world(self) -> None:
         """Show the meshes of the chosen world: the hand once, the object anew (its shape differs by world and

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
@@ -80,11 +81,9 @@ def _order(name: str) -> tuple[int, str]:
 
 def smooth(values: Sequence[float], width: int) -> list[float]:
     """Mean of each value and up to ``width - 1`` before it."""
-    total, out = 0.0, []
-    for i, value in enumerate(values):
-        total += value - (values[i - width] if i >= width else 0.0)
-        out.append(total / min(i + 1, width))
-    return out
+    total, ends = np.cumsum([0.0, *values]), np.arange(1, len(values) + 1)
+    begins = np.maximum(ends - width, 0)
+    return list((total[ends] - total[begins]) / (ends - begins))
 
 
 def draw(functions: Sequence[Any], folder: Path) -> list[Path]:
