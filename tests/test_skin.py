@@ -245,7 +245,7 @@ def test_entries_that_do_not_fit_the_hand_are_one_line(tmp_path):
             ({"body": "hall"}, True, r"skin.back.body \(hall\): no link .* did you mean hull"),
             ({"name": "a"}, True, "skin and fingers: 'a' twice"),
             ({}, False, "skin: needs pads on the fingertips"),
-            ({"taxels": "none.csv"}, True, "none.csv: not found"),
+            ({"taxels": "none.csv"}, True, "none.csv does not exist"),
         )
     ):
         with pytest.raises(UserError, match=said) as caught:
