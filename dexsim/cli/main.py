@@ -110,8 +110,8 @@ def dispatch(argv: list[str]) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     module, _, function = COMMANDS[name].where.partition(":")
     loaded, given = importlib.import_module(module), door.take(argv[1:])
-    asked = any(a in HELP for a in given) and given[0] not in PARTS if given else not COMMANDS[name].bare
-    if asked and (page := getattr(loaded, "USAGE", None)) is not None:
+    wants_page = any(a in HELP for a in given) and given[0] not in PARTS if given else not COMMANDS[name].bare
+    if wants_page and (page := getattr(loaded, "USAGE", None)) is not None:
         print(program.words(page), end="")
         return 0 if given else 2
     status: int = getattr(loaded, function)(given)

@@ -187,11 +187,11 @@ class LiveView:
         )
 
         def on(wish: str, value: Callable[[], Any]) -> Callable[[Any], None]:
-            def told(_: Any) -> None:
+            def answer(_: Any) -> None:
                 setattr(w, wish, value())
                 w.changed.set()
 
-            return told
+            return answer
 
         def pressed() -> int:
             steps = BUTTONS[buttons.value]
