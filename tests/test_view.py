@@ -117,6 +117,14 @@ def test_unwritable_video_is_an_error(tmp_path):
         video.render([clip(2)], tmp_path / "dir.mp4", dt=0.05, size=(64, 64))
 
 
+def test_the_rendering_process_loads_neither_torch_nor_warp():
+    code = (
+        "import sys; from dexsim.view import decor, live_panels, overlay, render;"
+        " assert not {'torch', 'warp'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_tiles_fill_a_grid():
     tiles = [np.full((4, 6, 3), k, np.uint8) for k in range(1, 6)]
     whole = render.grid(tiles)

@@ -50,7 +50,9 @@ def straighten(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, float]:
             bent[name] = off
             continue
         _replace(spec, old, [m.joint(j).name for j in moved], arms)
-        along = ", ".join(f"{1e3 * c:.2f} mm/rad of {m.joint(j).name}" for j, c in zip(moved, arms, strict=False))
+        units = ["mm/m" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE else "mm/rad" for j in moved]
+        along = ", ".join(f"{1e3 * c:.2f} {unit} of {m.joint(j).name}"
+                          for j, c, unit in zip(moved, arms, units, strict=False))  # fmt: skip
         notes.append(f"tendon '{name}' is routed over sites or geoms: taken as {along}; its length is off by at most"
                      f" {100 * off:.1f} % of its travel")  # fmt: skip
     if idle:

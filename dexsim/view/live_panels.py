@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dexsim.tactile.layout import TaxelLayout
+if TYPE_CHECKING:  # it would bring torch and Warp, three seconds of a film's process
+    from dexsim.tactile.layout import TaxelLayout
 
 PAD_WIDTH, PAD_HEIGHT, GAP = 72, 72, 6  # pixels of one fingertip's map
 BACKGROUND = np.array([246, 247, 249], np.uint8)
