@@ -81,7 +81,7 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
             elif group == "large":
                 entry |= {"shape": "hand", "tier": "easy"}
             elif group == "spatial":
-                entry["shape"] = rigs.SPATIAL[k % len(rigs.SPATIAL)]
+                entry["shape"] = rigs.SPATIAL[(k + k // len(rigs.SPATIAL)) % len(rigs.SPATIAL)]  # each with each tier
                 if k % 3 == 2:
                     names = BY_EFFECT[effects[k // 3 % len(effects)]]
                     entry |= {"kinds": [names[k // 3 // len(effects) % len(names)]], "tier": tiers[k // 3 % 2]}
