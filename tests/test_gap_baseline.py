@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.read import Run
@@ -185,6 +186,8 @@ def test_a_velocity_loop_is_a_setting(monkeypatch):
     monkeypatch.setitem(globals(), "BELIEVED", loop)
     true = {"kd": 0.31, "speed_feedforward": 0.31}
     case = case_of(*(moved(None, seed=k, **true) for k in (0, 1)))
+    (gains,) = EFFECTS["gain_mismatch"].variants(case.scales)
+    assert [p.key for p in gains.params] == ["kd_factor"]  # of a kp that is 0 there is no factor
     plain = baseline.judged(case, baseline.fitted(case, [0]), [1])
     assert plain.value["kd"] == pytest.approx(0.31, rel=0.1) and plain.error < 0.2 * plain.error_before
     baseline.write(plain, table, mujoco.MjSpec.from_string(PENDULUM))

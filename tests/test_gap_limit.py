@@ -10,6 +10,7 @@ from dexsim.gap.compute import GRACE, JUDGING, PAGE, TimeLimit
 from dexsim.gap.diagnosis import PLANNING, STANDING_IN, Drives
 from dexsim.gap.inquiry import Inquiry, Settings
 from dexsim.gap.judge import full_model
+from dexsim.gap.judge.conclude import Noise
 from dexsim.gap.plant.case import build
 from dexsim.gap.search import baseline
 from dexsim.gap.search.search import JointSearch, SearchedJoint
@@ -173,7 +174,7 @@ def test_no_replay_and_no_plan_in_the_last_moment(spent, seconds, clock, monkeyp
         clock=SimpleNamespace(lap=lambda _: None),
     )
     drives.parts = SimpleNamespace(test=[1], span_test=None)
-    drives.searched, drives.noise = [], SimpleNamespace(joints={"j": 1.0})
+    drives.searched, drives.noise = [], Noise(1.0, "split", {"j": 1.0})
     drives.by_torque, drives.stages, drives.answers, drives.plains = [], [], [], []
     clock[0] = seconds * spent
     drives.write()

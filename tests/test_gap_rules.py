@@ -381,6 +381,13 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
 
+def test_a_motion_has_the_floor_of_its_own_repeats():
+    """Ramps that repeat to 0.1 are not as good as anything within the 4 that all motions together differ by."""
+    floor = conclude.Noise(4.0, "repeats", {"a": 4.0}, {0: {"a": 0.1}, 1: {"a": 8.0}})
+    assert floor.of([0]) == pytest.approx({"a": 0.1}) and floor.of([2]) == floor.of([]) == {"a": 4.0}
+    assert floor.of([0, 1])["a"] == pytest.approx(8.0 / np.sqrt(2), rel=1e-3)
+
+
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
     """Return what a search of a joint ended with, at `loss`; and now, with what is known of the others."""
     one = SimpleNamespace(members=members, fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)))

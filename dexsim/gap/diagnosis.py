@@ -580,7 +580,7 @@ class Drives(Steps):
         told = logged_torque.told(self.by_torque, self.searched, p.test, p.span_test, self.stages)
         self.told = list(told.values())
         given, self.refused = conclude.candidates(self.answers, self.plains, told, w.m.joints)
-        what = w.m, w.runs, w.by_name, cases, given, self.noise.joints, p.test, p.span_test
+        what = w.m, w.runs, w.by_name, cases, given, self.noise.of(p.test), p.test, p.span_test
         best = partial(full_model.write_best, *what)
         engine = s.replay
         if engine != "none" and w.limit.spent(1 - PLANNING):

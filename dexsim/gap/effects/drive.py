@@ -298,12 +298,12 @@ class GainMismatch(Effect):
     motions = ("steps", "holds")
 
     def variants(self, s: Scales) -> list[Variant]:
-        params = [param("kp_factor", "kp", "factor", 0.25, 4.0, 1.0)]
-        starts: list[tuple[float, ...]] = [(0.6,), (0.8,), (0.91,), (1.1,), (1.3,), (1.7,)]
-        if s.nominal["kd"] > 0:
-            params.append(param("kd_factor", s.damping, "factor", 0.1, 6.0, 1.0))
-            starts = [*((x[0], 1.0) for x in starts), (1.0, 0.5), (1.0, 0.8), (1.0, 1.25), (1.0, 1.8), (1.0, 3.0)]
-        return [Variant(tuple(params), tuple(starts))]
+        there = [n for n in ("kp", "kd") if s.nominal[n] > 0] or ["kp"]  # a velocity loop has no kp
+        params = {"kp": param("kp_factor", "kp", "factor", 0.25, 4.0, 1.0),
+                  "kd": param("kd_factor", s.damping, "factor", 0.1, 6.0, 1.0)}  # fmt: skip
+        sizes = {"kp": (0.6, 0.8, 0.91, 1.1, 1.3, 1.7), "kd": (0.5, 0.8, 1.25, 1.8, 3.0)}
+        starts = [tuple(x if k == n else 1.0 for k in there) for n in there for x in sizes[n]]
+        return [Variant(tuple(params[n] for n in there), tuple(starts))]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         m, believed = case.regimes, case.scales.nominal  # the torque that the other gains make more or less

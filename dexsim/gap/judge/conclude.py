@@ -47,6 +47,11 @@ class Noise:
     motions: dict[int, dict[str, float]] = field(default_factory=dict)
     lowered: tuple[str, ...] = ()
 
+    def of(self, runs: Sequence[int]) -> dict[str, float]:
+        """Return the floor of each joint over these runs [rad or m]: of each its own repeats', where it has some."""
+        each = [self.motions.get(i, self.joints) for i in runs] or [self.joints]
+        return {j: rms(np.square([x[j] for x in each])) for j in self.joints}
+
     def at_most(self, left: dict[str, float]) -> Noise:
         """Return the floor, where repeats differ by what was found (a drive that is warmer in one of them): what they
         differ by beyond it [rad or m, by joint] is then less, and is the floor."""
@@ -341,21 +346,25 @@ def _judged(
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    return Judged(position(all_of_it, how), effort, None, structured, quiet, _loud(answers, kept, noise), shown)
+    loud = _loud(answers, kept, noise, refuted)
+    return Judged(position(all_of_it, how), effort, None, structured, quiet, loud, shown)
 
 
-def _loud(answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise) -> tuple[str, ...]:
+def _loud(
+    answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise, refuted: set[str]
+) -> tuple[str, ...]:
     """Return the recordings held out, joint by joint, that are surely missed by more than their own repeats differ
-    by, in words."""
+    by, with what was found of the joint where it keeps that, in words."""
     said = []
     for a in answers:
+        squares = a.after if a.found and a.case.joint not in refuted else a.before
         for i in kept.test:
             on = a.case.plant.run_of[a.rows] == i
             own = noise.motions.get(i, {}).get(a.case.joint, math.inf)
-            was, low, _ = held_out.rms_interval([a.before[on]], [a.t[on]])
+            left, low, _ = held_out.rms_interval([squares[on]], [a.t[on]])
             if low > JUDGE.within * own:
                 said.append(
-                    f"{kept.runs[i].name}: {a.case.joint} is missed by {1e3 * was:.3g} mrad, by {1e3 * own:.2g} do "
+                    f"{kept.runs[i].name}: {a.case.joint} is missed by {1e3 * left:.3g} mrad, by {1e3 * own:.2g} do "
                     "repeats of it differ"
                 )
     return tuple(said)
@@ -724,6 +733,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
+    if limit and d.judged is not None and d.judged.loud and after < 1e3 * (floor or 0.0):  # that of all motions
+        limit = "repeats of the same motion differ by less"
     named = [f for f in d.findings if modelled(f) and not f.hint]
     bad = [f for f in d.findings if f.wrong_signal and not f.hint]
     prefix = _first_of_all([f for f in d.findings if not f.hint], bad, d)

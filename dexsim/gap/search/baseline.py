@@ -27,7 +27,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import pieces
-from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search.fit import Box, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import subset
 
@@ -41,7 +41,7 @@ WIDER = 2.0  # x: a stated range may be off by as much
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
 MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
 OFFSET = 1.0  # of a joint's typical torque
-COSTS = 0.01  # of the loss: figures that do less than this together stay as they are believed
+COSTS = 1e-3  # of the loss: figures that do less than this together stay as they are believed
 UNSTATED = ("braking_slope",)  # what is believed of an unknown drive is not the servo table's default (`plant.case`)
 UNITS = {
     "torque_limit": "N.m",
@@ -160,7 +160,7 @@ def fitted(
         passed,
     )
     fits = _fits(fitter, params, np.random.default_rng(seed))
-    # which of them, and what is believed, follows whole recordings, and a few steps more there
+    # what is believed, the fit from there, or else the best, by how whole recordings are followed; there a few steps
     whole = case.plant.windows(None, list(train), span=span)
     t = case.plant.t[whole.sample_row]
     seconds = [np.ptp(t[whole.sample_window == w]) for w in range(len(whole.window))]
@@ -169,7 +169,8 @@ def fitted(
     box = Box(params)
     start = np.clip(box.centre, box.low, box.high)
     tried = np.array([start, *fits])
-    best = tried[int(np.argmin(runs.loss(runs.residuals(params, tried))))]
+    left = runs.loss(runs.residuals(params, tried))
+    best = tried[int(np.flatnonzero(left <= (1 + SEARCH.apart) * left.min())[0])]
     if passed():
         return params, best
     told = _told(runs, params, start, best)
