@@ -173,22 +173,19 @@ def fitted(
     best = tried[int(np.flatnonzero(left <= (1 + SEARCH.apart) * left.min())[0])]
     if passed():
         return params, best
-    told = _told(runs, params, start, best)
-    few, rest = [params[i] for i in told], np.setdiff1d(np.arange(len(params)), told)
-    runs.fixed = tuple((name, float(start[i])) for i in rest if params[i].mode == "set" for name in params[i].columns)
-    slopes = slopes_of(runs.fit(few, x0=best[told], iterations=0))
-    start[told] = runs.fit(few, x0=best[told], iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False).x
-    return params, start
+    slopes = slopes_of(runs.fit(params, x0=best, iterations=0))
+    fit = runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False)
+    return params, _put_back(runs, params, start, fit.x)
 
 
-def _told(runs: Fitter, params: list[Param], start: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Return numbers of the figures of a fit (best [P]) that recordings tell: without the others, which are put back to
-    what is believed (start [P]), the loss is the same to `COSTS`. A limit that no motion reaches is none of them."""
+def _put_back(runs: Fitter, params: list[Param], start: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return a fit x [P] with what no recording tells as it is believed (start [P]): as many figures as leave the loss
+    the same to `COSTS`, those that do least first. A limit that no motion reaches is one of them."""
     loss = lambda x: runs.loss(runs.residuals(params, x))  # noqa: E731
-    order = np.argsort(loss(np.where(np.eye(len(params), dtype=bool), start, best)), kind="stable")
-    back = np.argsort(order)[None] < np.arange(len(params) + 1)[:, None]  # the first 0, 1, .. P of them
-    left = loss(np.where(back, start, best))
-    return np.sort(order[int(np.flatnonzero(left <= (1 + COSTS) * left[0])[-1]) :])
+    order = np.argsort(loss(np.where(np.eye(len(params), dtype=bool), start, x)), kind="stable")
+    tried = np.where(np.argsort(order)[None] < np.arange(len(params) + 1)[:, None], start, x)
+    left = loss(tried)
+    return tried[np.flatnonzero(left <= (1 + COSTS) * left[0])[-1]]
 
 
 def judged(
