@@ -39,6 +39,9 @@ class Stage:
         self.palm_force = touched.float().sum(1)  # as much as the fingertips
         self.torque, self.gravity, self.force = torch.zeros(N, 12), [], []
 
+    def forget_recorded(self):
+        """Do nothing: it records nothing."""
+
     def reset_all(self):
         self.fields["opt.gravity"].copy_(torch.tensor([0.0, 0.0, -9.81]).expand(N, 3))
 

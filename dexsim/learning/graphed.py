@@ -1,25 +1,38 @@
-"""rsl-rl's PPO update as a recorded CUDA graph: one replay a mini-batch, nothing read from the device until the end.
+"""rsl-rl's PPO update as recorded CUDA graphs: one replay a mini-batch, nothing read from the device until the end.
 
 rsl-rl reads the device five times in each mini-batch (the divergence that steers the learning rate, three losses) and
-launches some two hundred small kernels; the GPU waits for both. Here a mini-batch is recorded once and replayed: the
-learning rate is a tensor on the device, and so are the sums of the losses. The mathematics is that of
+launches some two hundred small kernels; the GPU waits for both. Here a mini-batch is recorded once and replayed: losses
+and their gradients are one kernel (:mod:`dexsim.learning.ppo_kernels`), actor and critic run side by side, the learning
+rate is a tensor on the device, and so are the sums of the losses. The mathematics is that of
 `rsl_rl.algorithms.PPO.update` (Schulman et al., arXiv:1707.06347, with rsl-rl's adaptive learning rate), results are
 equal up to rounding.
+
+With `use_mixed_precision`, factors of products are of half precision, which has as many bits of a mantissa (10) as TF32
+and half the bytes; products are added up in single precision, and so are weights and their gradients. The range of half
+precision is small: gradients by what a network puts out are scaled so that the largest is `LARGEST`, and where an input
+is over `FAR`, the update is one of single precision.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from typing import Any
 
 import torch
+import warp as wp
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from torch import nn
+from torch.nn import functional
 
-LOWEST, HIGHEST, FACTOR = 1e-5, 1e-2, 1.5
-"""Bounds of rsl-rl's adaptive learning rate, and the step that it makes."""
+from dexsim.learning import ppo_kernels
+from dexsim.tasks.structs import filled
+
+LARGEST, FAR = 256.0, 1000.0
+ONES = 16
+"""Rows of ones that add up a batch's gradients by a matrix product."""
 
 
 def unsupported(alg: Any) -> str | None:
@@ -30,10 +43,12 @@ def unsupported(alg: Any) -> str | None:
         return "several processes learn together"
     if alg.rnd or alg.symmetry:
         return "it explores by RND or mirrors its batches"
-    if alg.use_mixed_precision or alg.actor is not alg._raw_actor:
-        return "mixed precision or torch.compile is on"
+    if alg.actor is not alg._raw_actor:
+        return "torch.compile is on"
     if any(type(model) is not MLPModel for model in (alg.actor, alg.critic)):
         return "a network is not an MLPModel"
+    if type(alg.actor.distribution) is not GaussianDistribution:
+        return "its actions are not Gaussian, or their spread depends on what the policy sees"
     if type(alg.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
         return "the optimizer is not Adam"
     return None
@@ -56,27 +71,69 @@ def sample_without_waiting(actor: Any) -> None:
     distribution.sample = sample
 
 
+class Half(torch.autograd.Function):
+    """A linear layer of half precision: x [B, I or more, then zeros] -> [B, O], in single precision where `last`."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, last: bool) -> torch.Tensor:
+        ctx.inputs = weight.shape[1]
+        w = functional.pad(weight.half(), (0, x.shape[1] - ctx.inputs))
+        ctx.save_for_backward(x, w)
+        return product(x, w.t()) + bias if last else torch.addmm(bias.half(), x, w.t())
+
+    @staticmethod
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        x, w = ctx.saved_tensors
+        g = g.half()
+        by_bias = product(g.new_ones(ONES, len(g)), g)[0]  # faster than a sum
+        by_weight = product(g.t(), x)[:, : ctx.inputs]
+        return g @ w if ctx.needs_input_grad[0] else None, by_weight, by_bias, None
+
+
+def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return a @ b of half precision, in single precision."""
+    return torch.mm(a, b, out_dtype=torch.float32) if a.is_cuda else a.float() @ b.float()
+
+
+def forward(mlp: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
+    """Return what the network makes of x [B, I] or, of half precision, x [B, I or more, then zeros]."""
+    if x.dtype == torch.float32:
+        return mlp(x)
+    last = len(mlp) - 1
+    for n, layer in enumerate(mlp):
+        x = Half.apply(x, layer.weight, layer.bias, n == last) if isinstance(layer, nn.Linear) else layer(x)
+    return x
+
+
 class GraphedUpdate:
     """`alg.update()` of an rsl-rl PPO, recorded on CUDA; on a CPU the same program, not recorded (for tests).
 
-    The first mini-batch runs as it is, so that all that is allocated once is there; the next is recorded. A change of
-    what the record refers to (a checkpoint loaded into the optimizer) makes it anew.
+    The first mini-batch runs as it is, so that all that is allocated once is there; the others are recorded, each for
+    its part of the samples. A change of what a record refers to (a checkpoint loaded into the optimizer) makes them
+    anew.
     """
 
     def __init__(self, alg: PPO):
+        wp.init()
         self.alg = alg
         self.device = torch.device(alg.device)
-        st = alg.storage
+        st, dev = alg.storage, self.device
         self._size = st.num_envs * st.num_transitions_per_env // alg.num_mini_batches
-        self._chosen = torch.zeros(self._size, dtype=torch.long, device=self.device)
-        self._advantages = torch.zeros(st.num_envs * st.num_transitions_per_env, 1, device=self.device)
-        self._inputs: list[torch.Tensor] = []
-        self._rate = torch.zeros((), dtype=torch.float64, device=self.device)
-        self._rate32 = torch.zeros((), device=self.device)
-        self._sums = torch.zeros(3, device=self.device)
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._data: list[torch.Tensor] = []
+        self._rate = torch.zeros(1, dtype=torch.float64, device=dev)
+        self._rate32 = torch.zeros(1, device=dev)
+        self._totals = torch.zeros(4, device=dev)  # losses, mini-batches
+        self._block, A = ppo_kernels.BLOCK if dev.type == "cuda" else 1, st.actions.shape[-1]
+        self._to_mean, self._to_value = torch.zeros(self._size, A, device=dev), torch.zeros(self._size, 1, device=dev)
+        self._to_std, self._old_std = torch.zeros(A, device=dev), torch.zeros(A, device=dev)
+        self._blocks = -(-self._size // self._block)
+        self._sums = torch.zeros(self._blocks, 3 + A, device=dev)
+        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
         self._key: tuple[int, ...] = ()
-        self._warm = False
+        self._own = self._side = None
+        if dev.type == "cuda":  # recorded on a stream of its own: the one in use may be the default, which cannot be
+            self._own, self._side = torch.cuda.Stream(dev), torch.cuda.Stream(dev)
+            self._own_of_warp = wp.stream_from_torch(self._own)
 
     def update(self) -> dict[str, float]:
         """Learn from the storage's rollout; mean losses by name, as rsl-rl's `update`."""
@@ -85,19 +142,18 @@ class GraphedUpdate:
         group = alg.optimizer.param_groups[0]
         options = {name: group[name] for name in ("lr", "fused", "foreach", "capturable")}
         on_gpu = self.device.type == "cuda"
-        rate = self._rate32 if on_gpu else alg.learning_rate
+        rate = self._rate32[0] if on_gpu else alg.learning_rate
         group.update(lr=rate, fused=on_gpu or None, foreach=None, capturable=on_gpu)
         try:
-            count = alg.num_mini_batches * self._size
-            order = torch.randperm(count, device=self.device)
             for _ in range(alg.num_learning_epochs):
                 for k in range(alg.num_mini_batches):
-                    self._chosen.copy_(order[k * self._size : (k + 1) * self._size])
-                    self._run()
-            totals = torch.cat([self._sums.double(), self._rate[None]]).tolist()
+                    self._run(k)
+            totals = torch.cat([self._totals.double(), self._rate]).tolist()
         finally:
             group.update(options)
-        alg.learning_rate = totals[3]
+        with torch.no_grad():  # what it had lies in the memory of a record
+            alg.actor.distribution.update(self._to_mean[:1])
+        alg.learning_rate = totals[4]
         for g in alg.optimizer.param_groups:
             g["lr"] = alg.learning_rate
         observations = st.observations.flatten(0, 1)
@@ -108,114 +164,139 @@ class GraphedUpdate:
         return dict(zip(("value", "surrogate", "entropy"), means, strict=True))
 
     def _prepare(self) -> None:
-        """Put where the record looks what changes from one update to the next."""
+        """Put where the records look what changes from one update to the next, in the order of the mini-batches."""
         alg, st = self.alg, self.alg.storage
         self._rate.fill_(alg.learning_rate)
         self._rate32.fill_(alg.learning_rate)
-        self._sums.zero_()
-        self._advantages.copy_(st.advantages.flatten(0, 1))
+        self._totals.zero_()
+        order = torch.randperm(alg.num_mini_batches * self._size, device=self.device)
+        observations = st.observations.flatten(0, 1)
         with torch.no_grad():  # the running normalization holds still during an update: once for all mini-batches
-            for n, model in enumerate((alg.actor, alg.critic)):
-                latent = model.get_latent(st.observations.flatten(0, 1))
-                if n == len(self._inputs):
-                    self._inputs.append(latent.contiguous())
-                else:
-                    self._inputs[n].copy_(latent)
+            data = [model.get_latent(observations) for model in (alg.actor, alg.critic)]
+            if alg.use_mixed_precision and float(torch.stack([x.abs().max() for x in data]).max()) < FAR:
+                data = [functional.pad(x.half(), (0, -x.shape[1] % 8)) for x in data]  # rows of a multiple of 16 bytes
+            data += [x.flatten(0, 1) for x in (st.actions, st.distribution_params[0])]
+            scalars = st.actions_log_prob, st.advantages, st.values, st.returns
+            data += [x.flatten() for x in scalars]
+            self._old_std.copy_(st.distribution_params[1][0, 0])
+            if [x.dtype for x in data] != [x.dtype for x in self._data]:
+                self._data = [x[: len(order)].clone() for x in data]
+            for mine, x in zip(self._data, data, strict=True):
+                torch.index_select(x, 0, order, out=mine)
+            if self._data[0].dtype != torch.float32:
+                self._begin_in_half()
         if self.device.type == "cuda":
             for state in alg.optimizer.state.values():
                 state["step"] = state["step"].to(device=self.device, dtype=torch.float32)
 
-    def _run(self) -> None:
-        if self.device.type != "cuda":
-            self._mini_batch()
+    def _begin_in_half(self) -> None:
+        """Let the update begin where half precision has the policy: the divergence from it, and the ratio to it, are
+        then those of what is learned, and not of rounding."""
+        seen, _, actions, mean, log_prob, *_ = self._data
+        for part in range(0, len(seen), self._size):
+            mean[part : part + self._size] = forward(self.alg.actor.mlp, seen[part : part + self._size])
+        log_prob.copy_(torch.distributions.Normal(mean, self._old_std).log_prob(actions).sum(-1))
+
+    def _run(self, k: int) -> None:
+        if self._own is None:
+            self._mini_batch(k)
             return
         key = self._refers_to()
-        if self._graph is not None and key == self._key:
-            self._graph.replay()
-        elif not self._warm or key != self._key:
-            self._graph, self._warm = None, True
-            side, here = self._side(), torch.cuda.current_stream()
-            side.wait_stream(here)
-            with torch.cuda.stream(side):
-                self._mini_batch()
-            here.wait_stream(side)
+        if key != self._key:
+            self._graphs.clear()
+            here = torch.cuda.current_stream()
+            self._own.wait_stream(here)
+            with torch.cuda.stream(self._own), wp.ScopedStream(self._own_of_warp, sync_enter=False):
+                self._mini_batch(k)
+            here.wait_stream(self._own)
             self._key = self._refers_to()
-        else:
-            gc.collect()
+            return
+        if k not in self._graphs:
+            if not self._graphs:
+                gc.collect()
             gc.disable()  # a graph destroyed during a capture would be recorded into it
             try:
-                self.alg.optimizer.zero_grad(set_to_none=True)
                 graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(graph, stream=self._side(), capture_error_mode="thread_local"):
-                    self._mini_batch()
+                pool = next(iter(self._graphs.values())).pool() if self._graphs else None
+                recording = torch.cuda.graph(graph, pool=pool, stream=self._own, capture_error_mode="thread_local")
+                with recording, wp.ScopedStream(self._own_of_warp, sync_enter=False):
+                    self._mini_batch(k)
             finally:
                 gc.enable()
-            self._graph = graph
-            graph.replay()
-
-    def _side(self) -> torch.cuda.Stream:
-        if not hasattr(self, "_stream"):
-            self._stream = torch.cuda.Stream(self.device)
-        return self._stream
+            self._graphs[k] = graph
+        self._graphs[k].replay()
 
     def _refers_to(self) -> tuple[int, ...]:
         """Return the addresses of all that a record reads and that others could replace."""
-        st, tensors = self.alg.storage, []
-        for model in (self.alg.actor, self.alg.critic):
-            tensors += list(model.parameters())
+        tensors = [*self.alg.actor.parameters(), *self.alg.critic.parameters(), *self._data]
         for state in self.alg.optimizer.state.values():
             tensors += [value for value in state.values() if isinstance(value, torch.Tensor)]
-        tensors += [st.actions, st.values, st.returns, st.actions_log_prob, *(st.distribution_params or ())]
         return tuple(t.data_ptr() for t in tensors)
 
-    def _mini_batch(self) -> None:
-        """Take one step of the optimizer on the samples `_chosen`."""
-        alg, st = self.alg, self.alg.storage
-        actor, critic, distribution = alg.actor, alg.critic, alg.actor.distribution
-
-        def chosen(x: torch.Tensor) -> torch.Tensor:
-            return x.flatten(0, 1).index_select(0, self._chosen)
-
-        advantages = self._advantages.index_select(0, self._chosen)
+    def _mini_batch(self, k: int) -> None:
+        """Take one step of the optimizer on the samples of mini-batch k."""
+        alg, actor, critic = self.alg, self.alg.actor, self.alg.critic
+        part = slice(k * self._size, (k + 1) * self._size)
+        seen, seen_by_critic, actions, old_mean, log_prob, advantages, old_values, returns = (
+            x[part] for x in self._data
+        )
         if alg.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        advantages = advantages.squeeze(-1)
-        old_values, returns = chosen(st.values), chosen(st.returns)
-        old_log_prob = chosen(st.actions_log_prob).squeeze(-1)
-        old_params = tuple(chosen(p) for p in st.distribution_params)
-
-        distribution.update(actor.mlp(self._inputs[0].index_select(0, self._chosen)))
-        log_prob = actor.get_output_log_prob(chosen(st.actions))
-        values = critic.mlp(self._inputs[1].index_select(0, self._chosen))
-        entropy = actor.output_entropy.mean()
-        if alg.desired_kl is not None and alg.schedule == "adaptive":
-            with torch.no_grad():
-                self._adapt(actor.get_kl_divergence(old_params, actor.output_distribution_params).mean())
-
-        ratio = torch.exp(log_prob - old_log_prob)
-        clipped = ratio.clamp(1.0 - alg.clip_param, 1.0 + alg.clip_param)
-        surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
-        if alg.use_clipped_value_loss:
-            near = old_values + (values - old_values).clamp(-alg.clip_param, alg.clip_param)
-            value = torch.max((values - returns).pow(2), (near - returns).pow(2)).mean()
-        else:
-            value = (returns - values).pow(2).mean()
-        loss = surrogate + alg.value_loss_coef * value - alg.entropy_coef * entropy
         alg.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        for model in (actor, critic):
-            nn.utils.clip_grad_norm_(model.parameters(), alg.max_grad_norm)
-        alg.optimizer.step()
-        with torch.no_grad():
-            self._sums += torch.stack((value, surrogate, entropy))
-
-    def _adapt(self, kl: torch.Tensor) -> None:
-        """Adapt the learning rate as rsl-rl does, on the device."""
-        alg, rate = self.alg, self._rate
-        lower, higher = (rate / FACTOR).clamp(min=LOWEST), (rate * FACTOR).clamp(max=HIGHEST)
-        up = (kl < alg.desired_kl / 2.0) & (kl > 0.0)
-        rate.copy_(torch.where(kl > alg.desired_kl * 2.0, lower, torch.where(up, higher, rate)))
-        self._rate32.copy_(rate)
+        with self._beside():
+            values = forward(critic.mlp, seen_by_critic)
+        mean = forward(actor.mlp, seen)
+        self._together()
+        actor.distribution.update(mean[:1])
+        std = actor.distribution.std[0]  # the same for all samples
+        self._losses(
+            mean, std, values, actions=actions, old_mean=old_mean, log_prob=log_prob, advantage=advantages,
+            value=old_values, returns=returns,
+        )  # fmt: skip
+        with self._beside():
+            self._descend(critic, values, self._to_value)
+        if std.requires_grad:
+            std.backward(self._to_std)
+        self._descend(actor, mean, self._to_mean)
+        self._together()
         if self.device.type != "cuda":
             for group in alg.optimizer.param_groups:
-                group["lr"] = float(rate)
+                group["lr"] = float(self._rate)
+        alg.optimizer.step()
+
+    def _losses(self, mean: torch.Tensor, std: torch.Tensor, values: torch.Tensor, **samples: torch.Tensor) -> None:
+        """Fill the gradients by mean, standard deviation and value; add up losses; adapt the learning rate."""
+        alg = self.alg
+        s = filled(
+            ppo_kernels.Samples, **samples, old_std=self._old_std, clip=alg.clip_param, value_coef=alg.value_loss_coef,
+            clipped_value=int(alg.use_clipped_value_loss),
+        )  # fmt: skip
+        put_out = [wp.from_torch(x.detach()) for x in (mean, std, values.flatten())]
+        to = [wp.from_torch(x) for x in (self._to_mean, self._to_value.flatten(), self._sums)]
+        where: dict[str, Any] = {"device": str(self.device), "block_dim": self._block}
+        wp.launch(ppo_kernels.losses, dim=self._blocks * self._block, inputs=[s, *put_out, *to], **where)
+        desired = (alg.desired_kl or 0.0) if alg.schedule == "adaptive" else 0.0
+        rest = [wp.from_torch(x) for x in (self._to_std, self._totals, self._rate, self._rate32)]
+        inputs = [to[2], put_out[1], alg.entropy_coef, desired, *rest]
+        wp.launch(ppo_kernels.finish, dim=self._sums.shape[1] * self._block, inputs=inputs, **where)
+
+    def _descend(self, model: Any, out: torch.Tensor, gradient: torch.Tensor) -> None:
+        """Fill the gradients of a model's weights, of which the norm is at most as the settings say."""
+        if self._data[0].dtype == torch.float32:
+            out.backward(gradient)
+        else:
+            scale = gradient.abs().amax().clamp(min=1e-30) / LARGEST
+            out.backward(gradient / scale)
+            torch._foreach_mul_([p.grad for p in model.mlp.parameters()], scale)
+        nn.utils.clip_grad_norm_(model.parameters(), self.alg.max_grad_norm)
+
+    def _beside(self) -> Any:
+        """Return a context whose launches run beside those after it, until `_together`."""
+        if self._side is None:
+            return contextlib.nullcontext()
+        self._side.wait_stream(torch.cuda.current_stream())
+        return torch.cuda.stream(self._side)
+
+    def _together(self) -> None:
+        if self._side is not None:
+            torch.cuda.current_stream().wait_stream(self._side)

@@ -22,6 +22,7 @@ import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
 from rsl_rl.runners import OnPolicyRunner  # isort: skip
 from rsl_rl.utils import check_nan  # isort: skip
 from dexsim.learning import graphed  # isort: skip
+from dexsim.learning.rollout import Rollout  # isort: skip
 
 from dexsim.errors import UserError
 
@@ -69,6 +70,7 @@ class Runner(OnPolicyRunner):
         # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
         record = device.startswith("cuda") and cfg.get("graphed_update", True) and not graphed.unsupported(self.alg)
         self._updater = graphed.GraphedUpdate(self.alg) if record else self.alg
+        self._rollout = Rollout(self.alg) if record else None
         if device.startswith("cuda"):
             graphed.sample_without_waiting(self.alg.get_policy())
         self._meter = Meter(env.num_envs, device)
@@ -151,7 +153,7 @@ class Runner(OnPolicyRunner):
                             self._go_back(before)
                         return False
                     obs = self._step(obs)
-                self.alg.compute_returns(obs)
+                (self._rollout or self.alg).compute_returns(obs)
             self.env.check()
             collected = time.perf_counter()
             losses = self._update()
@@ -205,15 +207,18 @@ class Runner(OnPolicyRunner):
         return self.cfg["num_steps_per_env"] * self.env.num_envs * self.ranks.size
 
     def _step(self, obs: Any) -> Any:
-        actions = self.alg.act(obs)
+        actions = (self._rollout or self.alg).act(obs)
         obs, rewards, dones, extras = self.env.step(actions)
         if self.cfg["check_for_nan"]:
             try:
                 check_nan(obs, rewards, dones)
             except ValueError as error:  # of an environment that does not see to it itself, as HandEnv does
                 raise UserError(f"iteration {self.iteration + 1}: {str(error).splitlines()[0]}") from None
-        obs = obs.clone()
-        self.alg.process_env_step(obs, rewards, dones, extras)
+        if self._rollout is not None:
+            self._rollout.store(rewards, dones, extras.get("time_outs"))
+        else:
+            obs = obs.clone()
+            self.alg.process_env_step(obs, rewards, dones, extras)
         self._meter.add(rewards, dones, extras.get("log"))
         return obs
 

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from dexsim import files
 from dexsim.errors import UserError
@@ -78,6 +76,9 @@ def along(path: Path) -> tuple[Callable[[float], np.ndarray], float]:
     path is [s]). Cubic splines, at rest at both ends. Raises UserError."""
     t, x, turn = _read(path)
     where = f"task.evaluation.base={path}"
+    from scipy.interpolate import CubicSpline  # 0.3 s of every start
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     place = CubicSpline(t, x, bc_type="clamped")
     turned = RotationSpline(t, Rotation.from_rotvec(turn))
     fine = np.linspace(0.0, t[-1], 2000)

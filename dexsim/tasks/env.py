@@ -264,6 +264,11 @@ class HandEnv(Kept):
             self._recorded[name] = graph
         graph.replay()
 
+    def forget_recorded(self) -> None:
+        """Record the step anew: what a recording holds beside tensors of the environment has changed."""
+        self._runs.clear()
+        self._recorded.clear()
+
     def act(self, actions: torch.Tensor) -> None:
         """Turn actions [N, J] into targets. `relative`: the target moves by action * scale a step, held within the
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans

@@ -49,12 +49,12 @@ def evaluate(env: GraspEnv, policy: Policy, episodes: int, seed: int, progress: 
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
     """
-    was, env.graphs = env.graphs, False  # commands, pushes and objects are not those that a recording holds
+    ahead, env.draws_ahead = env.draws_ahead, False
     env.rng.manual_seed(seed)
     torch.manual_seed(seed)
     trained = _play_all(env, policy, episodes, env.train_rows, progress, "trained shapes")
     held_out = _play_all(env, policy, max(episodes // 2, 1), env.held_rows, progress, "kept-out shapes")
-    env.graphs = was
+    env.draws_ahead = ahead
     metrics = _metrics(trained, held_out, env)
     metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
     metrics["by_fingertip_share"] = by_share(trained)
@@ -90,6 +90,7 @@ def _play(
     if env.thumb_range is not None:
         low, high = env.thumb_range
         env.fixed_thumb = low + (high - low) * torch.rand(n, generator=env.rng, device=dev)
+    env.forget_recorded()  # commands, pushes and objects are not those that a recording holds
     env.reset_all()
     obs = env.get_observations()
     pushed = torch.arange(n, device=dev) % 2 == 0
@@ -152,6 +153,7 @@ def _play(
             progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
     env.outside_force.zero_()
     env.fixed_command, env.fixed_thumb, env.pushes, env.max_episode_length = None, None, True, training_length
+    env.forget_recorded()
     samples = samples.clamp(min=1)
     out = {
         "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held,
