@@ -61,15 +61,8 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
         with Ranks().leaders(source) as place:
             data = _load(place)
     with _blamed(source if data is not None else None, request):
-        if data is None:
-            cfg = _from_files(config_dir, request)
-        else:
-            cfg = _from_checkpoint(data, source, config_dir, request, {"run": None, "out": None, "device": None})
-        device = _rank_device(cfg)
-        if data is None:
-            cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
-        plain = _finish(cfg, device)
-        kind = device.partition(":")[0]
+        forget = {"run": None, "out": None, "device": None}
+        plain, kind = _settled(data, source, config_dir, request, forget, ranked=True)
         if _another_world(plain):
             raise UserError(
                 f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py"
@@ -110,16 +103,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
         play["checkpoint"] = str(policies.place(play["checkpoint"]))
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
     with _blamed(play["checkpoint"] if data is not None else None, request):
-        if data is not None:
-            cfg = _from_checkpoint(data, play["checkpoint"], config_dir, request, {})
-        else:
-            cfg = _from_files(config_dir, request)
-        OmegaConf.update(cfg, "device", play["device"])
-        device = _device(cfg)
-        if data is None:
-            cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
-        plain = _finish(cfg, device)
-        kind = device.partition(":")[0]
+        plain, kind = _settled(data, play["checkpoint"], config_dir, request, {"device": play["device"]})
         if _another_world(plain):  # on the CPU, all trials at once: C MuJoCo has a thread pool
             plain, kind = _elsewhere(plain, play), "cuda"
         checks.check(play)
@@ -190,61 +174,51 @@ def _load(path: Any) -> dict[str, Any]:
     return data
 
 
-def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
-    cfg = settings.from_files(config_dir, request.choices)
-    return settings.override(_files(cfg, request), request.values)
+def _settled(
+    data: dict[str, Any] | None, source: Any, config_dir: Path, request: settings.Request, fresh: dict[str, Any],
+    ranked: bool = False,
+) -> tuple[dict[str, Any], str]:  # fmt: skip
+    """Return the settings of a checkpoint, else of our files, with this command's applied, and the kind of device.
+
+    source: the checkpoint's file, for messages; fresh: what goes before the earlier command's; ranked: this may be one
+    of the processes that torchrun has started."""
+    base = settings.from_files(config_dir, request.choices) if data is None else _stored(data, source, config_dir)
+    cfg = _files(base if data is None else settings.choose(base, config_dir, request.choices), request)
+    cfg.update(fresh)
+    cfg = settings.override(cfg, request.values)
+    from dexsim.cli import machine
+    from dexsim.learning.ranks import Ranks
+
+    device = machine.device(Ranks().device(cfg.device, machine.cuda_devices()) if ranked else cfg.device)
+    kind = device.partition(":")[0]
+    if data is None:
+        preset = "none" if cfg.preset is None else str(cfg.preset)
+        cfg = settings.apply_preset(cfg, kind if preset == "auto" else preset, request.values)
+    plain = settings.resolve(cfg) | {"device": device}
+    hand = files.place(plain["hand"])
+    # os.path: a name that is too long for a file is none
+    if os.path.exists(hand) and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
+        plain["hand"] = str(hand.resolve())
+    objects.apply(plain)
+    return plain, kind
 
 
-def _from_checkpoint(
-    data: dict[str, Any], source: Any, config_dir: Path, request: settings.Request, fresh: dict[str, Any]
-) -> DictConfig:
-    """Return the checkpoint's own config, settings of the earlier command forgotten and this command's applied. fresh:
-    what is forgotten. source: its file, for messages."""
+def _stored(data: dict[str, Any], source: Any, config_dir: Path) -> DictConfig:
+    """Return the checkpoint's own config, with what is new since."""
     known = _yaml(config_dir / "config.yaml")
     plain = OmegaConf.to_container(known)
     assert isinstance(plain, dict)
     own = {str(k): v for k, v in plain.items() if k not in ("defaults", "sim")}  # a checkpoint from before has not all
     own |= dict.fromkeys(("model_file", "tactile_file", "objects", "kept_out"))  # new since
     own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0, "object_scale": 1.0, "object_hulls": PARTS}
-    stored = own | copy.deepcopy(data["config"]) | fresh
+    stored = own | copy.deepcopy(data["config"])
     if _another_world(stored):
         raise UserError(f"{source}: damaged checkpoint, its settings name another world (reality)")
     cfg = OmegaConf.create(stored)
     if "sim" in cfg:
         cfg.sim = OmegaConf.merge(known.sim, cfg.sim)
     OmegaConf.set_struct(cfg, True)
-    cfg = _files(settings.choose(cfg, config_dir, request.choices), request)
-    return settings.override(cfg, request.values)
-
-
-def _device(cfg: DictConfig) -> str:
-    from dexsim.cli import machine
-
-    return machine.device(cfg.device)
-
-
-def _rank_device(cfg: DictConfig) -> str:
-    """Return the device as `_device` does, for one of the processes that torchrun may have started."""
-    from dexsim.cli import machine
-    from dexsim.learning.ranks import Ranks
-
-    return machine.device(Ranks().device(cfg.device, machine.cuda_devices()))
-
-
-def _preset(cfg: DictConfig, device: str) -> str:
-    name = "none" if cfg.preset is None else str(cfg.preset)
-    return device.partition(":")[0] if name == "auto" else name
-
-
-def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
-    plain = settings.resolve(cfg)
-    plain["device"] = device
-    hand = files.place(plain["hand"])
-    # os.path: a name that is too long for a file is none
-    if os.path.exists(hand) and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
-        plain["hand"] = str(hand.resolve())
-    objects.apply(plain)
-    return plain
+    return cfg
 
 
 def _another_world(plain: dict[str, Any]) -> bool:
