@@ -11,19 +11,14 @@ from dexsim import files
 from dexsim.calibration.current import Half
 from dexsim.calibration.rubber import Rubber, Stiffness, stress
 from dexsim.calibration.taxels import Pad
+from dexsim.view import plots
 
 
 def lines(half: Half, path: Path, title: str) -> Path:
     """Force over effort of every joint: loading, unloading, the line and the paper's line through zero."""
-    across = min(4, len(half.joints))
-    down = -(-len(half.joints) // across)
-    width, height = 3.5 * across, 3.0 * down  # inches; margins by hand: a layout engine doubles the time
-    figure = Figure(figsize=(width, height))
-    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.65 / height, wspace=0.28, hspace=0.36)
-    axes = figure.subplots(down, across, squeeze=False).flat
-    for ax in axes[len(half.joints) :]:
-        ax.set_visible(False)
-    for ax, joint in zip(axes, half.joints, strict=False):
+    margins = 0.65, 0.5, 0.2, 0.65
+    figure, axes = plots.grid(len(half.joints), 4, (3.5, 3.0), margins, title, 0.12, wspace=0.28, hspace=0.36)
+    for ax, joint in zip(axes, half.joints, strict=True):
         ax.set_title(joint, fontsize=9)
         levels, f = half.levels.get(joint), half.fits.get(joint)
         if levels is None or f is None:  # what is fitted has levels
@@ -47,7 +42,6 @@ def lines(half: Half, path: Path, title: str) -> Path:
         ax.set_xlabel(half.unit, fontsize=8)
         ax.set_ylabel("N", fontsize=8)
         ax.grid(alpha=0.25)
-    figure.suptitle(title, fontsize=10, y=1 - 0.12 / height, va="top")
     files.picture(figure, path, dpi=110)
     return path
 

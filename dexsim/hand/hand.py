@@ -34,6 +34,11 @@ class Finger:
     geoms: tuple[str, ...]
     pad: Pad | None
 
+    @property
+    def presses(self) -> tuple[str, str]:
+        """Return what presses objects, as a contact pair takes it: one geom, or of several the whole distal link."""
+        return ("geom", self.geoms[0]) if len(self.geoms) == 1 else ("body", self.body)
+
 
 @dataclass(frozen=True)
 class TouchPad:

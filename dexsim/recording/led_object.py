@@ -18,22 +18,15 @@ from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
 from dexsim.sim.make import solver_iterations
+from dexsim.sim.scene import add_shape
 
 NAME, JOINT = "object", "object_free"
-TYPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-}
 MARKER = 0.015  # m, radius of what stands for an object of unknown shape: seen, not felt
 
 
 def pairs(hand: Hand) -> tuple[ContactPair, ...]:
-    """Return fingertip on object, one a finger; a fingertip of several geoms counts as its whole distal link."""
-    return tuple(
-        ContactPair(f.name, ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body), ("body", NAME))
-        for f in hand.fingers
-    )
+    """Return fingertip on object, one a finger."""
+    return tuple(ContactPair(f.name, f.presses, ("body", NAME)) for f in hand.fingers)
 
 
 @dataclass(frozen=True)
@@ -53,7 +46,7 @@ class Stated:
             raise UserError(f"object={self.shape}: must be one of {', '.join(shapes)}")
         shape = shapes[self.shape]
         count = {"box": 3, "sphere": 1, "capsule": 2}.get(shape.kind, 1)
-        own = [2 * x for x in _library_size(shape)] if shape.kind in TYPES else [float(shape.extents.max())]
+        own = [2 * x for x in _library_size(shape)] if shape.kind != "grid" else [float(shape.extents.max())]
         size = [float(x) for x in self.size] or own
         if len(size) != count or not all(1e-3 <= x <= 1.0 for x in size):
             raise UserError(
@@ -66,7 +59,7 @@ class Stated:
             )
         if shape.kind == "capsule":
             half = [size[0] / 2, (size[1] - size[0]) / 2, 0.0]
-        elif shape.kind in TYPES:
+        elif shape.kind != "grid":
             half = [x / 2 for x in size] + [0.0] * (3 - count)
         else:
             half = [size[0] / float(shape.extents.max())] * 3
@@ -103,12 +96,7 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     common: dict[str, Any] = dict(
         contype=OBJECT_BIT, conaffinity=HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
     )
-    if shape.kind in TYPES:
-        body.add_geom(type=TYPES[shape.kind], size=size, **common)
-    else:
-        for k, hull in enumerate(shape.hulls):
-            m.spec.add_mesh(name=f"led_{k}", uservert=(np.asarray(hull) * size[0]).ravel())
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"led_{k}", **common)
+    add_shape(m.spec, body, "led", shape, size, **common)
     extent = shape.extents.max() * size.max() if shape.kind == "grid" else 2 * size.max()
     body.explicitinertial, body.mass = True, about.mass
     body.inertia = [0.1 * about.mass * extent**2] * 3

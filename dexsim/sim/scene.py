@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -112,6 +113,18 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
     for slot in slots[3:]:
         body.add_geom(name=slot, type=g.mjGEOM_MESH, meshname=placeholder, **common)
     return Scene(spec, variants, slots, *_variant_table(spec, variants, slots))
+
+
+def add_shape(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, shape: Shape, size: np.ndarray, **common: Any
+) -> None:
+    """Add a shape's geoms to a body: a primitive of `size`, as MuJoCo counts it, or hulls times size[0]."""
+    if shape.kind in _PRIMITIVE_SLOT:
+        body.add_geom(name=name, type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}"), size=size, **common)
+        return
+    for k, hull in enumerate(shape.hulls):
+        spec.add_mesh(name=f"{name}_{k}", uservert=(np.asarray(hull) * size[0]).ravel())
+        body.add_geom(name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{name}_{k}", **common)
 
 
 def _variant_table(spec: mujoco.MjSpec, variants: list[Variant], slots: tuple[str, ...]) -> tuple[np.ndarray, ...]:

@@ -53,14 +53,13 @@ UNIT_PALM = 0.025
 def contact_pairs(hand: Hand, root: str, parts: Sequence[str] = ()) -> tuple[ContactPair, ...]:
     """Return contact pairs of hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object
     (F .. 2F-1), palm on object (2F), distal link on the hand itself (2F+1 .. 3F); of links with skin, on the object
-    and on the hand itself; then fingertips and those links on each of the bodies `parts`. A fingertip of several
-    geoms counts as its whole distal link. root: the hand's root body."""
+    and on the hand itself; then fingertips and those links on each of the bodies `parts`. root: the hand's root
+    body."""
     obj, own = ("body", OBJECT), ("subtree", root)
-    tips = [("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers]
     pads = dict(pad_pairs(hand))
     links = {p.body: name for p, name in zip(hand.pads, self_pairs(hand), strict=True) if p.body not in hand.tip_bodies}
     return (
-        *(ContactPair(f"tip_{f.name}", tip, obj) for f, tip in zip(hand.fingers, tips, strict=True)),
+        *(ContactPair(f"tip_{f.name}", f.presses, obj) for f in hand.fingers),
         *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
         ContactPair("palm", ("body", hand.palm_body), obj),
         *(ContactPair(f"self_{f.name}", ("body", f.body), own) for f in hand.fingers),
@@ -74,10 +73,9 @@ def pad_pairs(hand: Hand) -> list[tuple[str, tuple[str, str]]]:
     """Return the name of the contact pair with the object whose force each pad feels (each fingertip, without touch),
     and its first member: the fingertip; where a link has skin, the link, whose pads share its force."""
     skin = {p.body for p in hand.file.skin}
-    tips = {f.body: ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body) for f in hand.fingers}
-    names = dict(zip(hand.tip_bodies, hand.finger_names, strict=True))
+    tips = {f.body: (f"tip_{f.name}", f.presses) for f in hand.fingers}
     bodies = [*hand.tip_bodies, *(p.body for p in hand.file.skin)]
-    return [(f"link_{b}", ("body", b)) if b in skin else (f"tip_{names[b]}", tips[b]) for b in bodies]
+    return [(f"link_{b}", ("body", b)) if b in skin else tips[b] for b in bodies]
 
 
 def self_pairs(hand: Hand) -> list[str]:

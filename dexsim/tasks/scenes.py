@@ -23,7 +23,7 @@ from dexsim.assets.objects.own import is_own, own_shape
 from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
 from dexsim.hand.model import HAND_BIT, OBJECT_BIT
-from dexsim.sim.scene import OBJECT
+from dexsim.sim.scene import OBJECT, add_shape
 from dexsim.surface import geom_surface
 from dexsim.tactile.shapes import TouchShape, bake_convex
 
@@ -270,17 +270,9 @@ def _thing(spec: mujoco.MjSpec, thing: Thing) -> Part:
         contype=OBJECT_BIT, conaffinity=OBJECT_BIT | HAND_BIT, condim=4, friction=[0.8, 1e-3, 1e-4], group=0,
         rgba=[0.3, 0.55, 0.8, 1.0],
     )  # fmt: skip
-    kinds = {"box": mujoco.mjtGeom.mjGEOM_BOX, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-             "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE}  # fmt: skip
-    if shape.kind in kinds:
-        size = shape.size * thing.size
-        body.add_geom(name=thing.name, type=kinds[shape.kind], size=size, **common)
-        return Part(thing.name, TouchShape(thing.name, shape.kind), size)
-    for k, hull in enumerate(shape.hulls):
-        spec.add_mesh(name=f"{thing.name}_{k}", uservert=(np.asarray(hull) * thing.size).ravel())
-        geom = f"{thing.name}_{k}"
-        body.add_geom(name=geom, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=geom, **common)
-    return Part(thing.name, TouchShape(thing.name, "grid", shape.grid), np.array([thing.size, 0.0, 0.0]))
+    size = np.array([thing.size, 0.0, 0.0]) if shape.kind == "grid" else shape.size * thing.size
+    add_shape(spec, body, thing.name, shape, size, **common)
+    return Part(thing.name, TouchShape(thing.name, shape.kind, shape.grid), size)
 
 
 def _shape(name: str) -> Shape:

@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")
+from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
 
 from dexsim import files  # noqa: E402
@@ -46,14 +47,10 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
     names = [n for n in FIRST if n in columns]
     names += sorted((n for n in columns if n not in FIRST and n not in HIDDEN), key=_order)
     names = [n for n in names if any(math.isfinite(v) for v in columns[n])]
-    across = min(4, max(1, len(names)))
-    down = max(1, math.ceil(len(names) / across))
-    width, height = 3.6 * across, 2.5 * down
-    figure = Figure(figsize=(width, height))  # margins by hand: a layout engine takes seconds for some thirty axes
-    top = 0.65 if title else 0.35  # inches
-    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.15 / width, 1 - top / height, wspace=0.25, hspace=0.38)
+    across, margins = 4, (0.65, 0.5, 0.15, 0.65 if title else 0.35)
+    figure, panels = grid(len(names), across, (3.6, 2.5), margins, title, 0.12, wspace=0.25, hspace=0.38)
     steps = columns.get("steps", [])
-    for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, names):
+    for axes, name in zip(panels, names, strict=True):
         points = [(x, y) for x, y in zip(steps, columns[name]) if math.isfinite(y)]
         x, y = [p[0] for p in points], [p[1] for p in points]
         axes.plot(x, y, color=LIGHT, linewidth=0.8, marker="." if len(x) < 3 else None)
@@ -64,14 +61,31 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
         for axis in (axes.xaxis, axes.yaxis):
             axis.offsetText.set_fontsize(7)
         axes.grid(alpha=0.25)
-    for axes in figure.axes[len(names):]:
-        axes.set_axis_off()
-    for axes in figure.axes[max(0, len(names) - across): len(names)]:
+    for axes in panels[-across:]:
         axes.set_xlabel("environment steps", fontsize=8)
-    if title:
-        figure.suptitle(title, fontsize=10, y=1 - 0.12 / height, va="top")
     files.picture(figure, path, dpi=110)
     return path
+
+
+def grid(
+    count: int, across: int, size: tuple[float, float], margins: tuple[float, float, float, float], title: str,
+    above: float, more: float = 0.0, **space: float,
+) -> tuple[Figure, list[Axes]]:  # fmt: skip
+    """Return a figure and its `count` panels, at most `across` in a row, each of size (width, height) in inches.
+
+    margins: left, bottom, right, top in inches, by hand: a layout engine takes seconds for some thirty axes; more: of
+    the height; above: the title, which may be ''."""
+    across = min(across, max(1, count))
+    down = max(1, math.ceil(count / across))
+    (width, height), (x, y, right, top) = (size[0] * across, size[1] * down + more), margins
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(x / width, y / height, 1 - right / width, 1 - top / height, **space)
+    axes = list(figure.subplots(down, across, squeeze=False).flat)
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    if title:
+        figure.suptitle(title, fontsize=10, y=1 - above / height, va="top")
+    return figure, axes[:count]
 
 
 def _order(name: str) -> tuple[int, str]:
