@@ -23,13 +23,13 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.reference import dry_friction, gear_load_friction
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.body import add_armature
+from dexsim.gap.plant.batch import subset
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import pieces
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
-from dexsim.gap.search.fit import Box, Fitter, Residuals, slopes_of
-from dexsim.gap.search.hypotheses import subset
+from dexsim.gap.search.fit import Box, Fitter, Residuals
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
 GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside what is believed
@@ -173,8 +173,7 @@ def fitted(
     best = tried[int(np.flatnonzero(left <= (1 + SEARCH.apart) * left.min())[0])]
     if passed():
         return params, best
-    slopes = slopes_of(runs.fit(params, x0=best, iterations=0))
-    fit = runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False)
+    fit = runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, lazy=True, exact=False)
     return params, _put_back(runs, params, start, fit.x)
 
 
@@ -224,7 +223,8 @@ def judged(
 
 
 def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list[np.ndarray]:
-    """Return [P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
+    """Return [P] each, least squares from what is believed, and from the best of guesses all over the bounds unless one
+    follows to the noise."""
     box = Box(params)
     low, high, start = box.low, box.high, np.clip(box.centre, box.low, box.high)
     # a Latin square
@@ -245,11 +245,13 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
         if i and fitter.passed():
             break
         loss[i : i + AT_ONCE] = fitter.loss(fitter.residuals(params, guesses[i : i + AT_ONCE]))
-    order = np.argsort(loss)[:BEST]
-    return [
-        fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3).x
-        for k in dict.fromkeys([0, *order.tolist()])
-    ]
+    fits: list[np.ndarray] = []
+    for k in dict.fromkeys([0, *np.argsort(loss)[:BEST].tolist()]):
+        f = fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3)
+        fits.append(f.x)
+        if f.loss < SEARCH.enough**2:
+            break  # none follows better than to the noise
+    return fits
 
 
 def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:
