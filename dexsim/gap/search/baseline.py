@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -227,6 +228,10 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
     follows to the noise."""
     box = Box(params)
     low, high, start = box.low, box.high, np.clip(box.centre, box.low, box.high)
+    fit = partial(fitter.fit, params, iterations=ITERATIONS, tolerance=5e-3)
+    fits, quiet = [fit(start)], SEARCH.enough**2
+    if fits[0].loss < quiet:  # none follows better than to the noise
+        return [fits[0].x]
     # a Latin square
     cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))
     share = cells / GUESSES
@@ -245,13 +250,10 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
         if i and fitter.passed():
             break
         loss[i : i + AT_ONCE] = fitter.loss(fitter.residuals(params, guesses[i : i + AT_ONCE]))
-    fits: list[np.ndarray] = []
-    for k in dict.fromkeys([0, *np.argsort(loss)[:BEST].tolist()]):
-        f = fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3)
-        fits.append(f.x)
-        if f.loss < SEARCH.enough**2:
-            break  # none follows better than to the noise
-    return fits
+    for k in np.argsort(loss)[:BEST]:
+        if k and fits[-1].loss >= quiet:
+            fits.append(fit(guesses[k]))
+    return [f.x for f in fits]
 
 
 def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:
