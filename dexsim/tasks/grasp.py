@@ -144,16 +144,17 @@ class GraspEnv(Launches):
 
     def update(self) -> None:
         self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)
-        rate = self.task["termination"].get("untouched")
+        rate = self.task["termination"].get("untouched")  # not for sure: all worlds would begin anew at once
         if rate and self.fixed_command is None:  # an evaluation goes on, and counts
-            off = (self.finger_force <= 0).sum(1)
+            touches = self.finger_force > 0
+            lost = ~(touches[:, self.opposing].any(1) & touches[:, self.others].any(1))
             late = self.episode_length_buf * self.dt > grasp_rewards.LATE
-            self._dropped |= late & (self.sampler.uniform() < rate * off)
+            self._dropped |= lost & late & (self.sampler.uniform() < rate)
 
     @done(name="dropped")
     def is_dropped(self) -> torch.Tensor:
-        """centre below the palm (termination.below) or far from it (termination.distance); or, while learning, a finger
-        off the object (termination.untouched)"""
+        """centre below the palm (termination.below) or far from it (termination.distance); or not held, while learning
+        (termination.untouched)"""
         return self._dropped
 
     # -- what is paid: every term is computed by one kernel
