@@ -16,14 +16,13 @@ from dexsim.gap.command import Progress
 from dexsim.gap.finding import Finding
 from dexsim.gap.judge import conclude, held_out
 from dexsim.gap.judge.joint_answer import stretched
-from dexsim.gap.plant.batch import subset
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Box, Fitted, Fitter
 from dexsim.gap.search.scan import cross_validated, free_run_errors, refolded, saved_by, scan_catalogue
-from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found
+from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found, subset
 from tests.test_gap import model, plant_run
 
 

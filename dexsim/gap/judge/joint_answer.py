@@ -18,14 +18,13 @@ from dexsim.gap.finding import Finding, chances, removed
 from dexsim.gap.inquiry import Curve
 from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.held_out import rms
-from dexsim.gap.plant.batch import subset
 from dexsim.gap.plant.case import Case, intervals_of
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, Fitter, intervals
-from dexsim.gap.search.hypotheses import JointSearch, Member, Outcome, Trial
+from dexsim.gap.search.hypotheses import JointSearch, Member, Outcome, Trial, subset
 from dexsim.gap.search.search import law_spread, loss_by_run, polished, widened
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism

@@ -26,7 +26,6 @@ BLOCK = 64
 PROFILED = [INDEX[name] for name in PROFILE]
 WARM = 0.15  # s before a window in which the recorded motion is held
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
-SOME = 1024  # steps of a series that are refined in one call: they stay in a core's cache
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 # guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
 # (two inertias 0.33) and a GPU 5 us (14), whose thousands of threads are no use to a fit that asks for a hundred
@@ -170,26 +169,6 @@ class Windows:
         )
 
 
-def subset(w: Windows, keep: np.ndarray) -> Windows:
-    """Return the windows where keep [W] bool holds."""
-    pick = np.flatnonzero(keep)
-    new = np.full(len(w.window), -1)
-    new[pick] = np.arange(len(pick))
-    samples = keep[w.sample_window]
-    window = w.window[pick].copy()
-    if len(pick):
-        window[:, 3] = np.concatenate([[0], np.cumsum(window[:-1, 4])])
-    return Windows(
-        window,
-        w.window_t[pick],
-        w.sample_step[samples],
-        w.sample_part[samples],
-        new[w.sample_window[samples]],
-        w.sample_row[samples],
-        w.run[pick],
-    )
-
-
 class JointPlant:
     """One joint over all runs: measurements in a row, series on the integration grid, and the simulation.
 
@@ -285,14 +264,11 @@ class JointPlant:
         out.series = np.empty((out._grid[-1], len(SERIES)))
         for run in range(len(sizes)):
             coarse, fine = self.series[self.grid(run)], out.series[out.grid(run)]
-            for a in range(0, len(coarse) - 1, SOME):
-                some = coarse[a : a + SOME + 1]
-                here = fine[times * a : times * (a + len(some) - 1) + 1]
-                here[::times] = some
-                for k in range(1, times):
-                    between = here[k::times]
-                    np.multiply(some[:-1], 1 - k / times, out=between)
-                    between += k / times * some[1:]
+            fine[::times] = coarse
+            for k in range(1, times):
+                between = fine[k::times]
+                np.multiply(coarse[:-1], 1 - k / times, out=between)
+                between += k / times * coarse[1:]
         return out
 
     def grid(self, run: int) -> slice:

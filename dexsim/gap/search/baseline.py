@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import mujoco
@@ -24,13 +23,13 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.reference import dry_friction, gear_load_friction
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.body import add_armature
-from dexsim.gap.plant.batch import subset
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.read import pieces
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
-from dexsim.gap.search.fit import Box, Fitter, Residuals
+from dexsim.gap.search.fit import Box, Fitter, Residuals, slopes_of
+from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
 GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside what is believed
@@ -174,7 +173,8 @@ def fitted(
     best = tried[int(np.flatnonzero(left <= (1 + SEARCH.apart) * left.min())[0])]
     if passed():
         return params, best
-    fit = runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, lazy=True, exact=False)
+    slopes = slopes_of(runs.fit(params, x0=best, iterations=0))
+    fit = runs.fit(params, x0=best, iterations=ITERATIONS, tolerance=5e-3, slopes=slopes, exact=False)
     return params, _put_back(runs, params, start, fit.x)
 
 
@@ -224,14 +224,9 @@ def judged(
 
 
 def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list[np.ndarray]:
-    """Return [P] each, least squares from what is believed, and from the best of guesses all over the bounds unless one
-    follows to the noise."""
+    """Return [P] each, least squares from the best of guesses all over the bounds, and from what is believed."""
     box = Box(params)
     low, high, start = box.low, box.high, np.clip(box.centre, box.low, box.high)
-    fit = partial(fitter.fit, params, iterations=ITERATIONS, tolerance=5e-3)
-    fits, quiet = [fit(start)], SEARCH.enough**2
-    if fits[0].loss < quiet:  # none follows better than to the noise
-        return [fits[0].x]
     # a Latin square
     cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))
     share = cells / GUESSES
@@ -250,10 +245,11 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
         if i and fitter.passed():
             break
         loss[i : i + AT_ONCE] = fitter.loss(fitter.residuals(params, guesses[i : i + AT_ONCE]))
-    for k in np.argsort(loss)[:BEST]:
-        if k and fits[-1].loss >= quiet:
-            fits.append(fit(guesses[k]))
-    return [f.x for f in fits]
+    order = np.argsort(loss)[:BEST]
+    return [
+        fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3).x
+        for k in dict.fromkeys([0, *order.tolist()])
+    ]
 
 
 def overall(given: Sequence[Baseline], handed_on: Sequence[str] = ()) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.sparse import csr_array
 
-from dexsim.gap.plant.batch import JointPlant, Windows, subset
+from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.rules import BELIEF, SEARCH
 
@@ -24,7 +24,6 @@ STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss i
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 ROUNDS, GUESSES = 2, 20  # of what is tried about a fit, and guesses of each
-PART, FINALISTS = 4, 2  # guesses are tried on a window in so many first, and so many of them on all
 LOOK = 2  # steps of a fit after which it may be given up
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
@@ -125,7 +124,6 @@ class Fitter:
         self._sizes = np.tile(np.bincount(windows.sample_window, minlength=self.count), self._signals)
         self._sparse: dict[int, csr_array] = {}
         self.fixed: tuple[tuple[str, float], ...] = ()  # constants of a hypothesis (`given`)
-        self._part: list[tuple[Fitter, np.ndarray]] = []  # made once: on some windows, and residuals [m] there
 
     def given(self, members: Sequence[Member]) -> Self:
         """This fitter with the constants of a hypothesis' variants."""
@@ -316,20 +314,8 @@ class Fitter:
         return self.loss(res) + ((x - box.centre) ** 2 @ box.prior) / res.shape[-1]
 
     def _tried(self, box: Box, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
-        """Return [K] loss and disbelief at each of trial [K, P], the initial states eliminated along s; infinite where
-        others do better on some of the windows: which of several is best shows there already. On a GPU many guesses
-        take no longer than one."""
-        if len(trial) <= FINALISTS or self.count < 2 or self.plant.device != "cpu":
-            return self._score(box, trial, self.eliminated(self.residuals(params, trial), s))
-        if not self._part:
-            keep = np.arange(self.count) % PART == 1
-            self._part.append((Fitter(self.plant, subset(self.w, keep), self.r), keep[self.window]))
-        part, on = copy.copy(self._part[0][0]), self._part[0][1]
-        part.fixed = self.fixed
-        rough = part._score(box, trial, part.eliminated(part.residuals(params, trial), None if s is None else s[:, on]))
-        out, ahead = np.full(len(trial), np.inf), np.argsort(rough)[:FINALISTS]
-        out[ahead] = self._tried(box, params, trial[ahead], s)
-        return out
+        """Return [K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
+        return self._score(box, trial, self.eliminated(self.residuals(params, trial), s))
 
     def fit(
         self,
@@ -346,12 +332,11 @@ class Fitter:
         """Fit by Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
 
         slopes: change [m] of the residuals per span of a parameter, by its key, known from a fit nearby on the same
-        windows. lazy: once known, from there or from the first batch, the slopes of beliefs (of all where there is
-        none) and of these parameters follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19,
-        1965) and are simulated anew only where they lead no further: a third of the simulations; and what is `late` is
-        held, and let go for one more step where the others end, if exact. That lowers the loss by `SEARCH.apart` for
-        each, or they are left out of the fit: it never ends higher than one without them. exact: end with slopes that
-        were simulated at the end.
+        windows. lazy: once known, from there or from the first batch, the slopes of beliefs and of these parameters
+        follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only
+        where they lead no further: a third of the simulations; and what is `late` is held, and let go for one more
+        step where the others end, if exact. That lowers the loss by `SEARCH.apart` for each, or they are left out of
+        the fit: it never ends higher than one without them. exact: end with slopes that were simulated at the end.
         hopeless: what leaves more than this after `LOOK` steps ends there."""
         box = Box(params)
         low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
@@ -360,7 +345,7 @@ class Fitter:
         damping = 1e-2
         P = len(params)
         jac, known = self._known(params, slopes)  # known: slopes that were not simulated here
-        follow = belief | known | (lazy and not belief.any()) if lazy or slopes is not None else np.zeros(P, bool)
+        follow = (belief | known) if lazy or slopes is not None else np.zeros(P, bool)
         held = np.array([lazy and p.late for p in params], bool)
         known &= ~held
         moved = last = s = None

@@ -13,7 +13,7 @@ from dexsim.gap.compute import Deadline
 from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, compatible
 from dexsim.gap.effects.friction import give
-from dexsim.gap.plant.batch import Windows, subset
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read import BLOCK
@@ -569,3 +569,23 @@ def thin(w: Windows, case: Case, budget: float) -> Windows:
     keep[chosen] = True
     keep[rest[np.unique(np.linspace(0, len(rest) - 1, most - len(chosen)).astype(int))]] = True
     return subset(w, keep)
+
+
+def subset(w: Windows, keep: np.ndarray) -> Windows:
+    """Return the windows where keep [W] bool holds."""
+    pick = np.flatnonzero(keep)
+    new = np.full(len(w.window), -1)
+    new[pick] = np.arange(len(pick))
+    samples = keep[w.sample_window]
+    window = w.window[pick].copy()
+    if len(pick):
+        window[:, 3] = np.concatenate([[0], np.cumsum(window[:-1, 4])])
+    return Windows(
+        window,
+        w.window_t[pick],
+        w.sample_step[samples],
+        w.sample_part[samples],
+        new[w.sample_window[samples]],
+        w.sample_row[samples],
+        w.run[pick],
+    )

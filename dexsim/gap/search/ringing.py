@@ -22,12 +22,12 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE
-from dexsim.gap.plant.batch import Windows, subset
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import Param, expand, neutral_of
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Box
-from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, JointSearch, Member, Outcome, Trial, thin
+from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, JointSearch, Member, Outcome, Trial, subset, thin
 from dexsim.gap.search.scan import narrowed
 
 APART = (1, 2, 3)  # samples between a reading and those that it is compared with

@@ -13,12 +13,11 @@ import numpy as np
 from dexsim import intervals
 from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
-from dexsim.gap.plant.batch import subset
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Box, Fitter, Residuals, disbelief, huber_square, robust, slopes_of
-from dexsim.gap.search.hypotheses import JointSearch, Member, Trial, complexity_price, fits_beside
+from dexsim.gap.search.hypotheses import JointSearch, Member, Trial, complexity_price, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
 

@@ -18,7 +18,7 @@ from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, huber_square, slopes_of
-from dexsim.gap.search.hypotheses import LONG, MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, named
+from dexsim.gap.search.hypotheses import LONG, MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import (
     BOOTSTRAPS,
     STRETCH,
@@ -778,4 +778,4 @@ class SearchedJoint:
     outcome: Outcome
 
 
-__all__ = ["JointSearch", "Member", "Outcome", "SearchedJoint", "Trial"]
+__all__ = ["JointSearch", "Member", "Outcome", "SearchedJoint", "Trial", "subset"]
