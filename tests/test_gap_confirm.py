@@ -176,7 +176,9 @@ def test_the_files_are_replayed_and_that_is_the_number_of_the_report(answer):
     # what the choice went by is that number
     assert r["error"] == pytest.approx(d.written.errors["joint"][d.written.chosen["joint"]], rel=1e-6)
     assert r["error"] == pytest.approx(h["after"], rel=0.5)
-    assert f"leave {1e3 * r['error']:.3g} mrad" in d.sentence
+    # the one number of the sentence, and so of the page's first lines
+    assert f"the files as written, replayed in the engine that trains, leave {1e3 * r['error']:.3g} on" in d.sentence
+    assert d.sentence.count("leave") == 1 and "with it, by" not in d.sentence
     page = (folder / "out" / "report.html").read_text()
     assert "What is written of each joint" in page and "as written, replayed" in page
 

@@ -662,8 +662,7 @@ class Drives(Steps):
         found = full_model.replay_files(self.written.kept, d.servo, spec, self.written.share)
         self.written.replayed = found
         d.data["held_out"]["replayed"] = found.entry()
-        if d.data["held_out"]["error"].startswith("position"):
-            d.sentence += " " + self.written.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
+        conclude.tell(d)
         d.notes += self.written.differences(d.joints)
 
 

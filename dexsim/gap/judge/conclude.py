@@ -542,7 +542,12 @@ def decide(d: Diagnosis) -> None:
     if d.touch is not None:  # in their own order
         settled = {(f.effect, *f.taxels): f for f in d.findings}
         d.touch.findings = [settled[f.effect, *f.taxels] for f in d.touch.findings]
-    if verdict.word != "unusable":
+    tell(d)
+
+
+def tell(d: Diagnosis) -> None:
+    """Write the verdict's sentence, again where the files were replayed since: what they leave is its number then."""
+    if d.data["verdict"] != "unusable":
         d.sentence = sentence(d.data, d, _floor(d)) + _unjudged(d.data, d.judged)
 
 
@@ -731,7 +736,10 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     effort, unit = metric.startswith("effort"), unit_of(metric)
     if unit == "mN" and not effort:
         floor = data["noise_floor"].get("tactile_N")
-    before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
+    written = h.get("replayed") if metric.startswith("position") else None
+    before, after = 1e3 * (h["before"] or 0), 1e3 * (written["error"] if written else h["after"] or 0)
+    engine = "replayed in the engine that trains"
+    replayed = f" The files as written, {engine}, leave {number(after)} {unit}." if written else ""
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
     if limit and d.judged is not None and d.judged.loud and after < 1e3 * (floor or 0.0):  # that of all motions
         limit = "repeats of the same motion differ by less"
@@ -742,13 +750,13 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         return (
             prefix
             + "Nothing in the catalogue is missing: the simulator follows "
-              f"{_where_judged(h)} to {before:.2g} {unit}; {limit}."
+              f"{_where_judged(h)} to {before:.2g} {unit}; {limit}.{replayed}"
         )
     if data["verdict"] == "explained" and not named and bad:
         return (
             prefix
             + f"Beside that nothing is missing: the simulator follows {_where_judged(h)} to {before:.2g} {unit}; "
-              f"{limit}."
+              f"{limit}.{replayed}"
         )
     if not named:
         depends = (
@@ -757,11 +765,13 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
             else ""
         )
         plain = baseline.left_by_what_is_handed_on(data["baseline"]) if metric.startswith("position") else None
-        left = (
-            f"{number(after)} {unit} are left"
-            if plain is None
-            else f"{number(1e3 * plain)} {unit} are left by the plain model, which is handed on,"
-        )
+        if written:
+            of = "the files as written" if plain is None else "the plain model, as written"
+            left = f"{number(after)} {unit} are left by {of}, {engine},"
+        elif plain is not None:
+            left = f"{number(1e3 * plain)} {unit} are left by the plain model, which is handed on,"
+        else:
+            left = f"{number(after)} {unit} are left"
         return (
             prefix
             + f"Something is missing that no effect of the catalogue explains: {left} where {limit}{depends}."
@@ -771,16 +781,15 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     # not thinned by joints that are well
     if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):
         of, mine = " of that joint", d.joints[next(iter(alone))]
-        before, after = 1e3 * mine["before"], 1e3 * mine["after"]
+        joint = next(iter(alone))
+        before, after = 1e3 * mine["before"], 1e3 * (written["joints"] if written else {}).get(joint, mine["after"])
     said = prefix + _names(named, d)
     if h["before"] is None:
         return said
     it = "it" if len(named) == 1 else "them"
-    tail = (
-        f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on "
-        + _where_judged(h)
-    )
-    return said + tail + (f"; {limit}." if limit else ".")
+    found = f"the files as written, {engine}, leave" if written else f"with {it}, by"
+    said += f" Without {it} simulation{of} is wrong by {number(before)} {unit}; {found} {number(after)} on "
+    return said + _where_judged(h) + (f"; {limit}." if limit else ".")
 
 
 def _where_judged(h: dict) -> str:

@@ -176,14 +176,6 @@ class Written:
             f"{k * min(x for n, x in mine.items() if n.startswith('found')):.3g} ({where})"
         )
 
-    def text(self, unit: str = "mrad") -> str:
-        """Return the headline in a sentence; unit: what a thousandth of the position's is called."""
-        assert self.replayed is not None  # as looked at by who asks
-        return (
-            f"The files as they are written, replayed in the engine that trains, leave {1e3 * self.replayed.error:.3g} "
-            f"{unit}."
-        )
-
     def differences(self, judged: Mapping[str, Mapping[str, float]]) -> list[str]:
         """Return joints on which the replay differs from the search's own plant by more than a tenth, each with the
         reason, in words. judged: `sigma` of each."""

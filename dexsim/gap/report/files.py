@@ -184,17 +184,11 @@ class Hero(Section):
     def values(self) -> dict[str, Any]:
         d, h = self.d, self.held_out
         word, tone = VERDICTS[d.data["verdict"]]
-        said, replayed = d.sentence, ""
-        if d.written is not None and d.written.replayed is not None:
-            text = d.written.text(unit_of(h["error"]))
-            if said.endswith(text):
-                said, replayed = said[: -len(text)].rstrip(), text
         kept = h.get("how") or ", ".join(h["recordings"])
         return {
             "word": word,
             "tone": tone,
-            "said": said,
-            "replayed": replayed,
+            "said": d.sentence,
             "judged": h["before"] is not None,
             "kept": kept,
         }
