@@ -436,7 +436,7 @@ def test_limits_name_existing_settings():
 
 @pytest.mark.parametrize("name", ["config", "play"])
 def test_every_setting_has_a_line_in_the_help(name):
-    from dexsim.cli.help import settings as lines
+    from dexsim.console.program import settings as lines
 
     path = CONFIGS / f"{name}.yaml"
     content = yaml.safe_load(path.read_text())

@@ -89,7 +89,7 @@ def test_the_deployed_loop_asks_the_driver_for_them(folder):
     with pytest.raises(UserError, match="reads no angle of second0, second1, second2"):
         where.followers(state)
     state.follower = np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(where.followers(state), [[0.1, 0.2, 0.3]], atol=1e-6)
+    np.testing.assert_allclose(where.followers(state), [0.1, 0.2, 0.3], atol=1e-6)
     tips, *_ = where(q)
     moved, *_ = where(q, 0.8 * q + 0.2)
     assert (np.linalg.norm(moved - tips, axis=1) > 2e-3).all()  # the fingertips are where the encoders say

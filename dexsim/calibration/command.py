@@ -10,7 +10,6 @@ import numpy as np
 import yaml
 
 from dexsim import typed
-from dexsim.cli import help as help_page
 from dexsim.console import program
 from dexsim.errors import UserError
 
@@ -303,7 +302,7 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
 
 def _help(file: Path) -> str:
     what = "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml."
-    rows = [(f"{key}={value}", comment) for key, value, comment in help_page.settings(file)]
+    rows = [(f"{key}={value}", comment) for key, value, comment in program.settings(file)]
     rows += [
         ("meta.KEY=VALUE", "metadata that wins over what real= and touch= recordings say"),
         ("units.QUANTITY=UNIT", "units of real= and touch=, as `dexsim audit` takes them"),

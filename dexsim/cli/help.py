@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from dexsim.cli.settings import groups
@@ -57,19 +56,7 @@ def text(script: str, config_dir: Path) -> str:
     files = ["config.yaml"] if script == "train" else ["play.yaml"]
     lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
     for file in files:
-        lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in settings(config_dir / file)]
+        lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in program.settings(config_dir / file)]
     lines += ["", *([REPLAY] if script == "play" else []), "groups (one file of dexsim/configs/<group>/ each):"]
     lines += [f"  {name + '=':<14}{' | '.join(options)}" for name, options in groups(config_dir).items()]
     return program.words("\n".join(lines) + "\n" + END.format(script=script))
-
-
-def settings(path: Path) -> list[tuple[str, str, str]]:
-    """Return (dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
-    rows, owner = [], ""
-    for line in path.read_text("utf-8").splitlines():
-        if match := re.match(r"^(\w+):\s*$", line):
-            owner = match[1] + "."
-        elif match := re.match(r"^(\s*)(\w+):\s*(\S+)\s+#\s*(.+)$", line):
-            indent, key, value, comment = match.groups()
-            rows.append(((owner if indent else "") + key, value, comment))
-    return rows

@@ -46,3 +46,15 @@ def words(text: str) -> str:
 def _by_door() -> bool:
     called = Path(sys.argv[0])
     return called.suffix == ".py" and called.stem in DOORS
+
+
+def settings(path: Path) -> list[tuple[str, str, str]]:
+    """Return (dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
+    rows, owner = [], ""
+    for line in path.read_text("utf-8").splitlines():
+        if match := re.match(r"^(\w+):\s*$", line):
+            owner = match[1] + "."
+        elif match := re.match(r"^(\s*)(\w+):\s*(\S+)\s+#\s*(.+)$", line):
+            indent, key, value, comment = match.groups()
+            rows.append(((owner if indent else "") + key, value, comment))
+    return rows

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
+import matplotlib
 
-from dexsim import files
-from dexsim.recording.mechanism import Mechanism, Run
-from dexsim.recording.schema import Recording, Series
-from dexsim.view.plots import grid
+matplotlib.use("Agg")
+import numpy as np  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
+
+from dexsim import files  # noqa: E402
+from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
+from dexsim.recording.schema import Recording, Series  # noqa: E402
 
 COLOURS = {"recorded": "#1f5fa8", "simulated": "#d1641b", "command": "#9a9a9a"}
 
@@ -131,16 +134,32 @@ def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
 
 def _panels(path: Path, title: str, names: tuple[str, ...], lines: list, notes: list[str]) -> Path:
     """Draw a panel a name; lines: (label, t [T] s, value [T, len(names)])."""
-    margins = 0.5, 0.5, 0.12, 0.6
-    figure, axes = grid(len(names), 3, (4.6, 2.3), margins, title, 0.1, more=0.6, wspace=0.16, hspace=0.3)
-    for j, (ax, name) in enumerate(zip(axes, names, strict=True)):
+    figure, axes = _grid(len(names))
+    for j, (ax, name) in enumerate(zip(axes, names, strict=False)):
         for label, t, value in lines:
             ax.plot(t, value[:, j], color=COLOURS[label], linewidth=0.9, label=label)
         ax.set_title(f"{name}  {notes[j]}", fontsize=8)
+    _finish(figure, axes, len(names), title, path)
+    return path
+
+
+def _grid(count: int) -> tuple[Figure, list]:
+    across = min(3, count)
+    down = -(-count // across)
+    width, height = 4.6 * across, 2.3 * down + 0.6  # inches; margins by hand: a layout engine doubles the time
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(0.5 / width, 0.5 / height, 1 - 0.12 / width, 1 - 0.6 / height, wspace=0.16, hspace=0.3)
+    return figure, list(figure.subplots(down, across, squeeze=False).flat)
+
+
+def _finish(figure: Figure, axes: list, count: int, title: str, path: Path) -> None:
+    for ax in axes[:count]:
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.25)
-    for ax in axes[-3:]:
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    for ax in axes[max(0, count - 3) : count]:
         ax.set_xlabel("time [s]", fontsize=8)
     axes[0].legend(fontsize=7)
+    figure.suptitle(title, fontsize=10, y=1 - 0.1 / figure.get_figheight(), va="top")
     files.picture(figure, path, dpi=110)
-    return path
