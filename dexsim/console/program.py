@@ -1,4 +1,5 @@
-"""The command that a user typed to get here, so that help pages and hints name commands that work for them."""
+"""What help pages and hints need: the command that a user typed to get here, so that they name commands that work for
+them, and the settings of a config file."""
 
 from __future__ import annotations
 

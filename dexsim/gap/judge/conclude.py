@@ -780,8 +780,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     alone = {j for f in named for j in f.joints}
     # not thinned by joints that are well
     if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):
-        of, mine = " of that joint", d.joints[next(iter(alone))]
-        joint = next(iter(alone))
+        (joint,) = alone
+        of, mine = " of that joint", d.joints[joint]
         before, after = 1e3 * mine["before"], 1e3 * (written["joints"] if written else {}).get(joint, mine["after"])
     said = prefix + _names(named, d)
     if h["before"] is None:
