@@ -353,18 +353,24 @@ def test_while_learning_a_cube_may_not_go_as_far():
     assert not make("task.termination.training=null").terminated()["dropped"].any()
 
 
-def test_a_start_that_was_lost_is_met_again_while_learning_and_not_when_judged():
+def test_a_start_that_was_lost_is_met_again_as_often_as_goals_are_reached_and_not_when_judged(monkeypatch):
     env = make("task.initial.again=0.999999", worlds=16)
-    start, lost = env.begun_with.clone(), torch.arange(16) % 2 == 0
-    env.dropped = lost
-    env.reset_all()
-    assert torch.equal(env.begun_with[lost], start[lost]) and bool((env.begun_with[~lost] != start[~lost]).any())
-    torch.testing.assert_close(env.object_pose[:, :3], env.grasps.pose[env.begun_with][:, :3], rtol=0, atol=1e-5)
-    env.reset(torch.zeros(16, dtype=torch.bool))
-    assert torch.equal(env.begun_with[lost], start[lost])
+    start, lost = torch.arange(16), torch.arange(16) % 2 == 0
+
+    def met(successes: int, drawn: float) -> bool:
+        """Reset the lost half while the other half has reached so many goals, every number drawn being the same."""
+        env.begun_with.copy_(start), env.dropped.copy_(lost), env.successes.fill_(successes)
+        monkeypatch.setattr(env.sampler, "uniform", lambda *shape: torch.full((16, *shape), drawn))
+        env.reset(lost)
+        monkeypatch.undo()
+        pose = env.grasps.pose[env.begun_with][lost, :3]
+        torch.testing.assert_close(env.object_pose[lost, :3], pose, rtol=0, atol=1e-5)
+        assert torch.equal(env.begun_with[~lost], start[~lost])
+        return torch.equal(env.begun_with[lost], start[lost])
+
+    assert met(1, 0.49) and met(3, 0.49) and not met(1, 0.51) and not met(0, 0.01)
     env.end_curriculum()
-    env.reset_all()
-    assert bool((env.begun_with[lost] != start[lost]).any())
+    assert not met(1, 0.01)
 
 
 def test_quaternion_jumps_and_six_does_not():

@@ -79,8 +79,7 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
         self.taxel_point = None if t["observe"]["force_weighted"] else self.taxels()
 
     def symmetries(self) -> list[dict[str, Callable[[torch.Tensor], torch.Tensor]]]:
-        """Return the symmetries of a cube, which looks the same from each side: the quarter turns of its own frame
-        about its z."""
+        """Return those of a cube, which looks the same from each side: quarter turns of its own frame about its z."""
         if self.names != (CUBE,):
             return []
         turns = [rotation.about(self.up, torch.tensor(k * math.pi / 2, device=self.device)) for k in (1, 2, 3)]
@@ -88,11 +87,12 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
 
     # -- an episode begins
     def once_more(self, drawn: torch.Tensor) -> torch.Tensor:
-        """Begin anew from the pose of the episode that was lost just now, with probability `initial.again`: a pose that
-        is lost in the first second is else met for a thousandth of the time."""
+        """Begin anew from the pose lost just now, with probability `initial.again` times the share of worlds that have
+        reached a goal: before anything turns, hard poses would else be most of what is met, and teach to hold still."""
         if not self.task["initial"].get("again", 0.0):
             return drawn
-        return torch.where((self.dropped | self.tipped) & (self.sampler.uniform() < self.again), self.begun_with, drawn)
+        chance = self.again * (self.successes > 0).float().mean()
+        return torch.where((self.dropped | self.tipped) & (self.sampler.uniform() < chance), self.begun_with, drawn)
 
     def begin(self, mask: torch.Tensor) -> None:
         m1, pose = mask[:, None], self.begin_held(mask)
