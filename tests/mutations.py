@@ -267,13 +267,6 @@ MUTATIONS = (
         "tests/test_gap_inverse.py::test_further_effects_are_named_one_after_another",
     ),
     Mutation(
-        "a torque that takes nothing off is offered",
-        "dexsim/gap/rules.py",
-        "    earns: float = 0.1\n",
-        "    earns: float = 0.0\n",
-        "tests/test_gap_rules.py::test_a_stand_in_must_take_a_least_share_off",
-    ),
-    Mutation(
         "a joint whose ringing is explained is said to be pushed",
         "dexsim/gap/judge/conclude.py",
         "(p.joint in d.ringing or _followed(d, p.joint))",

@@ -24,8 +24,8 @@ class Added:
     """An effect that dexsim does not have. column: the rest of its line; law: its functions, before the line `above`;
     terms, reference: (the line before which, what is added) in `laws.py` and `reference.py`; family: the file of its
     entry; entry: of its class, what no other has; hidden: its size in the demo; torque, friction: that it adds [N.m] at
-    rest at 1 rad, the target 0.1 rad off and 1 remembered; remaining: share of the torque that may stay; believed: of
-    the demo's drive, where its own would hardly show the effect; alone: a demo of one joint can show it."""
+    rest at 1 rad, the target 0.1 rad off and 1 remembered; believed: of the demo's drive, where its own would hardly
+    show the effect; alone: a demo of one joint can show it."""
 
     effect: str
     words: str
@@ -42,7 +42,6 @@ class Added:
     hidden: float
     torque: float = 0.0
     friction: float = 0.0
-    remaining: float = 0.5
     high: float = 1.0
     more: str = ""
     believed: dict[str, float] = field(default_factory=dict)
@@ -188,7 +187,7 @@ def tilted(size: Any, q: Any):
 '''),),
     "signals", "((0.03,), (0.1,))", 'np.abs(np.sin(2 * case.regimes["position"]))', 0.12,
     # the loop's own torque holds against it: what gravity and friction are at the true pose is little
-    torque=-2.0 * 0.12 * np.sin(2.0), remaining=1.0, high=0.3, more="misreads = True",
+    torque=-2.0 * 0.12 * np.sin(2.0), high=0.3, more="misreads = True",
 )  # fmt: skip
 LOOP = Added(  # of its error
     "soft_dead_zone", "hardly acts on small errors", "dead_zone", "rad", '0.05, "of errors", feature="dead_zone"',
@@ -297,7 +296,7 @@ def weary(share: Any, worked: Any):
         efficiency = efficiency / (1.0 + p["weary"] * step.memory["worked"])
 '''),),
     "drive", "((0.3,), (1.0,), (3.0,))", CHANGES, 4.0,
-    torque=2.0 * 0.1 * (1.0 / 5.0 - 1.0), high=10.0, remaining=0.8,
+    torque=2.0 * 0.1 * (1.0 / 5.0 - 1.0), high=10.0,
 )  # fmt: skip
 TENDON = Added(  # by another joint
     "soft_tendon", "is dragged by a tendon that gives", "tendon", "1/rad", '0.3, "drag", feature="rare"',
@@ -353,9 +352,7 @@ from dexsim.actuator import Servo
 from dexsim.actuator.columns import INDEX, MEMORY
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
-from dexsim.gap.diagnosis import Drives as Steps, Settings, diagnose, save
-from dexsim.gap.judge.handed_on import residual_torque
-from dexsim.gap.search.search import polished
+from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.servos import ServoRandomizer
 
@@ -370,16 +367,6 @@ class Drives:  # of 400 worlds
     params = nominal.expand(400, *nominal.shape).clone()
     check_simulated = Servo.check_simulated
 
-left, judge = [], Steps.judge
-def judged(self):
-    x = self.searched[0]
-    case, search, outcome = x.case, x.search, x.outcome
-    for trial in (outcome.none, outcome.best):
-        torque, on = residual_torque(case, self.w.runs, polished(search, trial), 0)
-        left.append(float(np.sqrt(np.mean(torque[on] ** 2))))
-    judge(self)
-Steps.judge = judged
-
 paths, model, servo, hidden = demo.make(out, effect, seconds=5.0)
 d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={effect, beside}),
              say=lambda _: None)
@@ -392,7 +379,7 @@ Drives.features = frozenset({column})
 ServoRandomizer(Drives(), Sampler({"servo": {column: [0.02, 0.06]}}, torch.Generator().manual_seed(0), 400,
                 "cpu")).draw(torch.ones(400).bool())
 drawn = Drives.params[:, 0, INDEX[column]]
-print(json.dumps({"hidden": hidden, "left": left, "drawn": [float(drawn.min()), float(drawn.max())],
+print(json.dumps({"hidden": hidden, "drawn": [float(drawn.min()), float(drawn.max())],
     "torque": float(there["qfrc_applied"] - without["qfrc_applied"]),
     "friction": float(there["dof_frictionloss"] - without["dof_frictionloss"]),
     "row": ServoTable.load(out / "servo.yaml").value("joint", column).value}))
@@ -457,7 +444,6 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(grown, added):
     assert said["torque"] == pytest.approx(added.torque, rel=1e-3, abs=1e-9)
     assert said["friction"] == pytest.approx(added.friction, rel=1e-3, abs=1e-9)
     assert first["effect"] == added.effect and found == pytest.approx(added.hidden, rel=0.1)
-    assert said["left"][1] < added.remaining * said["left"][0]  # what it explains is not left to a stand-in
     assert said["drawn"] == [pytest.approx(0.02, abs=1e-3), pytest.approx(0.06, abs=1e-3)]
     assert said["row"] == pytest.approx(found, rel=1e-3)
     assert added.words in (out / "report.html").read_text(encoding="utf-8")

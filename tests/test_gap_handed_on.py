@@ -1,15 +1,12 @@
-"""What a diagnosis hands on: servo.yaml as the centre and width of randomization, model.xml as the hand, the
-stand-in."""
+"""What a diagnosis hands on: servo.yaml as the centre and width of randomization, model.xml as the hand."""
 
 from __future__ import annotations
-
-import copy
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from test_gap import demo, motion, plant_run
+from test_gap import demo, motion
 from worlds import grasp_cfg, grasp_env
 
 from dexsim.actuator.columns import INDEX
@@ -17,10 +14,6 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.finding import Finding
-from dexsim.gap.judge import handed_on
-from dexsim.gap.plant.case import build
-from dexsim.gap.read import conditions
-from dexsim.gap.search.search import JointSearch, without_search
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import realistic
@@ -267,61 +260,3 @@ def _write(path, text):
     path.write_text(text)
     return path
 
-
-@pytest.mark.slow
-def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
-    """A drag that the catalogue has not (torque against speed times |speed|): regressed, judged, written, loaded by
-    training."""
-    drag = -3e-2
-    table = ServoTable.from_dict(
-        {
-            "joints": {
-                "*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.005}
-            }
-        }
-    )
-    true = copy.deepcopy(table)
-    true.set("joint", "standin_drag", drag)
-    spec = mujoco.MjSpec.from_string(demo.MODEL)
-    from dexsim.gap.read import Run
-    from dexsim.recording.mechanism import Mechanism
-
-    runs = []
-    for k in (0, 1, 3):
-        t, cmd = motion(k, 6.0, k)
-        full = drive(
-            Mechanism(spec, ("joint",), true, "pendulum"),
-            Series(t, cmd[:, None], COMMANDS, t),
-            ["joint"],
-            6.0,
-            timestep=1e-3,
-        )
-        pick = slice(0, None, 10)
-        runs.append(
-            Run(f"r{k}", ("joint",), t, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81]))
-        )
-        runs[-1].smooth()
-    case = build(spec.compile(), runs)[0]
-    none = without_search(JointSearch(case, [0, 2], None, conditions(runs))).none
-    found = handed_on.fit_stand_in(case, runs, none, [0, 2], [1])
-    assert found is not None and found.after < 0.5 * found.before
-    assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
-    hand = ServoTable.from_dict(grasp_cfg()["servo"])
-    found.joint = JOINT
-    handed_on.write_stand_in(hand, [found], tmp_path / "servo_standin.yaml")
-    env = grasp_env(f"servo_file={tmp_path / 'servo_standin.yaml'}", worlds=32)
-    drawn = env.servo.params[:, xhand.JOINTS.index(JOINT), INDEX["standin_drag"]]
-    assert (
-        float(drawn.min()) >= found.low[3] - 1e-6
-        and float(drawn.max()) <= found.high[3] + 1e-6
-        and float(drawn.std()) > 0
-    )
-
-
-def test_no_stand_in_where_nothing_is_left():
-    runs = [plant_run(f"r{k}", k, 4.0, {}, seed=k) for k in (0, 1, 3)]
-    for r in runs:
-        r.smooth()
-    case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
-    none = without_search(JointSearch(case, [0, 2], None, conditions(runs))).none
-    assert handed_on.fit_stand_in(case, runs, none, [0, 2], [1]) is None

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from test_gap import model, plant_run
 
-from dexsim.actuator.reference import lagged
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.judge.handed_on import missing_of, servo_changes
@@ -54,15 +53,6 @@ def test_step_response_is_the_closed_form_with_one_mean_delay(stages):
     after = np.maximum(t - 0.05, 0.0)
     assert np.abs(torque - closed(after, stages)).max() < 1.1 * DT / TIME  # a step either way
     assert np.sum(targets - torque) * DT == pytest.approx(TIME, abs=1.5 * DT)
-    assert np.abs(lagged(t, targets, TIME, stages) - closed(after, stages)).max() < 1.5 * DT / TIME
-
-
-def test_the_reference_is_exact_for_one_stage_and_converges_for_two():
-    for dt in (1e-3, 1e-4):
-        t = dt * np.arange(round(0.3 / dt))
-        on = np.where(t > 0, 1.0, 0.0)
-        assert np.abs(lagged(t, on, TIME, 1) - closed(t, 1)).max() < 1e-12
-        assert np.abs(lagged(t, on, TIME, 2) - closed(t, 2)).max() < 12 * dt
 
 
 @pytest.mark.parametrize("stages", [1, 2])

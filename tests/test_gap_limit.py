@@ -7,13 +7,13 @@ import pytest
 
 from dexsim.gap import diagnosis, inquiry
 from dexsim.gap.compute import GRACE, JUDGING, PAGE, TimeLimit
-from dexsim.gap.diagnosis import PLANNING, STANDING_IN, Drives
+from dexsim.gap.diagnosis import PLANNING, Drives
 from dexsim.gap.inquiry import Inquiry, Settings
 from dexsim.gap.judge import full_model
 from dexsim.gap.judge.conclude import Noise
 from dexsim.gap.plant.case import build
 from dexsim.gap.search import baseline
-from dexsim.gap.search.search import JointSearch, SearchedJoint
+from dexsim.gap.search.search import JointSearch
 from dexsim.gap.touch.diagnosis import SEARCHING, Touch
 from tests.test_gap import model, plant_run
 
@@ -123,31 +123,6 @@ def test_recordings_whose_model_would_take_too_long_are_left_out_evenly(limit, m
     if modelled < 10:
         assert [r.name for r in drives.w.runs] == {7: list("0135679"), 2: list("06")}[modelled]
         assert f"{10 - modelled} of 10 recordings are left out" in drives.w.limit.left_out[0]
-
-
-@pytest.mark.parametrize("spent, fitted", [(0.0, 3), (1 - STANDING_IN + 0.01, 0), (0.75, 2)])
-def test_stand_ins_stop_in_time(spent, fitted, clock, monkeypatch):
-    """Out of 100 s: none is begun in the last tenth, nor one where less is left than twice what one took (6 s each)."""
-
-    def fit(*_):
-        clock[0] += 6.0
-        return SimpleNamespace(text="a stand-in")
-
-    monkeypatch.setattr("dexsim.gap.judge.handed_on.fit_stand_in", fit)
-    drives = object.__new__(Drives)
-    drives.w = SimpleNamespace(limit=TimeLimit(100.0), runs=[], settings=SimpleNamespace(seed=0))
-    drives.parts = SimpleNamespace(train=[0], test=[1], span_train=None, span_test=None)
-    drives.noise, drives.written = SimpleNamespace(floor=1.0), SimpleNamespace(plain=lambda joint: False)
-    search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
-    outcome = SimpleNamespace(none=None, best=None)
-    drives.searched = [SearchedJoint(SimpleNamespace(joint=j), search, outcome) for j in "abc"]
-    joints = {j: {"after": 1e3} for j in "abc"}
-    d = SimpleNamespace(joints=joints, findings=[], standins=[], notes=[])
-    clock[0] = 100 * spent
-    drives.stand_in(d)
-    assert len(d.standins) == fitted
-    without = ", ".join("abc"[fitted:])
-    assert drives.w.limit.left_out == ([f"no stand-in is fitted to {without} (the limit of 100 s)"] if without else [])
 
 
 @pytest.mark.parametrize("spent, seconds", [(0.5, 200.0), (1 - PLANNING + 0.01, 2000.0), (0.5, 100.0)])

@@ -10,8 +10,6 @@ import pytest
 from test_gap_least import Judged, judged
 
 from dexsim.gap import locate
-from dexsim.gap.compute import TimeLimit
-from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
@@ -26,7 +24,6 @@ from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import ringing, scan, search
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointSearch, Member, complexity_price, thin
-from dexsim.gap.search.search import SearchedJoint
 from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
 
@@ -277,36 +274,6 @@ def test_intervals_grow_with_what_is_left():
     assert (
         factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)
     )
-
-
-def test_a_stand_in_must_take_a_least_share_off():
-    n = 200
-    t, noise = 0.01 * np.arange(n), np.random.default_rng(0).normal(size=n)
-    run = SimpleNamespace(t=t, qs=np.sin(9 * t)[:, None], vs=np.cos(7 * t)[:, None])
-    for after, offered in ((0.91, False), (0.89, True)):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(handed_on, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
-            patch.setattr(handed_on, "_held_out", lambda *_, after=after: (1.0, after))
-            assert (
-                handed_on.fit_stand_in(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None
-            ) is offered, after
-
-
-def test_a_stand_in_is_offered_where_much_is_left():
-    for error, offered in ((1.25, False), (1.35, True)):  # x the noise floor
-        d = SimpleNamespace(joints={"j": {"after": error}}, findings=[], standins=[], notes=[])
-        parts = SimpleNamespace(train=[], test=[], span_train=None, span_test=None)
-        search = SimpleNamespace(polished={}, deadline=SimpleNamespace(over=lambda: True))
-        outcome = SimpleNamespace(best=None, none=None)
-        drives = SimpleNamespace(searched=[SearchedJoint(SimpleNamespace(joint="j"), search, outcome)],
-                                 noise=SimpleNamespace(floor=1.0), parts=parts,
-                                 written=SimpleNamespace(plain=lambda joint: False),
-                                 w=SimpleNamespace(runs=[], limit=TimeLimit(),
-                                                   settings=SimpleNamespace(seed=0)))  # fmt: skip
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(handed_on, "fit_stand_in", lambda *_: SimpleNamespace(text="a torque stands in"))
-            Drives.stand_in(drives, d)
-        assert (len(d.standins) == 1) is offered, error
 
 
 class Shook(ringing.Ringing):

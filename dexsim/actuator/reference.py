@@ -214,21 +214,6 @@ def torque_along(
     return np.clip(wanted, -limit, limit)
 
 
-def lagged(t: np.ndarray, torque: np.ndarray, time: float, stages: int = 1) -> np.ndarray:
-    """Return the torque [S] N.m after a lag of `time` s, of that in force before each of the times t [S] s: exact for
-    one that changes at these times only; from rest at the first.
-
-    stages: 1 first order, 2 second order: two in a row with half the time each (`laws.lag_share`)."""
-    out = np.asarray(torque, float)
-    for _ in range(stages):
-        gone = 1.0 - np.exp(-np.diff(t, prepend=t[0]) * stages / time)
-        y, x, out = out[0], out, np.empty_like(out)
-        for i in range(len(x)):
-            y += gone[i] * (x[i] - y)
-            out[i] = y
-    return out
-
-
 def parasitic_torque(
     p: Mapping[str, Numbers], q: Numbers, v: Numbers, features: Collection[str] = FEATURES, step: Step | None = None
 ) -> tuple[Numbers, Numbers, Numbers]:

@@ -37,7 +37,6 @@ writes to out=:
   servo.yaml            the fitted drives with intervals: python train.py servo_file=FILE randomizes inside them
   tactile.yaml          where something of touch was found: python train.py tactile_file=FILE draws inside
   model.xml             where masses or inertias were fitted: python train.py model_file=FILE
-  servo_standin.yaml    servo.yaml with a torque that stands in for what no effect explains, where that helps
   next_recording.mcap   commands to send, where another recording would settle a question
 
 examples:

@@ -18,7 +18,7 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.gap import compute
 from dexsim.gap.compute import LONGER, TimeLimit, map_joints, workers
-from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
+from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.inquiry import (
     Diagnosis,
     Inquiry,
@@ -30,7 +30,7 @@ from dexsim.gap.inquiry import (
     read_files,
     to_runs,
 )
-from dexsim.gap.judge import conclude, full_model, handed_on, held_out
+from dexsim.gap.judge import conclude, full_model, held_out
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
@@ -48,7 +48,6 @@ from dexsim.gap.search.search import (
     SearchedJoint,
     Trial,
     plain_of,
-    polished,
     search_joint,
     settle_found,
     without_search,
@@ -87,9 +86,6 @@ def _diagnosed(w: Inquiry) -> Diagnosis:
     touch.report(d)
     conclude.decide(d)
     w.clock.lap("judging on held-out data")
-    if d.data["verdict"] in ("unknown", "partly_explained"):
-        drives.stand_in(d)
-        w.clock.lap("stand-in")
     drives.replay(d)
     w.clock.lap("replay of what is written")
     _next(d, w, drives.searched)
@@ -143,9 +139,9 @@ __all__ = ["Diagnosis", "Settings", "diagnose", "save"]
 # -- the drives -------------------------------------------------------------------------------------------------------
 
 Answers = list[tuple[JointSearch, Outcome | None]]
-# shares of a limit of time: that the model along the motion may take; that must be left for stand-ins, and for plans of
-# a replay or a recording
-MODELLING, STANDING_IN, PLANNING = 0.2, 0.1, 0.07
+# shares of a limit of time: that the model along the motion may take; that must be left for plans of a replay or a
+# recording
+MODELLING, PLANNING = 0.2, 0.07
 PLAN = 60.0  # s that must be left for a plan of the next recording: one call, of 37 s on a busy machine
 MUCH = 20.0  # s of all joints' recordings for each second of a limit: the model along less is not worth a look
 
@@ -628,30 +624,6 @@ class Drives(Steps):
         add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
         conclude.claim_push(d, self.pushes)
         d.data["unexplained"]["not_considered"] = self.left_out
-
-    def stand_in(self, d: Diagnosis) -> None:
-        """Stand-ins for joints of which something is left that no effect explains."""
-        p, limit, longest, late = self.parts, self.w.limit, 0.0, []
-        for x in self.searched:
-            case, search, outcome = x.case, x.search, x.outcome
-            # a torque beside the plain model, which is written, would be another one
-            if d.joints[case.joint]["after"] < JUDGE.within * self.noise.floor or self.written.plain(case.joint):
-                continue
-            if limit.spent(1 - STANDING_IN) or limit.rest() < 2 * longest:
-                late.append(case.joint)
-                continue
-            begun = time.monotonic()
-            claimed = any(case.joint in f.joints and modelled(f) for f in d.findings)
-            trial = polished(search, outcome.best if claimed else outcome.none)
-            found = handed_on.fit_stand_in(
-                case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed
-            )
-            longest = max(longest, time.monotonic() - begun)
-            if found is not None:
-                d.standins.append(found)
-                d.notes.append(found.text)
-        if late:
-            limit.leave_out(f"no stand-in is fitted to {', '.join(late)}")
 
     def replay(self, d: Diagnosis) -> None:
         """The files as they are, over all that was held out, by the function of `play replay=`: the number of the

@@ -19,7 +19,7 @@ from dexsim.gap.compute import TimeLimit
 from dexsim.gap.effects import PadFacts
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.finding import Finding
-from dexsim.gap.judge import confidence, full_model, handed_on
+from dexsim.gap.judge import confidence, full_model
 from dexsim.gap.read import Run, agreement, channels, inputs
 from dexsim.gap.search.search import Outcome
 from dexsim.recording.mechanism import Mechanism
@@ -148,7 +148,6 @@ class Diagnosis:
     shares: dict[str, float] = field(default_factory=dict)
     touch: TouchResult | None = None
     lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
-    standins: list[handed_on.StandIn] = field(default_factory=list)
     # (joint, recording): mean |error| before, after
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     untrained: list[str] = field(default_factory=list)

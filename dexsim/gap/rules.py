@@ -80,7 +80,7 @@ class JudgeRules:
     verdict's."""
 
     # x the noise: an error within it asks for no effect, and is as good as any; beyond it it is said what it depends
-    # on, and a torque stands in; two that differ by less are the same: of repeats, of two engines, of one regime and
+    # on; two that differ by less are the same: of repeats, of two engines, of one regime and
     # the rest, of a taxel in its own place and in another's, of a gain for every taxel and one for all
     within: float = 1.3
     # x the noise floor: an error that large is not nothing, though only a few moments show it; a taxel that is pressed
@@ -95,8 +95,8 @@ class JudgeRules:
     sure_of_one: float = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
     # confidence from which a name stands alone: below it training is also given what was believed before
     sure: float = 0.8
-    # share of the error held out that a name must cost when dropped to keep all of its confidence; that a stand-in
-    # torque must take off; that the engine may leave beside what the plant leaves, in squares
+    # share of the error held out that a name must cost when dropped to keep all of its confidence; that the engine may
+    # leave beside what the plant leaves, in squares
     earns: float = 0.1
     # of the largest of an effect's sizes in fits without one condition each: the least must be as large
     repeated: float = 0.2

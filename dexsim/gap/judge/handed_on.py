@@ -1,43 +1,22 @@
-"""What is handed on to training: fitted effects as servo columns and as model fields, and a stand-in torque for what no
-effect explains."""
+"""What is handed on to training: fitted effects as servo columns and as model fields."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dexsim import intervals
 from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
-from dexsim.actuator.reference import (
-    command_delay,
-    dragged_target,
-    dry_friction,
-    friction_acts,
-    lagged,
-    loop_torque,
-    lost_error,
-    over_time,
-    parasitic_torque,
-    supply_left,
-    torque_along,
-    viscous,
-    warm_motor,
-)
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence
-from dexsim.gap.plant.case import Case, true_motion
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
-from dexsim.gap.plant.free_run import free_run
-from dexsim.gap.read import BLOCK, Run
-from dexsim.gap.rules import BELIEF, JUDGE
+from dexsim.gap.rules import BELIEF
 from dexsim.gap.search.search import Trial
 
 if TYPE_CHECKING:
@@ -258,180 +237,3 @@ def save_model(spec: mujoco.MjSpec, path: Path) -> None:
         spec.modelfiledir = str(path.parent)
         spec.compile()
     path.write_text(spec.to_xml(), encoding="utf-8")
-
-
-# -- a stand-in torque ------------------------------------------------------------------------------------------------
-# A stand-in for what no effect explains: a small regression of the residual torque, which training may use.
-#
-#     torque = constant + position * q + speed * v + drag * v |v|
-#
-# It names nothing. Inverse dynamics along the measured motion with the best hypothesis leaves a torque; the four
-# numbers are fitted to it, judged on recordings held out, and written to `servo_standin.yaml` as the servo's
-# `standin_*` columns.
-
-STAND_IN_COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")
-STAND_IN_DRAWS = 200  # of the bootstrap
-
-
-@dataclass
-class StandIn:
-    """Four numbers [4] (N.m, N.m/rad, N.m.s/rad, N.m.s2/rad2) with 90 % intervals; held-out rms before and after
-    [rad]."""
-
-    joint: str
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    before: float
-    after: float
-
-    @property
-    def text(self) -> str:
-        """What it does, in words."""
-        return (
-            f"{self.joint}: a stand-in torque (constant, position, speed, drag) takes the held-out error from "
-            f"{1e3 * self.before:.3g} to "
-            f"{1e3 * self.after:.3g} mrad; it names nothing (servo_standin.yaml)"
-        )
-
-
-KINDLESS = frozenset(FEATURES) - {"rare"}  # of the servo's features: a deadband without its kind, no torque inside it
-
-
-def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (torque [S] N.m that the measured motion of a run needs beyond the hypothesis, whether it can be read
-    there [S]).
-
-    Where the joint hardly moves, dry friction hides any torque.
-    """
-    plant, j = case.plant, case.index
-    row = expand(plant, trial.fit.params, trial.fit.x[None], trial.fixed)[0, run]
-    p = lambda name: row[PLANT_INDEX[name]]  # noqa: E731
-    r = runs[run]
-    shown = r.t, r.qs[:, j], r.vs[:, j], r.as_[:, j]
-    t, q, v, a = true_motion(shown, row)
-    grid = t[0] + plant.dt * np.arange(plant._grid[run + 1] - plant._grid[run])
-    series = plant.series[plant._grid[run] : plant._grid[run + 1]]
-    s = lambda name: np.interp(t, grid, series[:, SERIES_INDEX[name]])  # noqa: E731
-    columns = {n: row[i] for n, i in INDEX.items()}
-    cmd = r.command_at(t - over_time(command_delay, columns, t, t))[:, j]
-    away = np.interp(t, grid, series[:, SERIES_INDEX["drag0"] + max(int(p("coupling_from")), 0)])
-    cmd = cmd + over_time(dragged_target, columns, t, away)
-    error = cmd - shown[1]
-    lost, _, acts = over_time(lost_error, columns, t, cmd, error, features=KINDLESS)
-    asked = loop_torque(columns, error - lost, shown[2], acts)
-    supply = over_time(supply_left, columns, t, s("supply"), s("others_torque")) if plant.voltage else 1.0
-    able = lambda of, gave, *rest: warm_motor(of, gave, plant.voltage, *rest)  # noqa: E731
-    motor = np.zeros_like(asked)
-    for _ in range(2):
-        tau0, no_load, efficiency, rubs = now = over_time(able, columns, t, motor)
-        motor = torque_along(asked, v, tau0, no_load, plant.voltage, supply)
-        if p("lag") > 0:
-            motor = lagged(t, motor, p("lag"), int(p("lag_stages")))
-        if not any(map(np.ndim, now)):  # else what it can give follows from what it gave, known from now on
-            break
-    slope = 0.05 * max(case.scales.speed, 1e-9)
-    beside, _, _ = over_time(parasitic_torque, columns, t, q, v)
-    inertia = s("inertia") * p("inertia_scale") + p("armature")
-    turned = q - shown[1]  # the model was evaluated at the measured pose
-    gravity = s("gravity_cos") * np.cos(turned) + s("gravity_sin") * np.sin(turned)
-    needed = inertia * a + p("gravity_scale") * gravity + s("rest")
-    needed += p("spring") * q + p("spring_preload")
-    needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
-        s("own_cos") + s("own_inertia") * a
-    )
-    level = rubs * over_time(dry_friction, columns, t, q, v, motor, inertia * a - needed) + case.constants.friction
-    uneven, _ = over_time(friction_acts, columns, t, q, v)
-    friction = (
-        level * np.sign(v)
-        + uneven * level
-        + (rubs * viscous(columns, v) + case.constants.damping) * v
-    )
-    on = np.abs(v) > slope
-    if r.enabled is not None:
-        on &= r.enabled[:, j] > 0.5
-    on[:3] = on[-3:] = False
-    return needed + friction - efficiency * motor - beside, on
-
-
-def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return [S, 4] what the numbers multiply."""
-    return np.stack([np.ones_like(q), q, v, v * np.abs(v)], 1)
-
-
-def fit_stand_in(
-    case: Case,
-    runs: list[Run],
-    trial: Trial,
-    train: list[int],
-    test: list[int],
-    span_train: dict[int, tuple[float, float]] | None = None,
-    span_test: dict[int, tuple[float, float]] | None = None,
-    seed: int = 0,
-) -> StandIn | None:
-    """Return the stand-in of one joint; None where it would not take JUDGE.earns off the held-out error."""
-    xs, ys, parts = [], [], []
-    for r in train:
-        torque, on = residual_torque(case, runs, trial, r)
-        t = runs[r].t - runs[r].t[0]
-        if span_train and r in span_train:
-            on = on & (t >= span_train[r][0]) & (t <= span_train[r][1])
-        xs.append(basis(runs[r].qs[on, case.index], runs[r].vs[on, case.index]))
-        ys.append(torque[on])
-        parts.append(1000 * r + (t[on] / BLOCK).astype(int))
-    x, y = np.concatenate(xs), np.concatenate(ys)
-    if len(y) < 60:
-        return None
-    scale = np.maximum(np.sqrt((x**2).mean(0)), 1e-12)
-    _, block = np.unique(np.concatenate(parts), return_inverse=True)
-    count = int(block.max()) + 1
-    gram = np.zeros((count, 4, 4))
-    right = np.zeros((count, 4))
-    z = x / scale
-    huber = 2.5 * float(np.median(np.abs(y - np.median(y)))) + 1e-12
-    weight = np.minimum(1.0, huber / np.maximum(np.abs(y - np.median(y)), 1e-12))
-    np.add.at(gram, block, weight[:, None, None] * z[:, :, None] * z[:, None, :])
-    np.add.at(right, block, (weight * y)[:, None] * z)
-    ridge = 1e-3 * len(y) * np.eye(4)
-    solve = lambda k: np.linalg.solve(gram[k].sum(0) + ridge, right[k].sum(0)) / scale  # noqa: E731
-    value = solve(np.arange(count))
-
-    def each(index: np.ndarray, axis: int = -1) -> np.ndarray:
-        return np.moveaxis(np.apply_along_axis(solve, axis, index.astype(int)), axis, 0)
-
-    low, high = np.quantile(intervals.draws((np.arange(count),), each, seed, STAND_IN_DRAWS), [0.05, 0.95], axis=-1)
-    before, after = _held_out(case, runs, trial, value, test, span_test)
-    if not after < (1 - JUDGE.earns) * before:
-        return None
-    return StandIn(case.joint, value, np.minimum(low, value), np.maximum(high, value), before, after)
-
-
-def _held_out(
-    case: Case,
-    runs: list[Run],
-    trial: Trial,
-    value: np.ndarray,
-    test: list[int],
-    span_test: dict[int, tuple[float, float]] | None,
-) -> tuple[float, float]:
-    """Return held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
-    windows = case.plant.windows(None, test, span=span_test)
-    measured = case.plant.q[windows.sample_row]
-    out = []
-    for k in (0.0, 1.0):
-        plant, series = copy.copy(case.plant), case.plant.series.copy()
-        q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
-        series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
-        plant.set_series(series)
-        simulated, _ = free_run(replace(case, plant=plant), trial.fit.params, trial.fit.x, windows, trial.fixed)
-        out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
-    return out[0], out[1]
-
-
-def write_stand_in(table: ServoTable, found: list[StandIn], path: Path) -> None:
-    """The fitted servo with the stand-ins' columns and their intervals, as a file that training loads."""
-    out = copy.deepcopy(table)
-    for s in found:
-        for name, value, low, high in zip(STAND_IN_COLUMNS, s.value, s.low, s.high, strict=True):
-            out.set(s.joint, name, round(float(value), 9), round(float(low), 9), round(float(high), 9))
-    out.save(path)

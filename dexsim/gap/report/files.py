@@ -22,7 +22,6 @@ from dexsim.gap.effects import Effect
 from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.finding import Finding, gathered
 from dexsim.gap.inquiry import Diagnosis
-from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.conclude import place, spoken, unit_of, words_of
 from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
@@ -31,7 +30,7 @@ from dexsim.gap.report.charts import mechanism, pad, scale
 from dexsim.gap.search import baseline
 from dexsim.gap.touch.diagnosis import handed, save_tactile
 
-MAYBE = ("servo.yaml", "tactile.yaml", "servo_standin.yaml", "model.xml", "evidence.json")
+MAYBE = ("servo.yaml", "tactile.yaml", "model.xml", "evidence.json")
 """Files of a diagnosis that are written where there is something in them."""
 
 
@@ -49,9 +48,6 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             handed(d.touch.findings, d.touch.facts, d.touch.names), stage / "tactile.yaml"
         ):
             names.append("tactile.yaml")
-        if d.standins and d.servo is not None:
-            handed_on.write_stand_in(d.servo, d.standins, stage / "servo_standin.yaml")
-            names.append("servo_standin.yaml")
         if d.model_spec is not None:
             try:
                 d.model_spec.compile()
@@ -89,7 +85,6 @@ RESULTS = (
     "evidence.json",
     "servo.yaml",
     "tactile.yaml",
-    "servo_standin.yaml",
     "model.xml",
     MODEL_FILES,
     "next_recording.mcap",
