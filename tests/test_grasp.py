@@ -655,6 +655,12 @@ def test_play_prints_the_papers_columns_of_the_grasp():
         "force_command_correlation",
         "torque_command_correlation",
     ]
+    thumb, *others = grasp_eval._by_finger(r, stage)  # presses with twice what is said, F_max is 2 N
+    assert thumb[:2] == ("thumb", "none: a band") and all(x[1:4] == ("the command", "1.00", "0.00") for x in others)
+    stage.thumb_range = [0.0, 1.0]
+    thumb = grasp_eval._by_finger(r | {"thumb_command": 1 - command}, stage)[0]
+    assert thumb[1:3] == ("its own", "-1.00")
+    assert float(thumb[3]) == pytest.approx(np.abs(3 * command - 2).mean(), abs=0.01)
     nothing = r | {"held": np.zeros(n)}
     assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, stage))[0][2] == [("-", "-", "-", "-")]
 

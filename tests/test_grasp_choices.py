@@ -88,6 +88,14 @@ def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
     built, force = measure.observe(state, np.array([0.05, 0.0, 0.1]), [0.7], np.zeros(12), np.zeros(12))
     assert built.shape == (1, at) and built[0, -commands:] == pytest.approx(0.7)
     assert force.shape == (5,) and force[1] > 0 and force[[0, 2, 3, 4]].max() == 0  # known to the loop all the same
+    assert measure.commanded(None) == [0.5]
+    if commands == 2:
+        assert measure.commanded([0.7, 0.2]) == [0.7, 0.2]
+        both = measure.observe(state, np.array([0.05, 0.0, 0.1]), [0.7, 0.2], np.zeros(12), np.zeros(12))[0]
+        assert both[0, -2:] == pytest.approx([0.7, 0.2])
+    else:
+        with pytest.raises(UserError, match="1 number"):
+            measure.commanded([0.7, 0.2])
     row = next((r for r in table if r["name"] == "contact_force"), None)
     assert (row is None) == (pads == 0)
     if row is not None:

@@ -35,8 +35,9 @@ settings (key=default):
   ros2_message=       joint_state, or xhand: the messages of the vendor's ROS driver (needs rclpy)
   ros2_effort=1       mA a unit of the states' effort
   seconds=10          of the policy, after homing
-  command=            what the policy is told: grasp, a force, 0..1 of F_max (default 0.5); a task of your own, the
-                      numbers of its commands, as in "1 0 0 0" (default: the bundle's)
+  command=            what the policy is told: grasp, a force, 0..1 of F_max (default 0.5), and the thumb's own after
+                      it where the policy takes one; a task of your own, the numbers of its commands, as in
+                      "1 0 0 0" (default: the bundle's)
   calibration=        calibration.yaml instead of the bundle's
   record=             FILE.mcap, a new one, of everything seen and sent (default: out/deploy_<date>.mcap;
                       record=none: nothing)

@@ -72,8 +72,15 @@ class Measured(Measure):
         self._z = np.float32(0.0)
 
     def commanded(self, given: Any) -> list[float]:
-        """Return the commanded force, a share of F_max (0.5 for None). Raises UserError."""
-        return commanded(given, [0.5], str(self.manifest["task"]), 0.0, 1.0)
+        """Return the commanded force, a share of F_max (0.5 for None); where the policy takes the thumb's own after it,
+        both, or one number for both. Raises UserError."""
+        usual = [0.5] * (np.size(given) if np.size(given) == self.commands() else 1)
+        return commanded(given, usual, str(self.manifest["task"]), 0.0, 1.0)
+
+    def commands(self) -> int:
+        """Count the commands that the policy takes."""
+        rows = (x for x in self.manifest["observation"] if x["name"] == "force_command")
+        return sum(x["stop"] - x["start"] for x in rows) or 1
 
     def signals(
         self, state: HandState, seen: np.ndarray | None, command: list[float], target: np.ndarray, action: np.ndarray
@@ -82,7 +89,6 @@ class Measured(Measure):
         the hand feels; torque over tau_max, positive along positive joint position."""
         assert seen is not None
         tips, force, centre = self.touched(state)
-        width = {row["name"]: row["stop"] - row["start"] for row in self.manifest["observation"]}
         z = np.float32(seen[2])
         if self._xy is None:
             self._xy, self._z = np.array(seen[:2], float), z
@@ -91,7 +97,7 @@ class Measured(Measure):
             joint_position=state.position, object_xy=self._xy, object_z=z, object_vz=vz, touch_force=force,
             joint_torque=self.calibration.torque_norm(np.asarray(state.current, float) * 1e-3), touch_centre=centre,
             fingertip=tips, follower=self.hand.followers(state),
-            command=[*command] * width.get("force_command", 1))  # the thumb's own is the others'  # fmt: skip
+            command=command if len(command) > 1 else command * self.commands())  # fmt: skip
 
     def built(self, given: Given) -> np.ndarray:
         xy, z, vz = (np.atleast_1d(given[k]) for k in ("object_xy", "object_z", "object_vz"))

@@ -392,6 +392,8 @@ def _tables(r: dict, k: dict, env: GraspEnv) -> list:
             both = _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able)
             by_shape.append((name + label, int(m.sum()), *both, *missing))
     return [
+        ("Force by finger, held episodes", ("finger", "told by", "correlation", "error N", "N, told below 0.03"),
+         _by_finger(r, env)),
         ("Hold and force by command",
          ("F_cmd", "episodes", "held %", "held pushed %", f"asked N ({n} fingers)", "got N", "error N/finger"), rows),
         ("Held % by mass and friction (where the command can carry the load)",
@@ -399,6 +401,20 @@ def _tables(r: dict, k: dict, env: GraspEnv) -> list:
         ("Held % by object, and % of held episodes in which a finger does not touch",
          ("object", "episodes", "held %", "held pushed %", *names_of), by_shape),
     ]  # fmt: skip
+
+
+def _by_finger(r: dict, env: GraspEnv) -> list[tuple]:
+    """Return a row a finger: whose command it follows, how its force correlates with it, mean error [N], mean force [N]
+    at commands below 0.03."""
+    h, rows = r["held"].astype(bool), []
+    for i, name in enumerate(env.hand.finger_names):
+        own = i in env.hand.opposing and env.thumb_range is not None
+        command, force = r["thumb_command" if own else "command"][h], r["force"][h, i]
+        said = "its own" if own else "the command" if i in env.hand.others else "none: a band"
+        off, low = np.abs(force - command * env.f_max), force[command < 0.03]
+        numbers = (_corr(command, force), off.mean() if h.any() else None, low.mean() if low.size else None)
+        rows.append((name, said, *("-" if x is None else f"{x:.2f}" for x in numbers)))
+    return rows
 
 
 def _pct(ok: np.ndarray, among: np.ndarray) -> str:
