@@ -21,7 +21,7 @@ class Judged(JointAnswer):
     def __init__(self, before: float, after: float):
         """Take the errors of a free run without and with the effect, rad."""
         effect = SimpleNamespace(
-            effort_only=False, jitters=False, shows="", parameters=lambda fitted: {}, signal=lambda *_: np.ones(ROWS)
+            effort_only=False, shows="", parameters=lambda fitted: {}, signal=lambda *_: np.ones(ROWS)
         )
         self.member = SimpleNamespace(id="lag", effect=effect, variant=SimpleNamespace(fixed=(), note=""))
         self.best, self.none = (

@@ -1,5 +1,5 @@
 """Physics that the plant and the handed-on model have beyond one number: a load off its link's centre, elasticity that
-hardens, jitter."""
+hardens."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects import FittedEffect
 from dexsim.gap.effects.body import add_mass
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.judge import joint_answer
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.plant.mechanics import leaf_of
 from dexsim.gap.read import Run, conditions
-from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import intervals
-from dexsim.gap.search.search import JointSearch, search_joint, widened, without_search
+from dexsim.gap.search.search import JointSearch, search_joint, widened
 from tools.assets import xhand
 
 OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
@@ -221,51 +219,3 @@ def _scales():
     run = plant_run("a", 0, 2.0, {})
     run.smooth()
     return build(model(), [run])[0].scales
-
-
-def jittered(kind: int, sd: float) -> Run:
-    """Return a run whose commands act 20 ms and a normal time of `sd` s later than they were sent."""
-    run = plant_run(f"run{kind}", kind, 4.0, {"delay": 0.02}, seed=kind, noisy=False)
-    rng = np.random.default_rng(kind + 50)
-    acts = np.maximum.accumulate(run.cmd_t + 0.02 + np.maximum(sd * rng.standard_normal(len(run.cmd_t)), -0.02))
-    for _ in range(2):
-        run.smooth()
-        moved = Run(run.name, run.joints, acts, run.cmd, run.t, run.q, run.servo, run.gravity)
-        moved.smooth()
-        plant = build(model(), [moved])[0].plant
-        run.q = plant.simulate(plant.base()[None], plant.windows(None))[0][0][:, None].copy()
-        run.qs = None
-    run.q = np.round(run.q / 1.534e-3) * 1.534e-3
-    run.smooth()
-    return run
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sd", [0.0, 0.003])
-def test_jitter_of_a_delay_is_found_and_sized(sd):
-    runs = [jittered(k, sd) for k in (0, 1, 3)]
-    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"command_delay"})
-    best = search_joint(search).best
-    found = joint_answer.estimate_jitter(search, best)
-    assert best.ids == ("command_delay",) and best.fit.value("command_delay.delay") == pytest.approx(0.02, abs=0.002)
-    if not sd:
-        assert found is None
-    else:
-        assert (
-            found.value == pytest.approx(sd, rel=0.15)
-            and found.low < found.value < found.high
-            and found.low < 1.05 * sd
-            and found.high > 0.95 * sd
-        )
-        assert set(found.entry()) == {"value", "low", "high", "unit"}
-
-
-@pytest.mark.slow
-def test_what_only_looks_like_jitter_is_not_reported():
-    """Free play that nobody fitted leaves residuals that the times of commands could take up, too."""
-    runs = [plant_run(f"run{k}", k, 4.0, {"backlash": 0.1}, seed=k) for k in (0, 1, 3)]
-    for r in runs:
-        r.smooth()
-    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
-    none = without_search(search).none
-    assert none.fit.loss > JUDGE.within**2 and joint_answer.estimate_jitter(search, none) is None

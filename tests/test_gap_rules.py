@@ -14,7 +14,7 @@ from dexsim.gap.effects import Variant, param
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.finding import Finding
-from dexsim.gap.judge import conclude, confidence, handed_on, held_out, joint_answer
+from dexsim.gap.judge import conclude, confidence, handed_on, held_out
 from dexsim.gap.judge.joint_answer import stretched
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import coupled
@@ -361,11 +361,6 @@ def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
     return SimpleNamespace(none=one, best=one)
 
 
-def test_jitter_is_reported_where_the_likelihood_gains_much():
-    assert joint_answer.certain(9.0, 0.1, 1.0) and not joint_answer.certain(6.0, 0.1, 1.0)
-    assert not joint_answer.certain(50.0, 1.1, 1.0), "what is left beside it is not noise"
-
-
 def test_a_motion_that_settles_it_is_planned_alone():
     for score, motions in ((4.0, ["steps"]), (2.0, ["steps", "chirp"])):
         with pytest.MonkeyPatch.context() as patch:
@@ -433,16 +428,6 @@ def test_what_the_rest_depends_on_stands_out():
     spot = lambda p, ratio: locate.Spot("j", "speed", 0.0, 1.0, ratio, 1.0, 2.0, 1.0, 0.3, p)  # noqa: E731
     said = lambda *given: len(locate.control([spot(*given)])) == 1  # noqa: E731
     assert said(0.04, 2.0) and not said(0.06, 2.0) and said(0.01, 1.35) and not said(0.01, 1.25)
-
-
-def test_jitter_is_looked_for_where_much_is_left():
-    for loss, looked_for in ((1.8, True), (1.6, False)):
-        answer = Judged(1.0, 0.1)
-        answer.member.effect.jitters = True
-        answer.best = SimpleNamespace(members=(answer.member,), fit=SimpleNamespace(loss=loss, params=[], x=[]))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(joint_answer, "estimate_jitter", lambda *_: SimpleNamespace(entry=lambda: {}))
-            assert ("jitter" in judged(answer).parameters) is looked_for, loss
 
 
 def test_a_little_friction_stays_in_the_model():

@@ -123,7 +123,6 @@ class JudgeRules:
     stretch: float = 0.5  # intervals grow by this, times the square of what is left of what was held out over the noise
     stretch_least: float = 0.5  # the least factor on intervals
     stretch_most: float = 4.0  # the largest factor on intervals
-    jitter: float = 8.0  # gain of the log likelihood from which jitter of a delay is reported
     settled: float = 3.0  # x the noise: a motion on which two hypotheses differ by as much settles between them alone
     surest: float = 0.99  # the largest confidence of a name
     resolved: float = 0.5  # counts of the encoder: an effect that moves the joint by less is doubted

@@ -222,7 +222,6 @@ class Effect:
     # what is left of it without its size, which is fitted anyway, is an effect too
     parts_stand: ClassVar[bool] = False
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
-    jitters: ClassVar[bool] = False  # its size may vary from command to command
     alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
     by_torque: ClassVar[str] = ""  # what `search.inverse_dynamics` calls it, where that has a column of it
     # whether that column names it; else it only keeps others from taking its trace for their own

@@ -27,7 +27,6 @@ class CommandDelay(Effect):
     classes = ("late",)
     motions = ("steps", "chirp")
     slows = True
-    jitters = True
     demo = {"delay": 0.02}
 
     def variants(self, s: Scales) -> list[Variant]:

@@ -246,11 +246,6 @@ class JointPlant:
             k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
             fine[:, SERIES_INDEX["enabled"]] = exact["enabled"][k]
 
-    @property
-    def command_times(self) -> list[np.ndarray]:
-        """[K] s of each run: when its targets were sent."""
-        return self._cmd_t
-
     def set_series(self, series: np.ndarray) -> None:
         """Other series [G, E] in the place of those that were added."""
         self.series, self._d, self._version = series, {}, next(_VERSIONS)

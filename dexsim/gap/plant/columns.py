@@ -91,12 +91,7 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("gear_load_friction_backdriven", 0.0, "1", "the same where the joint drives the gear"),
     ("gear_load_power", 1.0, "1", "both are shares of unit * (|torque| / unit)^power; 2/3: Hertz's contact"),
     ("gear_load_unit", 1.0, "N.m", "that unit"),
-    ("late_by", 0.0, "s", "some of the commands act later by as much (to see what one command's time does)"),
-    ("late_at", 0.0, "1", "which: those of group late_at, modulo LATE_GROUPS"),
-    ("late_group", 1.0, "1", "commands in a row that are one group"),
 )
-
-LATE_GROUPS = 128  # commands that are told apart where one of them acts late (`late_group`)
 
 NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}

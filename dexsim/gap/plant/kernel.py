@@ -54,7 +54,7 @@ from dexsim.actuator.laws import (
     warm_motor,
     wind,
 )
-from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
@@ -109,7 +109,6 @@ P_BRAKING = INDEX["braking_slope"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
-P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 P_MOTORSHARE = INDEX["motor_share"]
 P_STAGES = INDEX["lag_stages"]
 P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
@@ -171,9 +170,6 @@ class Guess:  # the columns of one guess that every step asks for
     bias: f64
     spring: f64
     preload: f64
-    late: f64
-    late_at: int
-    late_group: int
     weak_own: f64  # of what the drive gives, lost per N.m of its own
     feed_v: f64
     feed_a: f64
@@ -289,9 +285,6 @@ def guess(c: Recorded, h: int, dt: f64):
     p.bias = c.params[h, P_BIAS]
     p.spring = c.params[h, P_SPRING]
     p.preload = c.params[h, P_PRELOAD]
-    p.late = c.params[h, P_LATE]
-    p.late_at = int(c.params[h, P_LATEAT])
-    p.late_group = int(c.params[h, P_LATEGROUP])
     p.weak_own = c.params[h, P_WEAKOWN]
     p.feed_v = c.params[h, P_FEEDV]
     p.feed_a = c.params[h, P_FEEDA]
@@ -346,22 +339,13 @@ def unread(m: f64, p: Guess):
 
 
 @wp.func
-def acts_at(c: Recorded, i: int, p: Guess):
-    """When command i acts, but for the delay: its time, later where it is one of those that are."""
-    t = c.cmd_t[i]
-    if p.late != f64(0.0) and (i // p.late_group) % LATE_GROUPS == p.late_at:
-        t = t + p.late
-    return t
-
-
-@wp.func
 def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
     """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken
     off; command k of the run's first .. last - 1 is in force at its begin."""
     target = c.cmd[k]
     kk = int(k)
     while kk + 1 < last:
-        stamp = acts_at(c, kk + 1, p)
+        stamp = c.cmd_t[kk + 1]
         if stamp >= end:
             break
         target += arrived(end, stamp, dt) * (c.cmd[kk + 1] - c.cmd[kk])
@@ -371,15 +355,15 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
     speed = f64(0.0)
     acceleration = f64(0.0)
     for m in range(wp.max(k, first + 1), kk + 1):
-        since = acts_at(c, m, p)
-        span = since - acts_at(c, m - 1, p)
+        since = c.cmd_t[m]
+        span = since - c.cmd_t[m - 1]
         rate = difference(c.cmd[m], c.cmd[m - 1], span, dt)
         earlier = f64(0.0)
         if m > first + 1:
-            earlier = difference(c.cmd[m - 1], c.cmd[m - 2], acts_at(c, m - 1, p) - acts_at(c, m - 2, p), dt)
+            earlier = difference(c.cmd[m - 1], c.cmd[m - 2], c.cmd_t[m - 1] - c.cmd_t[m - 2], dt)
         until = end
         if m < kk:
-            until = wp.min(until, acts_at(c, m + 1, p))
+            until = wp.min(until, c.cmd_t[m + 1])
         share = hold(since, span, until, end - dt, dt)
         speed += share * rate
         acceleration += share * difference(rate, earlier, span, dt)
@@ -865,11 +849,11 @@ def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, x: Sta
     waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
     begin = t - waits - f64(SETTLES) * c.params[h, P_LAG]
     kk = int(k)
-    while kk + 1 < last and acts_at(c, kk + 1, p) <= begin:
+    while kk + 1 < last and c.cmd_t[kk + 1] <= begin:
         kk += 1
     if kk + 1 >= last:
         return 0
-    since = t - waits - acts_at(c, kk + 1, p)
+    since = t - waits - c.cmd_t[kk + 1]
     if since <= f64(0.0):
         return 0
     return int(wp.ceil(since / dt)) + 1
@@ -931,7 +915,7 @@ def plant_kernel() -> wp.Kernel:
             waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
             x.memory = kept
             end = t + dt - waits
-            while k + 1 < c_end and acts_at(c, k + 1, p) <= end - dt:
+            while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
                 k += 1
             aim = command(c, c_begin, k, c_end, end, dt, p)
             n.target = aim[0]
