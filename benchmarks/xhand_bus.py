@@ -25,7 +25,6 @@ import torch
 
 from benchmarks.options import options
 from dexsim import export, intervals
-from dexsim.calibration.file import Calibration
 from dexsim.console.ending import guard
 from dexsim.deploy import bundle
 from dexsim.deploy.driver import PASSIVE, Clock, HandCommand, VirtualClock
@@ -62,17 +61,17 @@ def episode(
     b: bundle.Bundle, way: str, seed: int, seconds: float, faults: str, noise: float, camera: float, ahead: float
 ) -> dict:
     """Return one run of a policy: whether it ran to its end, whether the object is still in the hand, goals reached."""
-    c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
-    objects, grip = b.config["task"]["objects"], b.manifest.get("grip")
+    c, objects, grip = b.calibration, b.config["task"]["objects"], b.manifest.get("grip")
     shapes = [*objects["train"], *objects["held_out"]]
     shape = None if grip else shapes[seed % len(shapes)]
     clock = Clock() if way == "process" else VirtualClock()
     slack = {"late": 1.0, "overruns": 1000, "hang": 1.0, "stale": 0.5} if way == "process" else {}
+    how = {"seed": seed, "shape": shape, "grip": grip}
     if way == "direct":
-        hand = SimulatedXHand(b.config, c, clock, seed=seed, shape=shape, grip=grip)
+        hand = SimulatedXHand(b.config, c, clock, **how)
     else:
-        text = f"{faults},seed={seed}"
-        hand = faked(b.config, c, text, seed, False, shape, grip, 1.0, clock=None if way == "process" else clock)
+        at = None if way == "process" else clock
+        hand = faked(b.config, c, f"{faults},seed={seed}", 1.0, clock=at, **how)
     settings = LoopSettings(seconds=seconds, home_speed=2.0, seen=0.5 + camera, noise=noise, ahead=ahead, **slack)
     loop = Loop(b, hand, Later(hand, camera) if camera else hand, c, settings, clock)
     try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections.abc import Iterator
 
 WORD, MESSAGE = 300, 2000
 """Characters of a word, and of a message, at most: what a file says may be of any length."""
@@ -18,6 +20,17 @@ class UserError(ValueError):
         """Keep `message` to one line that a terminal prints as it stands, whatever line breaks, control characters or
         lengths a value in it has."""
         super().__init__(_plain(str(message)))
+
+
+@contextlib.contextmanager
+def about(what: object, fix: str = "") -> Iterator[None]:
+    """Begin a UserError raised within with the file or setting that it is of, and end it with what to do about it,
+    unless it says so itself."""
+    try:
+        yield
+    except UserError as error:
+        text = str(error) if str(what) in str(error) else f"{what}: {error}"
+        raise UserError(f"{text}; {fix}" if fix and fix not in text else text) from None
 
 
 def _plain(text: str) -> str:

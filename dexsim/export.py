@@ -371,10 +371,7 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
     """Return the golden observations [n, D], built from the golden signals as the loop builds them."""
     import numpy as np
 
-    from dexsim.calibration.file import Calibration
-
-    built = of.Measured(b, Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration",
-                                                b.manifest["normalization"]["tau_max"], b.hand))  # fmt: skip
+    built = of.Measured(b, b.calibration)
     signals = {k.removeprefix("signal_"): x.astype(np.float32) for k, x in rows.items() if k.startswith("signal_")}
     out = []
     for k in range(len(rows["q"])):

@@ -6,11 +6,13 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import repeat
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
-from msgspec import inspect
 
 from dexsim.errors import UserError
 
@@ -117,99 +119,69 @@ def one_of(key: str, text: str, known: Collection[str]) -> str:
     return text
 
 
-def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
+def convert(data: Any, kind: type[T], source: object, fix: str = "", lax: bool = False) -> T:
     """Return `data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is
     there and what must be.
 
-    fix: what to do about it, appended. Instances of classes that `kind` names (tensors) pass as they are.
+    fix: what to do about it, appended; lax: numbers and truth values may be given as text. Instances of classes that
+    `kind` names (tensors) pass as they are.
     """
+    to = partial(msgspec.convert, strict=not lax, dec_hook=_instance)
     try:
-        out = msgspec.convert(data, kind, dec_hook=_instance)
+        out: T = to(data, kind)
     except msgspec.ValidationError as error:
-        what, _, at = str(error).partition(" - at `$")
-        place = _named(data, kind, str(error), at.removesuffix("`").lstrip(".").replace("[...]", ".*").lstrip("."))
-        if what.startswith("Invalid enum value") and (allowed := _allowed(inspect.type_info(kind), place)):
+        place, value, inner, why = _innermost(to, data, kind, str(error))
+        fix, what = f"; {fix}" if fix else "", why.partition(" - at `$")[0]
+        if what.startswith("Object contains unknown field"):
+            name = f"{place}{'.' * bool(place)}{what.split('`')[1]}"
+            valid = [f.encode_name for t in _kinds(inner) if _is_struct(t) for f in msgspec.structs.fields(t)]
+            raise UserError(f"{source}: {name}: unknown; valid ones: {', '.join(valid)}{fix}") from None
+        if what.startswith("Invalid enum value"):
+            allowed = [x for t in _kinds(inner) if get_origin(t) is Literal for x in get_args(t)]
             what = f"must be one of {', '.join(map(str, allowed))}"
-        elif what.startswith("Object contains unknown field"):
-            name = what.split("`")[1]
-            valid = ", ".join(_fields(inspect.type_info(kind), place))
-            what = f"{place}{'.' * bool(place)}{name}: unknown; valid ones: {valid}"
-            raise UserError(f"{source}: {what}{f'; {fix}' if fix else ''}") from None
-        excerpt = f" ({_excerpt(data, place)})" if place else ""
-        fix = f"; {fix}" if fix else ""
+        excerpt = f" ({_excerpt(value)})" if place else ""
         raise UserError(f"{source}: {place or 'its contents'}{excerpt}: {what[0].lower()}{what[1:]}{fix}") from None
     except RecursionError:
         raise UserError(f"{source}: nested too deeply{f'; {fix}' if fix else ''}") from None
-    finite(data, source, fix)
+    finite(msgspec.to_builtins(out, enc_hook=lambda x: None), source, fix)  # what is read: not what is for people
     return out
 
 
-def _named(data: Any, kind: Any, message: str, place: str) -> str:
-    """Return the place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
-    parts = place.split(".")
-    for k, part in enumerate(parts):
-        node = _at(data, ".".join(parts[:k])) if part.startswith("*") else None
-        node = node if isinstance(node, dict) else {}
-        for key in list(node):
-            alone = _with(data, parts[:k], {key: node[key]})
-            try:
-                msgspec.convert(alone, kind, dec_hook=_instance)
-            except msgspec.ValidationError as error:
-                if str(error) == message:
-                    data, parts[k] = alone, str(key) + part[1:]
-                    break
-    return ".".join(parts)
-
-
-def _at(node: Any, place: str) -> Any:
-    """Return the value at a place that msgspec names (a.b[3].c); None where it cannot be told."""
-    for part in filter(None, place.replace("[", ".[").split(".")):
+def _innermost(
+    to: Callable[[Any, Any], Any], data: Any, kind: Any, why: str, place: str = ""
+) -> tuple[str, Any, Any, str]:
+    """Return the innermost part of `data` that `to` does not convert to its type, for which `why` is the reason: its
+    place (as in a.b[3].c), itself, its type, and why."""
+    for at, part, inner in _parts(data, kind):
         try:
-            node = node[int(part[1:-1])] if part.startswith("[") else {str(k): v for k, v in node.items()}[part]
-        except (AttributeError, KeyError, IndexError, TypeError, ValueError):
-            return None
-    return node
+            to(part, inner)
+        except msgspec.ValidationError as error:
+            return _innermost(to, part, inner, str(error), place + at)
+    return place.removeprefix("."), data, kind, why
 
 
-def _with(node: Any, parts: list[str], value: Any) -> Any:
-    """Return a copy of the data with `value` at a place of dicts."""
-    if not parts or not isinstance(node, dict):
-        return value if not parts else node
-    return {k: _with(v, parts[1:], value) if str(k) == parts[0] else v for k, v in node.items()}
+def _parts(data: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield what lies in data of a type: each part's place in it, itself, and its own type."""
+    for t in _kinds(kind):
+        of, args = get_origin(t), get_args(t)
+        if isinstance(data, dict) and (of is dict or _is_struct(t)):
+            types = dict.fromkeys(data, args[1]) if of is dict else {
+                f.encode_name: f.type for f in msgspec.structs.fields(t)}  # fmt: skip
+            yield from ((f".{key}", part, types[key]) for key, part in data.items() if key in types)
+        elif isinstance(data, (list, tuple)) and of in (list, tuple):
+            each = args if of is tuple and ... not in args else repeat(args[0])
+            yield from ((f"[{k}]", part, inner) for k, (part, inner) in enumerate(zip(data, each, strict=False)))
 
 
-def _allowed(kind: Any, place: str) -> list[Any]:
-    """Return what a value may be there, where only some words or numbers are."""
-    return [x for t in _types(kind, place) if isinstance(t, inspect.LiteralType) for x in t.values]
+def _kinds(kind: Any) -> list[Any]:
+    """Return the types that a type stands for: those of a union, without what is said of them."""
+    if get_origin(kind) is Annotated:
+        return _kinds(get_args(kind)[0])
+    return [x for t in get_args(kind) for x in _kinds(t)] if get_origin(kind) in (Union, UnionType) else [kind]
 
 
-def _fields(kind: Any, place: str) -> list[str]:
-    """Names that may stand in the mapping there."""
-    return [f.encode_name for t in _types(kind, place) if isinstance(t, inspect.StructType) for f in t.fields]
-
-
-def _types(kind: Any, place: str) -> list[Any]:
-    """Return what a place may be of."""
-    if isinstance(kind, inspect.UnionType):
-        return [x for t in kind.types for x in _types(t, place)]
-    if isinstance(kind, inspect.Metadata):
-        return _types(kind.type, place)
-    part, _, rest = place.replace("[", ".[").lstrip(".").partition(".")
-    if not part:
-        return [kind]
-    if isinstance(kind, inspect.StructType):
-        # names may hold dots themselves
-        inner = [(f, place[len(f.encode_name) :].lstrip(".")) for f in kind.fields if _begins(place, f.encode_name)]
-        return [x for f, rest in inner for x in _types(f.type, rest)]
-    if isinstance(kind, inspect.DictType):
-        return _types(kind.value_type, rest)
-    if isinstance(kind, inspect.TupleType):
-        return _types(kind.item_types[int(part[1:-1])], rest)
-    return _types(kind.item_type, rest) if hasattr(kind, "item_type") else []
-
-
-def _begins(place: str, name: str) -> bool:
-    return place == name or place.startswith((f"{name}.", f"{name}["))
+def _is_struct(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 
 def _instance(kind: type, value: Any) -> Any:
@@ -232,7 +204,7 @@ def finite(node: Any, source: object, fix: str = "", place: str = "") -> None:
         raise UserError(f"{source}: {place or 'its value'} ({what}): expected a number{f'; {fix}' if fix else ''}")
 
 
-def _excerpt(data: Any, place: str) -> str:
-    """Return the value at a place, shortened."""
-    text = " ".join(repr(_at(data, place)).split())
+def _excerpt(value: Any) -> str:
+    """Return a value, shortened."""
+    text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."

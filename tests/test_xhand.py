@@ -552,7 +552,7 @@ def other(b, tmp_path_factory):
 @pytest.mark.slow
 def test_the_command_runs_two_policies_on_two_hands_of_a_bus(b, other, tmp_path, monkeypatch, capsys):
     """In real time, each in a thread."""
-    fake = lambda config, calibration, text, *_: partial(FakeXHand, faults=Faults.parse(text))  # noqa: E731
+    fake = lambda config, calibration, text, **_: partial(FakeXHand, faults=Faults.parse(text))  # noqa: E731
     monkeypatch.setattr(simulated_hand, "fake_package", fake)
     patient = ["late=2", "stale=1", "overruns=1000", "hang=3", "home_speed=3", "tor_max=300", "seconds=1"]
     settings = [f"bundle={b.path}", f"second={other}", "driver=xhand", "port=fake", f"record={tmp_path / 'a.mcap'}"]

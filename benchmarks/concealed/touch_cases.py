@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 
 from benchmarks.concealed import touch
 from dexsim.recording import Writer
+from dexsim.recording.schema import EXTERNAL_FORCE
 
 SECONDS, LSB, NOISE, SIZES = 8.0, 0.1, 0.02, 14
 FINGERS = ("index", "mid", "ring", "pinky")
@@ -230,7 +231,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
                 value = z[at] * (1 - part) + z[at + 1] * part + NOISE * rng.normal(size=len(pad.areas))
                 out[pad_number, :, 2] = np.clip(np.round(value / LSB), 0, 255)
                 w.add("tactile", x, out)
-                w.add_external_force(x, np.r_[np.interp(x, grid, f) + 0.02 * rng.normal(), np.zeros(5)], "indenter")
+                push = np.r_[np.interp(x, grid, f) + 0.02 * rng.normal(), np.zeros(5)]
+                w.add_vector(EXTERNAL_FORCE, x, push, "indenter")
         if kind and k < len(RECORDINGS) - HELD:
             strength = kind.own(f, p)
             edge = np.flatnonzero(

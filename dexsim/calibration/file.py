@@ -231,14 +231,6 @@ def _content(raw: Any, where: str, hand: Hand) -> Content:
                         f"{where}: {part}{'.' if part else ''}{key}: no such "
                         f"{'key' if part in ('', 'touch') else 'joint'}; there are: {', '.join(known)}"
                     )
-        raw = {k: raw[k] for k in Content.__struct_fields__ if k in raw}
-        if isinstance(raw.get("joints"), dict):
-            raw["joints"] = {
-                j: {k: e[k] for k in Joint.__struct_fields__ if k in e} if isinstance(e, dict) else e
-                for j, e in raw["joints"].items()
-            }
-        if isinstance(raw.get("touch"), dict):
-            raw["touch"] = {k: raw["touch"][k] for k in Touch.__struct_fields__ if k in raw["touch"]}
     return typed.convert(raw, Content, where, "correct the file, or fit it anew with dexsim calibrate")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import re
 import threading
 import time
 from collections.abc import Sequence
@@ -64,6 +65,12 @@ safety (key=default):
 """
 SECOND = ("second", "second_serial", "second_place", "second_calibration")
 OWN = (*SECOND, *typed.defaults(USAGE), "task")
+USED_BY = {
+    "port": ("xhand", "fake"), "serial": ("xhand", "fake"), "ros2": ("ros2",), "ros2_message": ("ros2",),
+    "ros2_effort": ("ros2",), "vision": ("sim", "fake"), "shape": ("sim", "fake"), "seed": ("sim", "fake"),
+    "imu": ("xhand", "ros2"),
+}  # fmt: skip
+"""The drivers that use a setting; fake: driver=xhand port=fake."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -125,11 +132,9 @@ def _loops(all_given: Sequence[dict[str, str]], changes: dict[str, Any]) -> list
     found = []
     for given in all_given:
         b = bundles.load(given["bundle"])
-        base = b.manifest["normalization"]["tau_max"]
+        calibration = b.calibration
         if "calibration" in given:
-            calibration = Calibration.load(given["calibration"], base, b.hand)
-        else:
-            calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
+            calibration = Calibration.load(given["calibration"], b.manifest["normalization"]["tau_max"], b.hand)
         mine = dict(changes)
         if given.get("port", "").startswith("fake"):
             mine.setdefault("seen", 0.3)  # the fake's world is seen over its bus: after its pauses and outliers
@@ -169,7 +174,7 @@ def _two_hands(found: Sequence[tuple], hang: float) -> list[Any]:
         from dexsim.deploy.simulated_hand import fake_package
 
         faults = f"side={sides[0][0].upper()},second=FAKE0002,{port.partition(':')[2]}"
-        package, port = fake_package(b.config, calibration, faults, 0, False, None, b.manifest.get("grip")), "auto"
+        package, port = fake_package(b.config, calibration, faults, grip=b.manifest.get("grip")), "auto"
     bus = VendorXHands([x[0].get("serial") for x in found], sides, port, package=package, hang=hang)
     bus.start = 180.0
     return bus.hands
@@ -266,7 +271,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
         if at.shape != (3,) or not (np.abs(at) < 0.5).all():
             raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
         place = FixedPlace(at)
-    fake = given.get("port", "").split(":")[0] == "fake"
+    fake = kind == "xhand" and given.get("port", "").split(":")[0] == "fake"
     if kind not in ("sim", "xhand", "ros2"):
         return _own(kind, given, b, calibration, place)
     if kind == "xhand" and b.hand.name != "xhand":
@@ -274,13 +279,10 @@ def _hand(given: dict[str, str], b: Any, calibration: Any, hang: float, hand: An
             f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
             " hand (dexsim/deploy/driver.py)"
         )
-    wrong: list[str] = [k for k in ("port", "serial") if kind != "xhand" and k in given]
-    wrong += [k for k in ("ros2", "ros2_message", "ros2_effort") if kind != "ros2" and k in given]
-    wrong += [k for k in ("vision", "shape", "seed") if kind != "sim" and not fake and k in given]
-    wrong += [k for k in ("imu",) if (kind == "sim" or fake) and k in given]
-    if wrong:
-        raise UserError(f"{wrong[0]}={given[wrong[0]]}: driver={kind} does not use it{' with port=fake' * fake}")
-    if kind == "ros2" or (kind == "xhand" and not fake) or hand is not None:
+    by = "fake" if fake else kind
+    if wrong := next((k for k in given if by not in USED_BY.get(k, (by,))), ""):
+        raise UserError(f"{wrong}={given[wrong]}: driver={kind} does not use it{' with port=fake' * fake}")
+    if by in ("ros2", "xhand") or hand is not None:
         needs = of(task).Measured(b, calibration).needs
         if needs == PLACE and place is None:
             raise UserError(
@@ -342,15 +344,15 @@ def _imu(given: dict[str, str]) -> Any:
     """Return the IMU in the object."""
     from dexsim.deploy.imu import UdpImu
 
-    how, _, ports = given.get("imu", "").partition(":")
-    port, colon, sender = ports.partition(":")
-    if how != "udp" or not port.isdecimal() or (colon and not sender.isdecimal()):
+    found = re.fullmatch(r"udp:([0-9]+)(?::([0-9]+))?", given.get("imu", ""))
+    if found is None:
         raise UserError(
             f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y'
             ' z" there, or run'
             " the Loop with your own OrientationSource (dexsim.deploy.imu)"
         )
-    imu = UdpImu(int(port), sender_port=int(sender) if colon else None)
+    port, sender = found.groups()
+    imu = UdpImu(int(port), sender_port=int(sender) if sender else None)
     if not imu.wait(5.0):
         raise UserError(
             f'imu=udp:{port}: no orientation came within 5 s; send lines of text "w x y z" to 127.0.0.1:{port}'

@@ -480,17 +480,13 @@ class Hour:
 
     def bundle(self, step: Step) -> None:
         """See: nothing moves."""
-        from dexsim.calibration.file import Calibration
         from dexsim.deploy import bundle as bundles
-        from dexsim.deploy.driver import VirtualClock
         from dexsim.deploy.simulated_hand import SimulatedXHand
 
         if not self.given["bundle"]:
             return step.judge("skipped", "say which policy: bundle=DIR")
-        b = bundles.load(self.given["bundle"])
-        c = Calibration.from_dict(b.manifest["calibration"], "bundle", b.manifest["normalization"]["tau_max"], b.hand)
-        clock = VirtualClock()
-        trained = SimulatedXHand(b.config, c, clock, grip=b.manifest.get("grip"))
+        b, clock = bundles.load(self.given["bundle"]), VirtualClock()
+        trained = SimulatedXHand(b.config, b.calibration, clock, grip=b.manifest.get("grip"))
         trained.open()
         for amps in (self.amps, self.most, 4 * self.most):  # its friction is a guess: the lowest that moves it
             there = latency(Session(trained, b.hand, clock), self.middle, self.joints, amps)
@@ -517,7 +513,7 @@ class Hour:
         step.text += others or (["the fitted drives lie within what training drew"] if table else
                                 ["gains and limits were not fitted: take the step excite too"])  # fmt: skip
         here_a = self.found["calibrate"].figures.get("A_per_Nm", {}) if "calibrate" in self.found else {}
-        theirs = dict(zip(b.hand.joints, map(float, c.current_per_torque), strict=True))
+        theirs = dict(zip(b.hand.joints, map(float, b.calibration.current_per_torque), strict=True))
         off = [f"{n} {x:.2f} for {theirs[n]:.2f}" for n, x in here_a.items() if x and abs(x / theirs[n] - 1) > 0.2]
         step.figures["A_per_Nm"] = {n: [x, theirs[n]] for n, x in here_a.items() if x}
         if off:
@@ -645,7 +641,7 @@ def make_driver(given: dict[str, Any], hand: Any, clock: Clock | None = None) ->
     config["task"]["initial"]["object_xy"] = [0.5, 0.5]  # m: nothing is in the fingers' way
     calibration = Calibration.default(hand=hand)
     if given["driver"] == "xhand":
-        return faked(config, calibration, faults, int(given["seed"]), hang=1.0, clock=clock)
+        return faked(config, calibration, faults, hang=1.0, clock=clock, seed=int(given["seed"]))
     return SimulatedXHand(config, calibration, clock, hang=1.0)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import files, guard, yaml_text
+from dexsim.calibration.file import Calibration
 from dexsim.deploy import manifests
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
@@ -52,6 +53,12 @@ class Bundle:
         p = self.manifest["policy"]
         action, self._carried = _act(self.session, p, observation, self._carried or _blank(p))
         return action
+
+    @property
+    def calibration(self) -> Calibration:
+        """What currents and taxel counts of the hand mean, as the manifest says. Raises UserError."""
+        known, torques = self.manifest["calibration"], self.manifest["normalization"]["tau_max"]
+        return Calibration.from_dict(known, f"{self.path}: calibration", torques, self.hand)
 
     @property
     def config(self) -> dict[str, Any]:

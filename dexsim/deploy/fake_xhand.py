@@ -12,17 +12,17 @@ torque limit of 0 makes it limp.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from dexsim import typed
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
-from dexsim.errors import UserError
 
 JOINTS, BOARDS, TAXELS = 12, 5, 120
 TRIP, TAIL, MOST, OUTLIER, RARE = 0.00945, 0.00017, 0.0107, 0.111, 1 / 1773
@@ -34,8 +34,7 @@ ENCODER_JITTER = 0.0014
 """rad, of the encoders of a real hand."""
 
 
-@dataclass(frozen=True)
-class Faults:
+class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Faults that the fake has, times in s since it was opened: crc, torn: shares of frames; board: a taxel board that
     is dead (-1: none) from board_s on; silent_s: all boards are silent from then on; freeze_s: the bus dies, the cache
     answers on; abort_s: the native library aborts the process; hang_s: a call never returns; refuse_s: commands are
@@ -77,18 +76,11 @@ class Faults:
     @classmethod
     def parse(cls, text: str) -> Faults:
         """Read faults from text such as `crc=0.005,board=2`. Raises UserError."""
-        fields = {f.name: f for f in dataclasses.fields(cls)}
-        changes: dict[str, Any] = {}
-        for part in filter(None, text.split(",")):
-            key, _, value = part.partition("=")
-            if key not in fields:
-                raise UserError(f"port=fake:{text}: '{key}' must be one of {', '.join(fields)}")
-            kind: Any = type(fields[key].default)
-            try:
-                changes[key] = kind(value)
-            except ValueError:
-                raise UserError(f"port=fake:{text}: {key}={value} must be a {kind.__name__}") from None
-        return cls(**changes)
+        given = dict(part.partition("=")[::2] for part in text.split(",") if part)
+        return typed.convert(given, cls, f"port=fake:{text}", lax=True)
+
+
+SOUND = Faults()
 
 
 class LaggingHand:
@@ -128,7 +120,7 @@ class LaggingHand:
 class FakeXHand:
     """The module `xhand_controller.xhand_control`, over a hand (`LaggingHand`, `SimulatedHand`) and a clock."""
 
-    def __init__(self, clock: Clock, make: Callable[[], Any] = LaggingHand, faults: Faults = Faults()):
+    def __init__(self, clock: Clock, make: Callable[[], Any] = LaggingHand, faults: Faults = SOUND):
         self.clock, self.faults = clock, faults
         self.hands = [make() for _ in range(1 + bool(faults.second))]
         self.hand = self.hands[0]

@@ -17,25 +17,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexsim.calibration.file import Calibration
+from dexsim.deploy import readings
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.measure import ORIENTATION, POSE, for_bundle
 from dexsim.deploy.measure import PLACE as WHERE
-from dexsim.deploy.readings import (
-    Frozen,
-    Lasting,
-    bad_orientation,
-    bad_place,
-    bad_pose,
-    bad_sequence,
-    bad_stamp,
-    copied,
-    implausible,
-    overwritten,
-    refused,
-)  # fmt: skip
+from dexsim.deploy.readings import Frozen, Lasting
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HAND, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
@@ -150,6 +139,7 @@ class Loop:
     _rest: list[np.ndarray]
     _seen: np.ndarray | None
     _seen_at: float | None
+    _unseen: str | None
     _poses: list[tuple[float, np.ndarray]]
     _action: np.ndarray
 
@@ -279,10 +269,10 @@ class Loop:
                 self.report.counts["not_recorded"] = self.recorder.dropped
 
     def _first_reading(self) -> None:
-        limit = self.clock.now() + 2.0
+        limit, hand = self.clock.now() + 2.0, self.bundle.hand
         while True:
             state, now = self.driver.read(), self.clock.now()
-            wrong = "there is none" if state is None else implausible(state, now, self.bundle.hand, self._taxels)
+            wrong = "there is none" if state is None else readings.implausible(state, now, hand, self._taxels)
             if state is not None and wrong is None and now - state.time > self.settings.stale:
                 wrong = f"it is {1e3 * (now - state.time):.0f} ms old"
             if state is not None and wrong is None:
@@ -293,9 +283,9 @@ class Loop:
                 )
             self._beat = now
             self.clock.sleep_until(now + self.read_period)
-        if (why := bad_sequence(state.sequence, None)) is not None:
+        if (why := readings.bad_sequence(state.sequence, None)) is not None:
             raise UserError(f"{self.driver.name}: {why}")
-        self.state, self._sequence, self._good_at, self._checked = copied(state), state.sequence, now, now
+        self.state, self._sequence, self._good_at, self._checked = readings.copied(state), state.sequence, now, now
         self._has_touch = np.size(state.tactile) > 0
         self.target = np.asarray(state.position, float).copy()
         if self.settings.home:
@@ -402,17 +392,17 @@ class Loop:
     def _take(self, now: float) -> bool:
         """Return the newest state becomes ours if it can be true; whether it is a new one. Recorded once."""
         given = self.driver.read()
-        if self._given is not None and (name := overwritten(self._given, self.state)) is not None:
+        if self._given is not None and (name := readings.overwritten(self._given, self.state)) is not None:
             self._broken = f"{self.driver.name}: changed the {name} of a reading that it had given; it must give copies"
         if given is None:
             return False
-        if (wrong := bad_sequence(given.sequence, self._sequence)) is not None:
+        if (wrong := readings.bad_sequence(given.sequence, self._sequence)) is not None:
             self._broken = f"{self.driver.name}: {wrong}"
             return False
         if given.sequence == self._sequence:
             return False
-        state, self._given, self._sequence = copied(given), None, given.sequence
-        self._wrong = implausible(state, now, self.bundle.hand, self._taxels, self._has_touch)
+        state, self._given, self._sequence = readings.copied(given), None, given.sequence
+        self._wrong = readings.implausible(state, now, self.bundle.hand, self._taxels, self._has_touch)
         if self._wrong is not None:
             self.report.counts["bad_readings"] += 1
             return False
@@ -489,8 +479,9 @@ class Loop:
             return True
         # `__init__` has looked that the eye sees what the measure needs
         seen = getattr(self.eye, self.measure.needs)(now)
-        bad = {ORIENTATION: bad_orientation, WHERE: bad_place, POSE: bad_pose}[self.measure.needs]
-        self._unseen = "there is no reading" if seen is None else bad_stamp(seen[1], now) or bad(seen[0])
+        self._unseen = "there is no reading"
+        if seen is not None:
+            self._unseen = readings.bad_stamp(seen[1], now) or readings.bad_seen(self.measure.needs, seen[0])
         if seen is None or self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
@@ -558,7 +549,7 @@ class Loop:
                 self._sent = HandCommand(
                     self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION
                 )
-                answer = refused(self.driver.send(self._sent))
+                answer = readings.refused(self.driver.send(self._sent))
                 self._refused.note(bool(answer), now, f"{self.driver.name} refuses what is sent: {answer}")
                 if self._tripped is not None:  # the watchdog came in between: its word is the last
                     self.driver.relax()

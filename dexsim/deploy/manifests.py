@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from dexsim.deploy import measure
-from dexsim.errors import UserError
+from dexsim.errors import UserError, about
 from dexsim.hand import Hand
 from dexsim.typed import Count, Positive, Real, convert
 
@@ -194,40 +194,34 @@ def hand_entry(raw: dict[str, Any], source: object) -> HandEntry:
 def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
     """Return the manifest as declared above, of this hand. Raises UserError, one line: not a manifest, another version,
     a key missing or of the wrong type, a value outside its range or beyond what the hand can do."""
-    if raw.get("format") != FORMAT:
-        raise UserError(f"{source}: not the manifest of a policy bundle")
-    if raw.get("version") != VERSION:
-        raise UserError(f"{source}: bundle version {raw.get('version')}; this dexsim reads version {VERSION}: {AGAIN}")
-    m = convert(raw, Manifest, source, AGAIN)
-    measure.of(m.task).check(m, source, AGAIN)
-    for key, ours in (("joints", hand.joints), ("fingers", hand.finger_names)):
-        if getattr(m, key) != list(ours):
-            raise UserError(
-                f"{source}: {key} are {', '.join(getattr(m, key))[:120]}; this hand's are {', '.join(ours)}, in this"
-                " order"
-            )
-    _table(m, source)
-    _rows(m, source, hand)
-    _limits(m, source, hand)
+    with about(source, AGAIN):
+        if raw.get("format") != FORMAT:
+            raise UserError("not the manifest of a policy bundle")
+        if raw.get("version") != VERSION:
+            raise UserError(f"bundle version {raw.get('version')}; this dexsim reads version {VERSION}")
+        m = convert(raw, Manifest, source)
+        measure.of(m.task).check(m)
+        for key, theirs, ours in (("joints", m.joints, hand.joints), ("fingers", m.fingers, hand.finger_names)):
+            if theirs != list(ours):
+                raise UserError(f"{key} are {', '.join(theirs)[:120]}, must be {', '.join(ours)}, in this order")
+        _table(m)
+        _rows(m, hand)
+        _limits(m, hand)
     return m
 
 
-def _table(m: Manifest, source: object) -> None:
+def _table(m: Manifest) -> None:
     """Check that the rows follow one another and fill the observation."""
     at = 0
     for k, row in enumerate(m.observation):
         if row.start != at or row.stop <= row.start:
-            raise UserError(
-                f"{source}: observation[{k}] ({row.name}) is {row.start} to {row.stop}, must begin at {at}; {AGAIN}"
-            )
+            raise UserError(f"observation[{k}] ({row.name}) is {row.start} to {row.stop}, must begin at {at}")
         at = row.stop
     if at != m.policy.observation_size:
-        raise UserError(
-            f"{source}: policy.observation_size={m.policy.observation_size}, its observation table has {at}; {AGAIN}"
-        )
+        raise UserError(f"policy.observation_size={m.policy.observation_size}, its observation table has {at}")
 
 
-def _rows(m: Manifest, source: object, hand: Hand) -> None:
+def _rows(m: Manifest, hand: Hand) -> None:
     """Check that the loop builds each row, as wide as the policy was trained with; those of declared terms are built by
     a network of the bundle's own."""
     if m.terms is not None:
@@ -244,17 +238,14 @@ def _rows(m: Manifest, source: object, hand: Hand) -> None:
         sizes = [times * n for n in widths.get(row.name, (J,))] if row.name in known else []
         if row.stop - row.start not in sizes or row.unit != known[row.name][0]:
             here = f"{' or '.join(map(str, sizes))} {known[row.name][0]}" if sizes else "no such row"
-            raise UserError(
-                f"{source}: observation {row.name} of {row.stop - row.start} {row.unit}; this dexsim builds {here}: use"
-                " the dexsim of its versions"
-            )
+            wide = f"{row.stop - row.start} {row.unit}"
+            raise UserError(f"observation {row.name} of {wide}, here {here}: use the dexsim of the bundle's versions")
 
 
-def _limits(m: Manifest, source: object, hand: Hand) -> None:
+def _limits(m: Manifest, hand: Hand) -> None:
     """Check that each joint has a number, that ranges and speeds lie within the hand's own, poses within the ranges."""
     low, high = hand.limits.T
-    J = len(hand.joints)
-    slack = 1e-3
+    J, slack = len(hand.joints), 1e-3
     checks = [
         ("action.low", m.action.low, low, high),
         ("action.high", m.action.high, low, high),
@@ -263,23 +254,19 @@ def _limits(m: Manifest, source: object, hand: Hand) -> None:
     ]
     if m.grip is not None:
         checks += [("grip.target", m.grip.target, low, high)]
-    sizes = [(key, len(values)) for key, values, *_ in checks]
-    sizes += [("normalization.tau_max", len(m.normalization.tau_max)), ("policy.action_size", m.policy.action_size)]
+    sizes = {key: len(values) for key, values, *_ in checks}
+    sizes |= {"normalization.tau_max": len(m.normalization.tau_max), "policy.action_size": m.policy.action_size}
     if isinstance(m.action.lead, list):
-        sizes += [("action.lead", len(m.action.lead))]
+        sizes["action.lead"] = len(m.action.lead)
     if m.grip is not None:
-        sizes += [("grip.hand", len(m.grip.hand))]
-    for key, count in sizes:
+        sizes["grip.hand"] = len(m.grip.hand)
+    for key, count in sizes.items():
         if count != J:
-            raise UserError(f"{source}: {key}: {count}, must be {J}, one a joint of {hand.name}; {AGAIN}")
+            raise UserError(f"{key}: {count}, must be {J}, one a joint of {hand.name}")
     for key, values, least, most in checks:
         for joint, value, a, b in zip(hand.joints, values, least, most, strict=True):
             if not a - slack <= value <= b + slack:
-                raise UserError(
-                    f"{source}: {key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}; {AGAIN}"
-                )
+                raise UserError(f"{key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}")
     for joint, a, b in zip(hand.joints, m.action.low, m.action.high, strict=True):
         if not a < b:
-            raise UserError(
-                f"{source}: action.low of {joint} is {a:g}, action.high {b:g}; low must be below high; {AGAIN}"
-            )
+            raise UserError(f"action.low of {joint} is {a:g}, action.high {b:g}; low must be below high")

@@ -21,10 +21,10 @@ ROWS = COMMON | {
 }  # fmt: skip
 
 
-def check(m: Any, source: object, again: str) -> None:
+def check(m: Any) -> None:
     """Raise UserError for a manifest that lacks what this task needs."""
     if m.normalization.force_max_N is None:
-        raise UserError(f"{source}: lacks normalization.force_max_N, which task={m.task} needs; {again}")
+        raise UserError(f"lacks normalization.force_max_N, which task={m.task} needs")
 
 
 def parts(env: Any) -> dict[str, Any]:

@@ -26,13 +26,13 @@ ROWS = COMMON | {
 }  # fmt: skip
 
 
-def check(m: Any, source: object, again: str) -> None:
+def check(m: Any) -> None:
     """Raise UserError for a manifest that lacks what this task needs."""
     if m.task_settings is None or m.grip is None:
-        raise UserError(f"{source}: lacks task_settings or grip, which task={m.task} needs; {again}")
-    convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", again)
+        raise UserError(f"lacks task_settings or grip, which task={m.task} needs")
+    convert(m.task_settings.observe, Observe, "task_settings.observe")
     if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
-        raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {again}")
+        raise UserError(f"task_settings.goal.axis={m.task_settings.goal.axis}: must have a length")
 
 
 def parts(env: Any) -> dict[str, Any]:

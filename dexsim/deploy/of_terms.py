@@ -121,15 +121,15 @@ class Observation(torch.nn.Module):
         return {name: now[name][:1].clone().float() for name in self.names}
 
 
-def check(m: Any, source: object, again: str) -> None:
+def check(m: Any) -> None:
     """Raise UserError for a manifest that lacks what a task of terms needs."""
     if m.terms is None:
-        raise UserError(f"{source}: task={m.task} is none of this dexsim's, and the manifest has no terms; {again}")
+        raise UserError(f"task={m.task} is none of this dexsim's, and the manifest has no terms")
     seen = {r.name for r in m.observation}  # a command may be known to other rows only
     wide = sum(r.width * r.frames for r in m.terms.rows) + sum(len(v) for k, v in m.terms.commands.items() if k in seen)
     if wide * m.terms.history != m.policy.observation_size:
-        raise UserError(f"{source}: terms give {wide * m.terms.history} numbers, policy.observation_size is"
-                        f" {m.policy.observation_size}; {again}")  # fmt: skip
+        size = m.policy.observation_size
+        raise UserError(f"terms give {wide * m.terms.history} numbers, policy.observation_size is {size}")
 
 
 def rows(env: Task) -> list[tuple[str, int, str, str]]:

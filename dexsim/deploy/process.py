@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,7 +34,8 @@ LAST = 6.0
 NOBODY = "nobody holds the bus, and the hand keeps its last target: cut its power"
 _SEEN = 9  # numbers at the end of a state: the object's place and its time, its orientation and its time
 _TEXT = 1000  # bytes of a message
-_HEAD = 8  # numbers at the start of a command: number, era, mode, kp, ki, kd, what is done with the object, none
+_STATE = ("position", "current", "temperature", "error")  # what of a state is one number a joint, always
+_MODES = ("kp", "ki", "kd", "mode")  # what of a command is one number
 
 
 class Body(Protocol):
@@ -72,18 +73,18 @@ class Body(Protocol):
 class BusDriver:
     """The driver of a hand whose `Body` lives in a child process; see the module.
 
-    make: gives the body, in the child, from the clock that it runs by; joints, taxels: sizes of a state. hang [s]: see
-    `HANG`. start [s] that opening may take. clock: a `VirtualClock` keeps the body in this process, in step.
+    make: gives the body, in the child, from the clock that it runs by; joints, taxels, sensed: sizes of a state. hang
+    [s]: see `HANG`. start [s] that opening may take. clock: a `VirtualClock` keeps the body in this process, in step.
     """
 
     name = "hand"
 
     def __init__(
         self, make: Callable[[Clock], Body], joints: int, taxels: tuple[int, int], clock: Clock | None = None,
-        hang: float = HANG, start: float = 60.0,
+        hang: float = HANG, start: float = 60.0, sensed: int = 0,
     ):  # fmt: skip
         self.clock, self.joints, self.taxels, self.hang = clock or Clock(), joints, taxels, hang
-        self._make, self.start = make, start
+        self._make, self.start, self._layouts = make, start, _layouts(joints, taxels, sensed)
         self.body: Body | None = None
         self._process: multiprocessing.context.SpawnProcess | None = None
         self._lock = threading.Lock()
@@ -106,14 +107,14 @@ class BusDriver:
             self._object_row = np.full(_SEEN, np.nan)
             return info
         context = multiprocessing.get_context("spawn")
-        shared = _shared(context, self.joints, self.taxels)
-        self._v = v = _views(shared)
+        shared = _shared(context, self._layouts)
+        self._v = v = _views(shared, self._layouts)
         handle, path = tempfile.mkstemp(prefix="dexsim-bus-")
         os.close(handle)
         self._output = Path(path)
         v["beat"].value = time.monotonic()
         self._process = context.Process(
-            target=_child, args=(self._make, shared, self.joints, self.hang, path), daemon=True
+            target=_child, args=(self._make, shared, self._layouts, self.hang, path), daemon=True
         )
         self._process.start()
         limit = time.monotonic() + self.start
@@ -137,16 +138,14 @@ class BusDriver:
             k = v["newest"].value
             if k < 0:
                 return None
-            row, touch = v["state"][k % 2].copy(), v["touch"][k % 2].copy()
+            row = v["state"][k % 2].copy()
             if v["newest"].value - k < 2:
                 break  # else the slot was written over while it was copied
-        J, P = self.joints, self.taxels[0]
-        part = row[2 : 2 + 5 * J].reshape(5, J)
-        return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2],
-                         part[3].astype(np.int64),
-                         touch[: 3 * int(np.prod(self.taxels))].reshape(*self.taxels, 3),
-                         part[4] if np.isfinite(part[4]).all() else None,
-                         row[2 + 5 * J : 2 + 5 * J + P] > 0)  # fmt: skip
+        part = {name: row[name] for name in (*_STATE, "tactile", "silent")}
+        speed, follower = row["velocity"], row["follower"]
+        return HandState(float(row["time"]), int(row["sequence"]), **part,
+                         velocity=speed if np.isfinite(speed).all() else None,
+                         follower=follower if follower.size and np.isfinite(follower).all() else None)  # fmt: skip
 
     def send(self, command: HandCommand) -> None:
         """Hand over targets for the next bus cycle. Those of before the last `relax` are not carried out any more."""
@@ -249,7 +248,7 @@ class BusDriver:
             self._step(self.body)
             row = self._object_row[part]
         else:
-            row = self._v["state"][max(self._v["newest"].value, 0) % 2, -_SEEN:][part].copy()
+            row = self._v["state"]["seen"][max(self._v["newest"].value, 0) % 2][part].copy()
         return None if not np.isfinite(row).all() else (row[:-1], float(row[-1]))
 
     # -- parts
@@ -270,9 +269,9 @@ class BusDriver:
             v = self._v
             v["beat"].value = time.monotonic()
             number = self._number = self._number + 1
-            row = v["command"][number % 2]
-            row[:_HEAD] = number, era, c.mode, c.kp, c.ki, c.kd, self._object, 0
-            row[_HEAD : _HEAD + self.joints], row[_HEAD + self.joints :] = c.position, c.tor_max
+            row, known = v["command"][number % 2], {"number": number, "era": era, "object": self._object}
+            for name in row.dtype.names:
+                row[name] = known[name] if name in known else getattr(c, name)
             v["sent"].value = number
         finally:
             if held:
@@ -322,7 +321,7 @@ class BusDriver:
 
 
 # -- the child
-def _child(make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, output: str) -> None:
+def _child(make: Callable[[Clock], Body], raw: tuple, layouts: Sequence[np.dtype], hang: float, output: str) -> None:
     """Run the child's process: no key of the loop's terminal reaches the one that holds the hand."""
     system.leave_terminal()
     for number in system.hand_signals():
@@ -332,14 +331,12 @@ def _child(make: Callable[[Clock], Body], raw: tuple, joints: int, hang: float, 
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     with open(output, "ab") as sink:  # a native package prints to standard output
         os.dup2(sink.fileno(), 1)
-    status = _serve(make, _views(raw), joints, hang, lambda: bool(stop) or not lives())
+    status = _serve(make, _views(raw, layouts), hang, lambda: bool(stop) or not lives())
     sys.stdout.flush()
     os._exit(status)  # threads of a native package may wait for ever
 
 
-def _serve(
-    make: Callable[[Clock], Body], v: dict[str, Any], joints: int, hang: float, orphan: Callable[[], bool]
-) -> int:
+def _serve(make: Callable[[Clock], Body], v: dict[str, Any], hang: float, orphan: Callable[[], bool]) -> int:
     """Return bus cycles until the loop says stop, is silent or is gone; the last of them let go. Returns an exit
     status."""
     try:
@@ -356,11 +353,10 @@ def _serve(
     while True:
         if (number := v["sent"].value) > taken:
             row = v["command"][number % 2].copy()
-            taken, era = int(row[0]), int(row[1])
-            command = HandCommand(row[_HEAD : _HEAD + joints], row[_HEAD + joints :], int(row[3]), int(row[4]),
-                                  int(row[5]), int(row[2]))  # fmt: skip
-            if row[6] != handled:
-                handled = int(row[6])
+            taken, era = int(row["number"]), int(row["era"])
+            command = HandCommand(row["position"], row["tor_max"], *(int(row[name]) for name in _MODES))
+            if row["object"] != handled:
+                handled = int(row["object"])
                 body.handle(handled)
         now, alone = time.monotonic(), orphan()
         silence = now - v["beat"].value
@@ -372,7 +368,7 @@ def _serve(
                     " let go of the hand"
                 )
             if era < max(v["era"].value, silent_at) or v["stop"].value:
-                command = HandCommand(command.position, np.zeros(joints), 0, mode=PASSIVE)
+                command = HandCommand(command.position, np.zeros_like(command.tor_max), 0, mode=PASSIVE)
         if alone or (v["stop"].value and v["sent"].value == taken):  # what was sent before it is carried out
             last = min(last, now + LAST)
             if command is None or body.released() is not None or now > last:
@@ -392,37 +388,43 @@ def _serve(
             continue
         count += 1
         slot = v["state"][count % 2]
-        slot[:2] = state.time, state.sequence
-        speed = np.full(joints, np.nan) if state.velocity is None else state.velocity
-        slot[2 : 2 + 5 * joints] = np.concatenate(
-            [state.position, state.current, state.temperature, state.error, speed]
-        )
-        slot[2 + 5 * joints : -_SEEN] = 0 if state.silent is None else state.silent
-        slot[-_SEEN:] = body.seen()
-        v["touch"][count % 2, : state.tactile.size] = state.tactile.reshape(-1)
+        for name in ("time", "sequence", *_STATE):
+            slot[name] = getattr(state, name)
+        for name in ("velocity", "follower"):
+            slot[name] = np.nan if (x := getattr(state, name)) is None else x
+        slot["silent"] = False if state.silent is None else state.silent
+        slot["seen"] = body.seen()
+        if state.tactile.size:
+            slot["tactile"] = state.tactile
         v["newest"].value = count
     with contextlib.suppress(Exception):
         body.close()
     return 0
 
 
-def _shared(context: Any, joints: int, taxels: tuple[int, int]) -> tuple:
-    touch = 3 * int(np.prod(taxels))
-    state, command = 2 + 5 * joints + taxels[0] + _SEEN, _HEAD + 2 * joints
+def _layouts(joints: int, taxels: tuple[int, int], sensed: int) -> list[np.dtype]:
+    """Return the fields of a state and of a command, as the two processes share them."""
+    each = (joints,)
+    state = [
+        ("time", float), ("sequence", int), ("position", np.float32, each), ("current", np.int16, each),
+        ("temperature", float, each), ("error", int, each), ("velocity", float, each), ("follower", float, (sensed,)),
+        ("tactile", np.int16, (*taxels, 3)), ("silent", bool, taxels[:1]), ("seen", float, (_SEEN,)),
+    ]  # fmt: skip
+    command = [("number", int), ("era", int), ("object", int), ("position", float, each), ("tor_max", float, each)]
+    return [np.dtype(x, align=True) for x in (state, [*command, *((name, int) for name in _MODES)])]
+
+
+def _shared(context: Any, layouts: Sequence[np.dtype]) -> tuple:
     whole, text = ctypes.c_int64, ctypes.c_char
-    return (context.RawArray(ctypes.c_double, 2 * state), context.RawArray(ctypes.c_int16, 2 * max(touch, 1)),
-            context.RawArray(ctypes.c_double, 2 * command), context.RawValue(ctypes.c_double, 0.0),
-            *(context.RawValue(whole, x) for x in (-1, 0, 0, 0, 0, -1)),
+    return (*(context.RawArray(ctypes.c_byte, 2 * x.itemsize) for x in layouts),
+            context.RawValue(ctypes.c_double, 0.0), *(context.RawValue(whole, x) for x in (-1, 0, 0, 0, 0, -1)),
             *(context.RawArray(text, _TEXT) for _ in range(3)))  # fmt: skip
 
 
-def _views(raw: tuple) -> dict[str, Any]:
+def _views(raw: tuple, layouts: Sequence[np.dtype]) -> dict[str, Any]:
     names = "beat newest sent era stop ready released problem proof info".split()
-    return {
-        "state": np.frombuffer(raw[0], np.float64).reshape(2, -1),
-        "touch": np.frombuffer(raw[1], np.int16).reshape(2, -1),
-        "command": np.frombuffer(raw[2], np.float64).reshape(2, -1),
-    } | dict(zip(names, raw[3:], strict=True))
+    slots = {name: np.frombuffer(x, kind) for name, x, kind in zip(("state", "command"), raw, layouts, strict=False)}
+    return slots | dict(zip(names, raw[2:], strict=True))
 
 
 def _say(where: Any, text: str) -> None:

@@ -147,28 +147,18 @@ class Frozen:
         return (j, now - self._since) if moved[j] > self.MOVED else None
 
 
-def bad_place(place: Any) -> str | None:
-    """Return why an object's place [3] m, palm frame, cannot be true, or None."""
-    x = _array(place)
-    if x is None or x.shape != (3,):
-        return "its place is not x y z"
-    return None if np.isfinite(x).all() and np.abs(x).max() < 2.0 else f"its place is {np.round(x, 3).tolist()} m"
-
-
-def bad_orientation(q: Any) -> str | None:
-    """Return why an object's orientation [4], w x y z, cannot be true, or None."""
-    x = _array(q)
-    if x is None or x.shape != (4,):
-        return "its orientation is not w x y z"
-    return None if 0.5 < float(np.linalg.norm(x)) < 2.0 else f"its orientation is {np.round(x, 3).tolist()}"
-
-
-def bad_pose(pose: Any) -> str | None:
-    """Return why an object's pose [7], x y z m, w x y z, cannot be true, or None."""
-    x = _array(pose)
-    if x is None or x.shape != (7,):
-        return "its pose is not x y z w x y z"
-    return bad_place(x[:3]) or bad_orientation(x[3:])
+def bad_seen(what: str, value: Any) -> str | None:
+    """Return why what is seen of an object cannot be true, or None. what: `place` [3] m, palm frame, `orientation` [4]
+    or `pose` [7], which is both."""
+    form = {"place": "x y z", "orientation": "w x y z", "pose": "x y z w x y z"}[what]
+    x = _array(value)
+    if x is None or x.shape != (len(form.split()),):
+        return f"its {what} is not {form}"
+    if what != "orientation" and not np.abs(x[:3]).max() < 2.0:  # NaN too
+        return f"its place is {np.round(x[:3], 3).tolist()} m"
+    if what != "place" and not 0.5 < float(np.linalg.norm(x[-4:])) < 2.0:
+        return f"its orientation is {np.round(x[-4:], 3).tolist()}"
+    return None
 
 
 def _array(x: Any) -> np.ndarray | None:

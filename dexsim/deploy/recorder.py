@@ -40,7 +40,6 @@ class Recorder:
         self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s, sensed=sensed)
         self.path, self.zero, self.dropped, self.written = self.writer.path, zero, 0, 0
         self.error: str | None = None
-        self._channels: dict[str, int] = {}
         self._queue: queue.SimpleQueue = queue.SimpleQueue()
         self._most = most
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -81,7 +80,7 @@ class Recorder:
         w = self.writer
         add: dict[str, Callable[..., None]] = {
             "command": w.add_command, "tactile": partial(w.add, "tactile"),
-            "temperature": partial(w.add, "temperature"), "object": w.add_object_pose,
+            "temperature": partial(w.add, "temperature"),
         }  # fmt: skip
         first = None
         while (item := self._queue.get()) is not None:

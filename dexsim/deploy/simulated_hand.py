@@ -8,6 +8,7 @@ place.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -330,8 +331,8 @@ class SimulatedCamera:
 class SimulatedBody:
     """The hand's side of `SimulatedXHand`: a bus cycle every `BUS_PERIOD`, whose state is there `LATENCY` later."""
 
-    def __init__(self, clock: Clock, args: tuple):
-        self.clock, self.hand = clock, _physics(args)
+    def __init__(self, clock: Clock, make: Callable[[], SimulatedHand]):
+        self.clock, self.hand = clock, make()
         self._last: HandCommand | None = None
 
     def open(self) -> dict[str, str]:
@@ -386,18 +387,17 @@ class SimulatedBody:
 
 
 class SimulatedXHand(BusDriver):
-    """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step."""
+    """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step; how:
+    as `SimulatedHand` takes it."""
 
     name = "simulated hand"
 
     def __init__(
-        self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, seed: int = 0,
-        camera: bool = False, shape: str | None = None, grip: dict[str, Any] | None = None, hang: float = HANG,
+        self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, hang: float = HANG,
+        **how: Any,
     ):  # fmt: skip
-        registry.task_class(config)  # refused here where nobody that may has named it
-        hand = hand_of(config)
-        make = partial(SimulatedBody, args=(config, calibration, seed, camera, shape, grip))
-        super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, start=180.0)
+        make, hand = partial(SimulatedBody, make=simulated(config, calibration, **how)), hand_of(config)
+        super().__init__(make, len(hand.joints), touch_shape(hand), clock, hang, 180.0, len(hand.sensed))
 
     @property
     def hand(self) -> SimulatedHand:
@@ -407,35 +407,32 @@ class SimulatedXHand(BusDriver):
 
 
 def faked(
-    config: dict[str, Any], calibration: Calibration, faults: str = "", seed: int = 0, camera: bool = False,
-    shape: str | None = None, grip: dict[str, Any] | None = None, hang: float = HANG, serial: str | None = None,
-    clock: Clock | None = None,
+    config: dict[str, Any], calibration: Calibration, faults: str = "", hang: float = HANG, serial: str | None = None,
+    clock: Clock | None = None, **how: Any,
 ) -> VendorXHand:  # fmt: skip
     """Return the xHand's own driver, on a fake of the vendor's package with the simulated hand behind it. faults: see
-    `dexsim.deploy.fake_xhand.Faults`. Raises UserError."""
+    `dexsim.deploy.fake_xhand.Faults`; how: as `SimulatedHand` takes it. Raises UserError."""
     side = hand_of(config).handedness
     text = faults if "side=" in faults else f"side={side[0].upper()}," + faults
-    package = fake_package(config, calibration, text, seed, camera, shape, grip)
-    driver = VendorXHand("auto", clock, package, serial, side, hang)
+    driver = VendorXHand("auto", clock, fake_package(config, calibration, text, **how), serial, side, hang)
     driver.start = 180.0  # kernels compile on a first start
     return driver
 
 
-def fake_package(config: dict[str, Any], calibration: Calibration, faults: str, *how: Any) -> Any:
-    """Return what gives the fake of the vendor's package, with the simulated hand behind it. faults: see
-    `dexsim.deploy.fake_xhand.Faults`; how: as `SimulatedHand` takes it. Raises UserError."""
+def fake_package(config: dict[str, Any], calibration: Calibration, faults: str, **how: Any) -> Any:
+    """Return what gives the fake of the vendor's package, with the simulated hand behind it; see `faked`."""
+    return partial(FakeXHand, make=simulated(config, calibration, **how), faults=Faults.parse(faults))
+
+
+def simulated(config: dict[str, Any], calibration: Calibration, **how: Any) -> Callable[[], SimulatedHand]:
+    """Return what makes the hand, here or in another process. Raises UserError where nobody that may has named the
+    task."""
     registry.task_class(config)
-    make = partial(_physics, args=(config, calibration, *how))
-    return partial(FakeXHand, make=make, faults=Faults.parse(faults))
+    return partial(_physics, config, calibration, **how)
 
 
-def _physics(args: tuple) -> SimulatedHand:
-    _one_thread()
-    return SimulatedHand(*args)
-
-
-def _one_thread() -> None:
-    """Use one thread, in a process of the hand's own."""
+def _physics(config: dict[str, Any], calibration: Calibration, **how: Any) -> SimulatedHand:
+    """Return the hand; in a process of its own it uses one thread."""
     import multiprocessing
 
     import torch
@@ -445,3 +442,4 @@ def _one_thread() -> None:
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)
         quiet_warp("cpu")
+    return SimulatedHand(config, calibration, **how)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -28,11 +30,10 @@ PLAIN = "0.62 0.64 0.67 1"
 
 @dataclass
 class Model:
-    """xml: the text of model.xml; meshes: OBJ text by file name, in meshes/; tip_geoms: name of each finger's."""
+    """xml: the text of model.xml; meshes: OBJ text by file name, in meshes/."""
 
     xml: str
     meshes: dict[str, str] = field(default_factory=dict)
-    tip_geoms: list[str] = field(default_factory=list)
 
     def compile(self) -> mujoco.MjModel:
         """Return the model, without files."""
@@ -70,51 +71,40 @@ def build(
             owner[b] = owner.get(parent, -1)
     fingers = len(tree.fingers)
     bits = [1 << (FIRST_OWN + min(k, 27)) for k in range(fingers)] + [1 << (FIRST_OWN + min(fingers, 28))]
-    everyone = 0
-    for bit in bits:
-        everyone |= bit
+    everyone = sum(set(bits))
+    root = ET.fromstring(_TEMPLATE.format(solref=SOLREF, margin=MARGIN))
+    root.set("model", name)
+    assets, tip_of = root.find("asset"), {f.tip: k for k, f in enumerate(tree.fingers)}
 
-    def own(body: int) -> int:
-        return bits[owner[body]] if owner.get(body, -1) >= 0 else bits[-1]
+    def mesh(file: str, look: surface.Surface) -> str:
+        out.meshes[file] = surface.obj(look)
+        known = file.removesuffix(".obj")
+        _put(assets, "mesh", name=known, file=file, inertia="shell")
+        return known
 
-    files: list[str] = []
-    lines: list[str] = []
-    tip_of = {f.tip: k for k, f in enumerate(tree.fingers)}
-
-    def emit(b: int, depth: int) -> None:
-        pad = "  " * depth
-        at = "" if b == tree.palm else f' pos="{_n(m.body_pos[b])}" quat="{_n(m.body_quat[b])}"'
-        lines.append(f'{pad}<body name="{_t(m.body(b).name)}"{at}>')
-        inner = pad + "  "
+    def emit(b: int, parent: Any) -> Any:
+        body = _put(parent, "body", name=m.body(b).name)
+        if b != tree.palm:
+            body.attrib |= {"pos": _n(m.body_pos[b]), "quat": _n(m.body_quat[b])}
         if m.body_mass[b] > 0:
-            lines.append(
-                f'{inner}<inertial pos="{_n(m.body_ipos[b])}" quat="{_n(m.body_iquat[b])}" mass="{_n(m.body_mass[b])}"'
-                f' diaginertia="{_n(m.body_inertia[b])}"/>'
-            )
+            _put(body, "inertial", pos=m.body_ipos[b], quat=m.body_iquat[b], mass=m.body_mass[b],
+                 diaginertia=m.body_inertia[b])  # fmt: skip
         for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) if b != tree.palm else ():
-            joint = m.joint(j).name
-            kind = "" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else ' type="slide"'
-            lines.append(
-                f'{inner}<joint name="{_t(joint)}"{kind} pos="{_n(m.jnt_pos[j])}" axis="{_n(m.jnt_axis[j])}"'
-                f' range="{_n(m.jnt_range[j])}" armature="{_n(figures.armature[joint])}"'
-                f' damping="{_n(figures.damping[joint])}"{_spring(m, j)}{_rubs(m, j, tree)}/>'
-            )
+            joint, slides = m.joint(j).name, m.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE
+            _put(body, "joint", name=joint, type="slide" if slides else None, pos=m.jnt_pos[j], axis=m.jnt_axis[j],
+                 range=m.jnt_range[j], armature=figures.armature[joint], damping=figures.damping[joint],
+                 **_spring(m, j), frictionloss=_rubs(m, j, tree))  # fmt: skip
+        own = bits[owner.get(b, -1)]  # the last one: of no finger
+        others = everyone & ~own
         for n, c in enumerate(c for c in shapes.capsules if c.body == b):
-            others = everyone & ~own(b)
-            lines.append(inner + _capsule(f"link_{m.body(b).name}_{n}", c, HAND_BIT | own(b), OBJECT_BIT | others))
+            _capsule(body, f"link_{m.body(b).name}_{n}", c, HAND_BIT | own, OBJECT_BIT | others)
         if b in tip_of:
             k = tip_of[b]
-            finger = tree.fingers[k].name
-            out.meshes[f"tip_{finger}.obj"] = surface.obj(surface.hull(shapes.cores[k]))
-            files.append(f"tip_{finger}.obj")
-            out.tip_geoms.append(f"tip_{finger}")
-            lines.append(
-                f'{inner}<geom class="tip" name="tip_{finger}" mesh="tip_{finger}" contype="{HAND_BIT}"'
-                f' conaffinity="{OBJECT_BIT}"/>'
-            )
-            others = everyone & ~own(b)
+            tip = f"tip_{tree.fingers[k].name}"
+            known = mesh(f"{tip}.obj", surface.hull(shapes.cores[k]))
+            _put(body, "geom", class_="tip", name=tip, mesh=known, contype=HAND_BIT, conaffinity=OBJECT_BIT)
             for n, c in enumerate(c for c in shapes.proxies if c.body == b):
-                lines.append(inner + _capsule(f"self_{finger}_{n}", c, own(b), others))
+                _capsule(body, f"self_{tree.fingers[k].name}_{n}", c, own, others)
         drawn = geometry.seen(m, b)
         if b in tip_of and len(tree.fingers[tip_of[b]].geoms) < len(geometry.solid(m, b)):
             drawn = [*drawn, *(g for g in tree.fingers[tip_of[b]].geoms if g not in drawn)]  # a rubber tip of its own
@@ -125,62 +115,67 @@ def build(
             file = f"{_safe(m.body(b).name)}_{n}.obj"
             while file.lower() in {other.lower() for other in out.meshes}:  # names that differ in a dot or a case alone
                 file = f"_{file}"
-            out.meshes[file] = surface.obj(look)
-            files.append(file)
-            lines.append(
-                f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'
-                f' rgba="{_colour(m, g)}"/>'
-            )
+            _put(body, "geom", class_="visual", name=f"visual_{m.body(b).name}_{n}", mesh=mesh(file, look),
+                 rgba=_colour(m, g))  # fmt: skip
         for child in bodies:
             if m.body_parentid[child] == b:
-                emit(child, depth + 1)
-        lines.append(f"{pad}</body>")
+                emit(child, body)
+        return body
 
-    emit(tree.palm, 2)
-    drums, tendons, equalities = _ties(m, tree, figures, pulls)
-    lines[-1:-1] = drums
-    order = {f"tip_{f.name}": k for k, f in enumerate(tree.fingers)}
-    out.tip_geoms.sort(key=lambda g: order[g])
-    assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
-    excluding = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
-    out.xml = _TEMPLATE.format(
-        name=_t(name), note=re.sub("-{2,}", "-", note), assets=assets, bodies="\n".join(lines), solref=SOLREF,
-        margin=MARGIN,
-        contact=(f"\n  <contact>\n{excluding}\n  </contact>" if excluding else "") + tendons + equalities,
-    )  # fmt: skip
+    palm = emit(tree.palm, root.find("worldbody"))
+    for one, other in excluded:
+        _put(_section(root, "contact"), "exclude", body1=one, body2=other)
+    _ties(m, tree, figures, pulls, palm, root)
+    ET.indent(root)
+    note = re.sub("-{2,}", "-", note)
+    out.xml = f"<!-- {note} -->\n{ET.tostring(root, encoding='unicode')}\n"
     return out
 
 
-def _spring(m: mujoco.MjModel, j: int) -> str:
+def _put(parent: Any, kind: str, **said: Any) -> Any:
+    """Append an element with those attributes that are not None, and return it; class_ stands for class."""
+    text = {k.rstrip("_"): str(v) if isinstance(v, (str, int)) else _n(v) for k, v in said.items() if v is not None}
+    return ET.SubElement(parent, kind, text)
+
+
+def _section(root: ET.Element, name: str) -> Any:
+    """Return a section of the model, made where it is not there yet."""
+    found = root.find(name)
+    return ET.SubElement(root, name) if found is None else found
+
+
+def _spring(m: mujoco.MjModel, j: int) -> dict[str, float]:
     """Return what a joint is where the model is drawn, and its spring, where it has them."""
-    at = int(m.jnt_qposadr[j])
-    said = [("ref", m.qpos0[at]), ("stiffness", m.jnt_stiffness[j])]
-    if m.jnt_stiffness[j]:
-        said.append(("springref", m.qpos_spring[at]))
-    return "".join(f' {key}="{_n(value)}"' for key, value in said if value)
+    at, stiff = int(m.jnt_qposadr[j]), m.jnt_stiffness[j]
+    said = {"ref": m.qpos0[at], "stiffness": stiff, "springref": m.qpos_spring[at] if stiff else 0.0}
+    return {key: value for key, value in said.items() if value}
 
 
-def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> str:
+def _rubs(m: mujoco.MjModel, j: int, tree: Tree) -> float | None:
     """Return dry friction of a joint without a drive: that of driven ones is their servo's."""
-    level = m.dof_frictionloss[m.jnt_dofadr[j]]
-    return f' frictionloss="{_n(level)}"' if j in tree.passive and level else ""
+    level = float(m.dof_frictionloss[m.jnt_dofadr[j]])
+    return level if j in tree.passive and level else None
 
 
-def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]) -> tuple[list[str], str, str]:
-    """Return lines of the drums, and the tendons and equalities that tie the hand's joints, as MJCF."""
-    names = {m.joint(j).name for j in tree.every}
-    drums, tendons, ties, driven = [], [], [], set()
+def _ties(
+    m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull], palm: ET.Element, root: ET.Element
+) -> None:
+    """Add the drums to the palm, and to the model the tendons and equalities that tie the hand's joints."""
+    names, driven = {m.joint(j).name for j in tree.every}, set()
+
+    def tendon(name: str, arms: Mapping[str, float], **own: Any) -> None:
+        fixed = _put(_section(root, "tendon"), "fixed", name=name, **own)
+        for joint, coef in arms.items():
+            _put(fixed, "joint", joint=joint, coef=coef)
+
     for pull in pulls:
         at = sum(c * m.qpos0[m.joint(j).qposadr[0]] for j, c in pull.arms.items())
-        drum = _t(f"{DRIVE}{pull.name}")
-        drums.append(
-            f'      <body name="{drum}"><inertial pos="0 0 0" mass="1e-4" diaginertia="1e-9 1e-9 1e-9"/><joint'
-            f' name="{_t(pull.name)}" axis="0 0 1" range="{_n(pull_range(m, pull))}" ref="{_n(at)}"'
-            f' armature="{_n(figures.armature[pull.name])}" damping="{_n(figures.damping[pull.name])}"/></body>'
-        )
-        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in {**pull.arms, pull.name: -1.0}.items())
-        tendons.append(f'    <fixed name="{drum}">{along}</fixed>')
-        ties.append(f'    <tendon tendon1="{drum}" solref="{TIE}"/>')
+        drum = _put(palm, "body", name=f"{DRIVE}{pull.name}")
+        _put(drum, "inertial", pos="0 0 0", mass="1e-4", diaginertia="1e-9 1e-9 1e-9")
+        _put(drum, "joint", name=pull.name, axis="0 0 1", range=pull_range(m, pull), ref=at,
+             armature=figures.armature[pull.name], damping=figures.damping[pull.name])  # fmt: skip
+        tendon(f"{DRIVE}{pull.name}", {**pull.arms, pull.name: -1.0})
+        _put(_section(root, "equality"), "tendon", tendon1=f"{DRIVE}{pull.name}", solref=TIE)
     for t in range(m.ntendon):
         wraps = range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t])
         arms = {m.joint(m.wrap_objid[w]).name: m.wrap_prm[w] for w in wraps}
@@ -189,15 +184,13 @@ def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]
         if not arms:
             continue
         driven.add(t)
-        along = "".join(f'<joint joint="{_t(j)}" coef="{_n(c)}"/>' for j, c in arms.items())
-        own = "".join(f' {key}="{_n(value)}"' for key, value in (
-            ("stiffness", m.tendon_stiffness[t]), ("damping", m.tendon_damping[t]),
-            ("armature", m.tendon_armature[t]), ("frictionloss", m.tendon_frictionloss[t])) if value)  # fmt: skip
+        own = {key: getattr(m, f"tendon_{key}")[t] or None for key in ("stiffness", "damping", "armature",
+                                                                       "frictionloss")}  # fmt: skip
         if m.tendon_stiffness[t]:
-            own += f' springlength="{_n(m.tendon_lengthspring[t] - still)}"'
+            own["springlength"] = m.tendon_lengthspring[t] - still
         if m.tendon_limited[t]:
-            own += f' range="{_n(m.tendon_range[t] - still)}"'
-        tendons.append(f'    <fixed name="{_t(m.tendon(t).name or f"tendon_{t}")}"{own}>{along}</fixed>')
+            own["range"] = m.tendon_range[t] - still
+        tendon(m.tendon(t).name or f"tendon_{t}", arms, **own)
     for e in range(m.neq):
         pair = [int(m.eq_obj1id[e]), int(m.eq_obj2id[e])]
         if m.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT:
@@ -208,13 +201,8 @@ def _ties(m: mujoco.MjModel, tree: Tree, figures: Figures, pulls: Sequence[Pull]
             what, of = "tendon", [m.tendon(k).name or f"tendon_{k}" for k in pair if k in driven]
             if pair[0] not in driven:
                 continue
-        both = " ".join(f'{what}{n}="{_t(x)}"' for n, x in enumerate(of, 1))
-        ties.append(f'    <{what} {both} polycoef="{_n(m.eq_data[e, :5])}" solref="{TIE}"/>')
-    return (
-        drums,
-        "\n  <tendon>\n" + "\n".join(tendons) + "\n  </tendon>" if tendons else "",
-        "\n  <equality>\n" + "\n".join(ties) + "\n  </equality>" if ties else "",
-    )
+        both = {f"{what}{n}": x for n, x in enumerate(of, 1)}
+        _put(_section(root, "equality"), what, **both, polycoef=m.eq_data[e, :5], solref=TIE)
 
 
 def pull_range(m: mujoco.MjModel, pull: Pull) -> tuple[float, float]:
@@ -227,12 +215,10 @@ def pull_range(m: mujoco.MjModel, pull: Pull) -> tuple[float, float]:
     return low, high
 
 
-def _capsule(name: str, c: Capsule, contype: int, conaffinity: int) -> str:
-    bits = f'contype="{contype}" conaffinity="{conaffinity}"'
-    if np.linalg.norm(c.b - c.a) < 1e-4:
-        return f'<geom class="link" name="{_t(name)}" type="sphere" pos="{_n(c.a)}" size="{_n(c.radius)}" {bits}/>'
-    ends = _n([*c.a, *c.b])
-    return f'<geom class="link" name="{_t(name)}" type="capsule" fromto="{ends}" size="{_n(c.radius)}" {bits}/>'
+def _capsule(body: ET.Element, name: str, c: Capsule, contype: int, conaffinity: int) -> None:
+    ball = np.linalg.norm(c.b - c.a) < 1e-4
+    place = {"type": "sphere", "pos": c.a} if ball else {"type": "capsule", "fromto": [*c.a, *c.b]}
+    _put(body, "geom", class_="link", name=name, **place, size=c.radius, contype=contype, conaffinity=conaffinity)
 
 
 def _colour(m: mujoco.MjModel, g: int) -> str:
@@ -247,17 +233,12 @@ def _n(values: ArrayLike) -> str:
     return " ".join(f"{float(x) + 0.0:.8g}" for x in np.atleast_1d(values))
 
 
-def _t(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
-
-
 def _safe(text: str) -> str:
     return "".join(c if c.isalnum() or c in "_-" else "_" for c in text)
 
 
 _TEMPLATE = """\
-<!-- {note} -->
-<mujoco model="{name}">
+<mujoco>
   <compiler angle="radian" meshdir="meshes" autolimits="true"/>
   <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/>
   <default>
@@ -272,11 +253,7 @@ _TEMPLATE = """\
         margin="{margin}" rgba="0.2 0.7 0.4 0.5"/>
     </default>
   </default>
-  <asset>
-{assets}
-  </asset>
-  <worldbody>
-{bodies}
-  </worldbody>{contact}
+  <asset/>
+  <worldbody/>
 </mujoco>
 """

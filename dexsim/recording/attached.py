@@ -65,5 +65,4 @@ class Config(msgspec.Struct):
 def config(text: str | None, source: object) -> Config:
     """Return what is read of an attached config; nothing of none. Raises UserError."""
     raw: Any = (yaml_text.parse(text, f"{source}: attached config") if text else None) or {}
-    own = {k: raw[k] for k in Config.__struct_fields__ if k in raw} if isinstance(raw, dict) else raw
-    return typed.convert(own, Config, f"{source}: attached config")
+    return typed.convert(raw, Config, f"{source}: attached config")

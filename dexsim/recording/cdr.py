@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dexsim.recording.schema import IMU_TYPE, JOINT_STATE, MULTI_ARRAY, POSE, WRENCH
+from dexsim.recording.schema import EXTERNAL_FORCE, IMU, IMU_TYPE, JOINT_STATE, MULTI_ARRAY, OBJECT_POSE, POSE, WRENCH
 
 
 @cache
@@ -83,6 +83,9 @@ def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
         missing = not np.isfinite(part).all()
         parts += [make(np.zeros_like(part) if missing else part), np.r_[-1.0 if missing else 0.0, np.zeros(8)]]
     return _bytes(IMU_TYPE, _header(stamp_ns, frame), *parts)
+
+
+VECTORS = {EXTERNAL_FORCE: wrench, OBJECT_POSE: pose, IMU: imu}
 
 
 def _bytes(kind: str, *fields: Any) -> bytes:

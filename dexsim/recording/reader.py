@@ -212,12 +212,7 @@ class _Reading:
             fits = [t for t in self.streams if t not in taken and t.endswith(ours) and self._is_a(t, kind)]
             if ours == schema.STATES and not fits:
                 fits = [t for t in self.streams if t not in taken and self._is_a(t, kind, strict=True)]
-            if len(fits) == 1:
-                out[ours] = (fits[0], "")
-                self._note("topic", f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info", ours)
-            elif len(fits) > 1:
-                text = f"could be any of {', '.join(fits)}; none is used (say which with remap.{ours}=TOPIC)"
-                self._note("topic", text, "warning", ours, len(fits))
+            self._choose(out, ours, [(t, "") for t in fits])
         self._of_controllers(out)
         if schema.STATES not in out and schema.COMMANDS not in out:
             raise UserError(
@@ -243,17 +238,22 @@ class _Reading:
             for kind in SENT if ours == schema.COMMANDS and not fits else ():
                 taken = {theirs for theirs, _ in out.values()}
                 of_kind = [t for t in self.streams if t not in taken and self._is_a(t, SENT[kind], strict=True)]
-                fits = [(t, "") for t in of_kind if kind == "a trajectory" or t.endswith("/commands")]
-                if fits:
+                if fits := [(t, "") for t in of_kind if kind == "a trajectory" or t.endswith("/commands")]:
                     what = kind
                     break
-            if len(fits) == 1:
-                out[ours] = fits[0]
-                text = f"read from {fits[0][0]} ({what}; say otherwise with remap.{ours}=TOPIC)"
-                self._note("topic", text, "info", ours)
-            elif fits:
-                text = f"could be any of {', '.join(t for t, _ in fits)}; none is used (say which: remap.{ours}=TOPIC)"
-                self._note("topic", text, "warning", ours, len(fits))
+            self._choose(out, ours, fits, f"{what}; ")
+
+    def _choose(
+        self, out: dict[str, tuple[str, str]], ours: str, fits: Sequence[tuple[str, str]], what: str = ""
+    ) -> None:
+        """Take the only (topic, part) that fits one of ours; of several none, and say so."""
+        if len(fits) == 1:
+            out[ours] = fits[0]
+            text = f"read from {fits[0][0]} ({what}say otherwise with remap.{ours}=TOPIC)"
+            self._note("topic", text, "info", ours)
+        elif fits:
+            text = f"could be any of {', '.join(t for t, _ in fits)}; none is used (say which with remap.{ours}=TOPIC)"
+            self._note("topic", text, "warning", ours, len(fits))
 
     def _is_a(self, topic: str, kind: str, strict: bool = False) -> bool:
         s = self.streams[topic][0]

@@ -29,15 +29,15 @@ BLOCK = 16 << 20
 """Bytes of messages laid on top of each other at a time."""
 STAMP: tuple[Span, Span] = ((4, 1, "<i4"), (8, 1, "<u4"))
 """Seconds and nanoseconds of a message that begins with a header."""
-LITTLE = b"\x00\x01"
-"""How plain CDR of little endian begins."""
+LITTLE, HEAD = b"\x00\x01", 12
+"""How plain CDR of little endian begins; bytes before whatever comes behind the encoding and a stamp, or a layout."""
 
 
 class _Cursor:
     """Where one is in a message (CDR, little endian): fields in order, each aligned to its size, counted from behind
     the four bytes that say how it is encoded."""
 
-    def __init__(self, data: bytes, at: int = 4):
+    def __init__(self, data: bytes, at: int):
         self.data, self.at = data, at
 
     def align(self, size: int) -> int:
@@ -62,33 +62,18 @@ class _Cursor:
 
 def joint_state(data: bytes) -> list[Span] | None:
     """Stamp (two), position, velocity, effort of a sensor_msgs/JointState; None where it is none."""
-    c = _Cursor(data, 12)
+    c = _Cursor(data, HEAD)
     c.string()
     for _ in range(c.count()):
         c.string()
-    return _whole(c, [*STAMP, *(c.numbers(c.count(), "<f8") for _ in range(3))])
+    found = [*STAMP, *(c.numbers(c.count(), "<f8") for _ in range(3))]
+    return found if data[:2] == LITTLE and c.at <= len(data) else None
 
 
-def multi_array(data: bytes) -> list[Span] | None:
-    """Return the values of a std_msgs/Float32MultiArray; None where it is none."""
-    c = _Cursor(data)
-    for _ in range(c.count()):
-        c.string()
-        c.count(), c.count()
-    c.count()
-    return _whole(c, [c.numbers(c.count(), "<f4")])
-
-
-def plain(data: bytes, count: int) -> list[Span] | None:
-    """Stamp (two) and the `count` float64 that follow the header of a message without anything else; None where it is
-    none."""
-    c = _Cursor(data, 12)
-    c.string()
-    return _whole(c, [*STAMP, c.numbers(count, "<f8")])
-
-
-def _whole(c: _Cursor, found: list[Span]) -> list[Span] | None:
-    return found if c.data[:2] == LITTLE and c.at <= len(c.data) else None
+def at_the_end(data: bytes, count: int, kind: str, *before: Span) -> list[Span] | None:
+    """Return the spans `before` and that of the `count` numbers with which a message ends."""
+    at = len(data) - count * int(kind[-1])
+    return [*before, (at, count, kind)] if data[:2] == LITTLE and at >= HEAD else None
 
 
 def take(messages: Sequence[bytes], layout: Callable[[bytes], list[Span] | None]) -> list[np.ndarray] | None:
@@ -147,7 +132,7 @@ def joint_rows(messages: Sequence[bytes], one: JointSample) -> JointRows | None:
 
 def array_rows(messages: Sequence[bytes], one: Array) -> list[Array] | None:
     """Return arrays of one layout; None where they are not. one: the first, as the standard decoder reads it."""
-    found = take(messages, multi_array)
+    found = take(messages, partial(at_the_end, count=len(one[1]), kind="<f4"))
     if found is None:
         return None
     values = found[0].astype(float)
@@ -166,7 +151,7 @@ class Plain:
 
     def rows(self, messages: Sequence[bytes], one: Vector) -> list[Vector] | None:
         """Return vectors of one layout; None where they are not. one: the first, as it is read by itself."""
-        found = take(messages, partial(plain, count=self.count))
+        found = take(messages, lambda data: at_the_end(data, self.count, "<f8", *STAMP))
         if found is None:
             return None
         seconds, rest, numbers = found

@@ -95,17 +95,12 @@ class Writer:
         topic, labels = schema.ARRAYS[name]
         self.add_array(topic, t, np.atleast_1d(value), labels)
 
-    def add_external_force(self, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None) -> None:
-        """Add [6]: force [N] and torque [N.m] in `frame`."""
-        self._message(schema.EXTERNAL_FORCE, t, cdr.wrench(self._ns(t if stamp is None else stamp), frame, value))
-
-    def add_object_pose(self, t: float, value: np.ndarray, stamp: float | None = None) -> None:
-        """Add a pose [7]: x y z [m], w x y z, palm frame."""
-        self._message(schema.OBJECT_POSE, t, cdr.pose(self._ns(t if stamp is None else stamp), "palm", value))
-
-    def add_imu(self, t: float, value: np.ndarray, frame: str = "object", stamp: float | None = None) -> None:
-        """Add [10]: orientation w x y z, angular velocity [rad/s], linear acceleration [m/s2]."""
-        self._message(schema.IMU, t, cdr.imu(self._ns(t if stamp is None else stamp), frame, value))
+    def add_vector(
+        self, topic: str, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None
+    ) -> None:
+        """Add to one of `cdr.VECTORS`, in `frame`: force and torque [6] N, N.m; pose [7] x y z m, w x y z; of an IMU
+        [10] orientation w x y z, angular velocity rad/s, linear acceleration m/s2."""
+        self._message(topic, t, cdr.VECTORS[topic](self._ns(t if stamp is None else stamp), frame, value))
 
     def flush(self) -> None:
         """Finish the chunk in progress and hand it to the operating system."""
@@ -190,13 +185,12 @@ def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]
         if (series := getattr(r, name)) is not None:
             for i, t in enumerate(series.t):
                 yield t, order, w.add, (name, t, series.value[i])
-    if r.object_pose is not None:
-        for i, t in enumerate(r.object_pose.t):
-            yield t, 7, w.add_object_pose, (t, r.object_pose.value[i], _stamp(r.object_pose, i))
-    for order, (series, add) in enumerate(((r.external_force, w.add_external_force), (r.imu, w.add_imu)), start=8):
+    vectors = {schema.OBJECT_POSE: r.object_pose, schema.EXTERNAL_FORCE: r.external_force, schema.IMU: r.imu}
+    for order, (topic, series) in enumerate(vectors.items(), start=7):
         if series is not None:
+            frame = "palm" if topic == schema.OBJECT_POSE else series.frame
             for i, t in enumerate(series.t):
-                yield t, order, add, (t, series.value[i], series.frame, _stamp(series, i))
+                yield t, order, w.add_vector, (topic, t, series.value[i], frame, _stamp(series, i))
 
 
 def _stamp(series: Series, i: int) -> float | None:
