@@ -308,8 +308,7 @@ def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
 
 def test_a_page_follows_a_run(env, tmp_path):
     """A slider position for each checkpoint that is saved, the last for the newest policy, which is played anew."""
-    from dexsim.cli.live import Run
-    from dexsim.view.live import LiveView
+    from dexsim.view.live import LiveView, Run
 
     def save(name, number):
         (tmp_path / name).write_text(str(number))

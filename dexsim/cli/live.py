@@ -10,17 +10,15 @@ from typing import Any
 
 from dexsim import system
 from dexsim.cli.start import Start
-from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import Policy, load_policy, plain_policy
 
-PROGRESS = "progress.csv"
 PLAIN = ("scripted", "zero", "random")  # policies that need no checkpoint
 
 
 def run(start: Start, env: Any, policy: Policy) -> int:
     """Serve until Ctrl-C; returns the exit status. Raises UserError."""
-    from dexsim.view.live import LiveView
+    from dexsim.view.live import PROGRESS, LiveView, Run
 
     play = start.play
     source = None if start.source is None else Path(start.source)
@@ -65,41 +63,6 @@ def _end_with(process: int, view: Any) -> None:
     while system.parent() == process:
         time.sleep(0.5)
     view.stop()
-
-
-class Run:
-    """The training that a checkpoint is of, by its folder; see `dexsim.view.live.Followed`. files: of the page, by
-    name; checkpoints that are saved later are added."""
-
-    def __init__(self, source: Path, files: dict[str, Path]):
-        self.newest, self._folder, self._files = source.name, source.parent, files
-        self._stamp = self._time()
-
-    def _time(self) -> float:
-        path = self._folder / self.newest
-        return path.stat().st_mtime if path.is_file() else 0.0
-
-    def names(self) -> list[str]:
-        """List the checkpoints by iteration, then the newest policy."""
-        saved = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
-        saved.sort(key=lambda p: int(p.stem.removeprefix("model_")))
-        self._files.update({p.name: p for p in saved})
-        return [*(p.name for p in saved if p.name != self.newest), self.newest]
-
-    def changed(self) -> bool:
-        """Tell whether the newest policy was saved again."""
-        before, self._stamp = self._stamp, self._time()
-        return self._stamp != before
-
-    def panel(self) -> str:
-        """Show what progress.csv says."""
-        from dexsim.view.live_panels import training
-        from dexsim.view.plots import read_progress
-
-        try:
-            return training(read_progress(self._folder / PROGRESS))
-        except (OSError, ValueError, UserError):  # in the middle of a line
-            return ""
 
 
 def beside(source: Path) -> list[Path]:

@@ -14,7 +14,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,6 +28,7 @@ from dexsim.view import live_panels as panels
 from dexsim.view.live_meshes import body_meshes
 from dexsim.view.render import CAMERA, backdrop
 
+PROGRESS = "progress.csv"
 Policy = Callable[[Any], torch.Tensor]  # observations -> actions [N, A]
 SPEEDS = {"1/10": 0.1, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "fastest": float("inf")}
 BUTTONS = {"step": 1, "10 steps": 10, "new episodes": 0}
@@ -53,20 +55,38 @@ class Wishes:
     changed: threading.Event = field(default_factory=threading.Event)
 
 
-class Followed(Protocol):
-    """A training, seen from its folder."""
+class Run:
+    """The training that a checkpoint is of, seen from its folder. newest: the policy that it saves over and over;
+    files: of the page, by name; checkpoints that are saved later are added."""
 
-    newest: str
-    """Name of the policy that it saves over and over."""
+    def __init__(self, source: Path, files: dict[str, Path]):
+        self.newest, self._folder, self._files = source.name, source.parent, files
+        self._stamp = self._time()
+
+    def _time(self) -> float:
+        path = self._folder / self.newest
+        return path.stat().st_mtime if path.is_file() else 0.0
 
     def names(self) -> list[str]:
-        """Name its checkpoints, the oldest first, the newest policy last."""
+        """List the checkpoints by iteration, then the newest policy."""
+        saved = [p for p in self._folder.glob("model_*.pt") if p.stem.removeprefix("model_").isdigit()]
+        saved.sort(key=lambda p: int(p.stem.removeprefix("model_")))
+        self._files.update({p.name: p for p in saved})
+        return [*(p.name for p in saved if p.name != self.newest), self.newest]
 
     def changed(self) -> bool:
-        """Tell whether the newest policy is another than when this was last asked."""
+        """Tell whether the newest policy was saved again since this was last asked."""
+        before, self._stamp = self._stamp, self._time()
+        return self._stamp != before
 
     def panel(self) -> str:
-        """Give HTML: how it learns."""
+        """Give HTML: how it learns, by its progress.csv."""
+        from dexsim.view.plots import read_progress
+
+        try:
+            return panels.training(read_progress(self._folder / PROGRESS))
+        except (OSError, ValueError, UserError):  # in the middle of a line
+            return ""
 
 
 class LiveView:
@@ -82,7 +102,7 @@ class LiveView:
 
     def __init__(
         self, env: Any, policy: Policy, name: str, choices: list[str], load: Callable[[str], Policy], host: str,
-        port: int, run: Followed | None = None,
+        port: int, run: Run | None = None,
     ) -> None:  # fmt: skip
         viser: Any = importlib.import_module("viser")  # slow to load
 
@@ -172,7 +192,6 @@ class LiveView:
         self._policy_choice, self._checkpoint, self._choices = policy, at, choices
         with gui.add_folder("Rewards"):
             self._reward_html = gui.add_html("")
-        self._pause = pause
         live_gate.only_known(
             server,
             {
