@@ -305,20 +305,12 @@ def check(path: str | Path) -> bool:
     b = bundle.load(path)
     m = b.manifest
     file = b.path / bundle.GOLDEN
-    try:
-        rows = _golden_rows(file)
-        observation, expected = rows["observation"], rows["action"]
-        n = len(rows["q"])
-    except UserError:
-        raise
-    except Exception as error:  # a damaged zip or array header ends in many ways
-        raise UserError(
-            f"{file}: cannot be read ({' '.join(str(error).split())[:100]}); export the bundle again"
-        ) from None
-    of = measure.of(m["task"])
     rule = ActionRule.from_manifest(m["action"])
     try:
-        built = _rebuilt(of, b, rows) - observation[:n]
+        rows = files.arrays(file)
+        observation, expected = rows["observation"], rows["action"]
+        n = len(rows["q"])
+        built = _rebuilt(measure.of(m["task"]), b, rows) - observation[:n]
         begins = [*rows["begins"], *[True] * (len(observation) - n)] if "begins" in rows else [True] * len(observation)
         single = _in_order(b, observation, begins)
         whole = single if b.recurrent else b.act(observation)
@@ -329,10 +321,9 @@ def check(path: str | Path) -> bool:
         single - expected, whole - expected
     except KeyError as error:
         raise UserError(f"{file}: lacks {error}; export the bundle again") from None
-    except Exception as error:  # onnxruntime's, numpy's and torch's for arrays of the wrong shape or type
-        raise UserError(
-            f"{file}: its arrays do not fit the bundle ({' '.join(str(error).split())[:160]}); export it again"
-        ) from None
+    except Exception as error:  # of a damaged archive; onnxruntime's, numpy's and torch's for arrays of another shape
+        why = " ".join(str(error).split())[:160]
+        raise UserError(f"{file}: cannot be read, or does not fit the bundle ({why}); export it again") from None
     relative = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
     found = {
         "actions": float(relative(whole, expected).max()),
@@ -379,11 +370,3 @@ def _rebuilt(of: Any, b: Any, rows: dict[str, Any]) -> Any:
             built.reset()
         out.append(built.built({name: x[k] for name, x in signals.items()})[0])
     return np.stack(out)
-
-
-def _golden_rows(file: Path) -> dict[str, Any]:
-    """Return the arrays of a golden file."""
-    try:
-        return files.arrays(file)
-    except ValueError as error:
-        raise UserError(f"{file}: {error}; export the bundle again") from None
