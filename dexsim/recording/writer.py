@@ -48,20 +48,16 @@ class Writer:
             raise UserError(f"{self.path}: metadata key '{unknown[0]}' does not exist; valid: {', '.join(schema.KEYS)}")
         try:
             self._file = open(self.path, "wb")  # noqa: SIM115 (lives as long as the writer)
-            try:
-                self._mcap = McapWriter(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
-                self._mcap.start(profile="ros2", library="dexsim")
-                self._mcap.add_metadata(schema.METADATA, self.meta)
-                if config is not None:
-                    self._mcap.add_attachment(
-                        self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode()
-                    )
-                self._file.flush()
-            except OSError:
-                with suppress(OSError):
-                    self._file.close()
-                raise
+            self._mcap = McapWriter(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+            self._mcap.start(profile="ros2", library="dexsim")
+            self._mcap.add_metadata(schema.METADATA, self.meta)
+            if config is not None:
+                at = self.start_ns, self.start_ns
+                self._mcap.add_attachment(*at, schema.ATTACHMENT, "application/yaml", config.encode())
+            self._file.flush()
         except OSError as error:
+            with suppress(OSError, AttributeError):  # the latter where it was not opened
+                self._file.close()
             raise UserError(f"cannot write recording {self.path}: {error.strerror}; choose another place") from None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
