@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from worlds import grasp_env
 
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
+from dexsim.deploy.process import BusDriver
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.import_hand import poses
@@ -94,3 +96,44 @@ def test_the_deployed_loop_asks_the_driver_for_them(folder):
     moved, *_ = where(q, 0.8 * q + 0.2)
     assert (np.linalg.norm(moved - tips, axis=1) > 2e-3).all()  # the fingertips are where the encoders say
     np.testing.assert_allclose(where(q, 0.8 * q)[0], tips, atol=1e-4)
+
+
+class Told:
+    """A hand behind its bus that is read, and nothing else."""
+
+    def __init__(self, clock):
+        self.clock, self.due = clock, 0.0
+
+    def open(self):
+        return {}
+
+    def cycle(self, command):
+        self.clock.sleep_until(self.clock.now() + 0.01)
+        joints = np.array([0.1, 0.2, 0.3], np.float32)
+        return HandState(self.clock.now(), 1, joints, np.zeros(3), follower=np.array([0.4, 0.5]))
+
+    def problem(self):
+        return ""
+
+    def released(self):
+        return True, "limp"
+
+    def seen(self):
+        return np.full(9, np.nan)
+
+    def handle(self, what):
+        pass
+
+    close = open
+
+
+def test_a_driver_in_its_own_process_passes_them_on():
+    driver = BusDriver(Told, 3, (0, 0), sensed=2)
+    driver.open()
+    try:
+        limit = time.monotonic() + 20.0
+        while (state := driver.read()) is None and time.monotonic() < limit:
+            time.sleep(0.01)
+        assert state is not None and state.follower.tolist() == [0.4, 0.5] and state.velocity is None
+    finally:
+        driver.close()
