@@ -17,6 +17,7 @@ from dexsim.sim import collision as narrow_phase
 from dexsim.sim import contact
 from dexsim.sim import solver as newton
 from dexsim.sim.begin import Begin
+from dexsim.sim.beside import Beside
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 from dexsim.sim.warmup import compile_side_by_side
 
@@ -37,6 +38,7 @@ class WarpEngine(Engine):
 
     narrow: who finds the contacts of convex hulls, None = MuJoCo-Warp itself.
     newton: who finds the contact forces, None = MuJoCo-Warp itself.
+    beside: lets stages of a recorded step run side by side, None = one after the other.
     """
 
     kind = "warp"
@@ -83,6 +85,10 @@ class WarpEngine(Engine):
             if self.narrow is not None and not self.narrow.number:
                 self.narrow = None
             self.newton = newton.NewtonSolver(self.m, self.d) if solver != "mujoco" and not no_solver else None
+            by_contact = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY).any()  # its moments are of contacts
+            ours = device.startswith("cuda") and self.narrow is not None and self.newton is not None
+            more = (_warp_stream(torch.cuda.Stream()) for _ in range(2))
+            self.beside = Beside(*more) if ours and not (deterministic or by_contact) else None
             P = len(self.pairs)
             w = self.wp
             w.time, w.qpos, w.qvel, w.qfrc_applied = self.d.time, self.d.qpos, self.d.qvel, self.d.qfrc_applied
@@ -134,9 +140,10 @@ class WarpEngine(Engine):
         self._run(("step", substeps, before_each, after), program)
 
     def physics_step(self) -> None:
-        """Launch one bare physics step, launched and not recorded."""
+        """Launch one bare physics step."""
         with ExitStack() as stack:
-            for ours in (self.narrow, self.newton):
+            recorded = wp.get_device(self.device).captures  # what is not waits for Python anyway
+            for ours in (self.narrow, self.newton, self.beside if recorded else None):
                 if ours is not None:
                     stack.enter_context(ours.in_place())
             mjw.step(self.m, self.d)

@@ -19,10 +19,12 @@ class Episodes(Built):
     """Worlds that begin anew where a mask says so; see `HandEnv`."""
 
     # what `Task` has: where mask [N] holds, a new episode (object, servo, state through `place`); groups of
-    # observations [N, D], advance: a control step has passed (sensors with memory move on); what drives are drawn
+    # observations [N, D], advance: a control step has passed (sensors with memory move on); what drives are drawn; how
+    # pads are launched
     begin_episodes: Callable[[torch.Tensor], None]
     observe: Callable[..., dict[str, torch.Tensor]]
     servo_random: servos.ServoRandomizer
+    feel: Callable[[], None]
 
     def reset_all(self) -> None:
         """Begin an episode in every world."""
@@ -176,3 +178,5 @@ class Episodes(Built):
         """Launch each kernel once, for `compile_side_by_side`, which only notes what is launched."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)
+        self.servo.before_each()
+        self.feel()
