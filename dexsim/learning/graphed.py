@@ -71,37 +71,37 @@ def sample_without_waiting(actor: Any) -> None:
     distribution.sample = sample
 
 
-class Half(torch.autograd.Function):
-    """A linear layer of half precision: x [B, I or more, then zeros] -> [B, O], in single precision where `last`."""
+class Linear(torch.autograd.Function):
+    """A linear layer: x [B, I or more, then zeros] -> [B, O], of the precision of x; in single where `last`."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, last: bool) -> torch.Tensor:
         ctx.inputs = weight.shape[1]
-        w = functional.pad(weight.half(), (0, x.shape[1] - ctx.inputs))
+        w = functional.pad(weight.to(x.dtype), (0, x.shape[1] - ctx.inputs))
         ctx.save_for_backward(x, w)
-        return product(x, w.t()) + bias if last else torch.addmm(bias.half(), x, w.t())
+        return product(x, w.t()) + bias if last else torch.addmm(bias.to(x.dtype), x, w.t())
 
     @staticmethod
     def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, w = ctx.saved_tensors
-        g = g.half()
+        g = g.to(x.dtype)
         by_bias = product(g.new_ones(ONES, len(g)), g)[0]  # faster than a sum
         by_weight = product(g.t(), x)[:, : ctx.inputs]
         return g @ w if ctx.needs_input_grad[0] else None, by_weight, by_bias, None
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return a @ b of half precision, in single precision."""
-    return torch.mm(a, b, out_dtype=torch.float32) if a.is_cuda else a.float() @ b.float()
+    """Return a @ b, in single precision."""
+    if a.dtype != torch.float32 and a.is_cuda:
+        return torch.mm(a, b, out_dtype=torch.float32)
+    return a.float() @ b.float()
 
 
 def forward(mlp: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
-    """Return what the network makes of x [B, I] or, of half precision, x [B, I or more, then zeros]."""
-    if x.dtype == torch.float32:
-        return mlp(x)
+    """Return what the network makes of x [B, I or more, then zeros], with products of the precision of x."""
     last = len(mlp) - 1
     for n, layer in enumerate(mlp):
-        x = Half.apply(x, layer.weight, layer.bias, n == last) if isinstance(layer, nn.Linear) else layer(x)
+        x = Linear.apply(x, layer.weight, layer.bias, n == last) if isinstance(layer, nn.Linear) else layer(x)
     return x
 
 
@@ -174,7 +174,8 @@ class GraphedUpdate:
         with torch.no_grad():  # the running normalization holds still during an update: once for all mini-batches
             data = [model.get_latent(observations) for model in (alg.actor, alg.critic)]
             if alg.use_mixed_precision and float(torch.stack([x.abs().max() for x in data]).max()) < FAR:
-                data = [functional.pad(x.half(), (0, -x.shape[1] % 8)) for x in data]  # rows of a multiple of 16 bytes
+                data = [x.half() for x in data]
+            data = [functional.pad(x, (0, -x.shape[1] % 8)) for x in data]  # rows of a multiple of 16 bytes
             data += [x.flatten(0, 1) for x in (st.actions, st.distribution_params[0])]
             scalars = st.actions_log_prob, st.advantages, st.values, st.returns
             data += [x.flatten() for x in scalars]
