@@ -1,7 +1,7 @@
 """Stages of MuJoCo-Warp's step that need nothing of each other, side by side on a GPU.
 
-    positions - broad phase - hulls | primitives - constraint rows - solver - integration
-              - inertia, velocities, bias, unconstrained acceleration /
+    positions - broad phase - hulls | primitives, rows of friction and limits - rows of contacts - solver - integration
+              - inertia, velocities, bias, unconstrained acceleration                            /
 
 One after the other, most of these kernels leave a part of the GPU idle: they have a thread a world, or end when their
 slowest pair does. What a step computes stays as it is; the order of contacts, which the GPU decides, may change.
@@ -18,7 +18,7 @@ from mujoco_warp._src import collision_driver, constraint, smooth, solver
 
 
 class Beside:
-    """Two more streams of a device, for a step that is recorded: contacts, and those of primitives."""
+    """Two more streams of a device, for a step that is recorded: contacts; those of primitives, and constraint rows."""
 
     def __init__(self, contacts: wp.Stream, primitives: wp.Stream):
         self._contacts, self._primitives = contacts, primitives
@@ -33,8 +33,9 @@ class Beside:
             (collision_driver, "collision", [], contacts),
             (collision_driver, "convex_narrowphase", [(primitives, contacts)], contacts),
             (collision_driver, "primitive_narrowphase", [], primitives),
-            (constraint, "make_constraint", [(contacts, primitives), (contacts, here)], contacts),
-            (solver, "solve", [(here, contacts)], here),
+            (constraint, "make_constraint", [(primitives, here)], primitives),
+            (constraint, "_efc_contact_init", [(primitives, contacts)], primitives),
+            (solver, "solve", [(here, contacts), (here, primitives)], here),
         )
         kept = [(owner, name, getattr(owner, name)) for owner, name, *_ in stages]
         for (owner, name, theirs), (*_, waits, stream) in zip(kept, stages, strict=True):
@@ -48,13 +49,13 @@ class Beside:
 
 def _launched(
     stage: Callable[..., Any], waits: list[tuple[wp.Stream, wp.Stream]], stream: wp.Stream
-) -> Callable[..., None]:
+) -> Callable[..., Any]:
     """Return a stage that is launched on a stream, when each stream of `waits` waits for the other."""
 
-    def launch(*args: Any) -> None:
+    def launch(*args: Any) -> Any:
         for one, other in waits:
             one.wait_stream(other)
         with wp.ScopedStream(stream, sync_enter=False):
-            stage(*args)
+            return stage(*args)
 
     return launch
