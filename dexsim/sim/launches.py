@@ -24,5 +24,7 @@ class Launches:
             return
         if name not in self._packed:  # kept with its inputs: it points to their memory
             command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
+            if command is None:  # it was only listed (`dexsim.sim.warmup`)
+                return
             self._packed[name] = command, inputs
         self._packed[name][0].launch()
