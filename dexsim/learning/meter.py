@@ -17,9 +17,9 @@ class Meter:
     def __init__(self, n: int, device: str) -> None:
         self._return = torch.zeros(n, device=device)
         self._length = torch.zeros(n, device=device)
-        # returns, lengths and number of ended episodes;
+        # returns, lengths and number of ended episodes; reward of all steps
         self._sums = torch.zeros(4, dtype=torch.float64, device=device)
-        self._device = device                                            # reward of all steps
+        self._device = device
         self._steps = 0
         self._logs: dict[tuple[str, ...], list[torch.Tensor]] = {}
 
@@ -62,9 +62,7 @@ class Meter:
         for keys in names:
             sums, counts, rest = rest[: len(keys)], rest[len(keys): 2 * len(keys)], rest[2 * len(keys):]
             found |= {(k if "/" in k else f"Episode/{k}"): s / n for k, s, n in zip(keys, sums, counts) if n}
-        self._sums.zero_()
-        self._logs.clear()
-        self._steps = 0
+        self.drop()
         return found
 
     def state(self) -> dict[str, torch.Tensor]:
@@ -77,7 +75,7 @@ class Meter:
         self._length.copy_(state["meter.length"])
 
     def drop(self) -> None:
-        """Forget a rollout that was broken off."""
+        """Forget the sums, of a rollout that is over or was broken off."""
         self._sums.zero_()
         self._logs.clear()
         self._steps = 0

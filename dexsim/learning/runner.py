@@ -85,11 +85,8 @@ class Runner(OnPolicyRunner):
         ranks = self.ranks
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.size, ranks.rank, ranks.local
         self.is_distributed = ranks.size > 1
-        self.cfg["multi_gpu"] = (
-            None
-            if ranks.size == 1
-            else {"global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
-        )
+        several = {"global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
+        self.cfg["multi_gpu"] = several if self.is_distributed else None
 
     def _whether_worlds(self, wanted: bool | None) -> bool:
         """Return whether checkpoints hold the worlds' states: as asked, else where they are small."""
@@ -266,11 +263,8 @@ class Runner(OnPolicyRunner):
         """Return the config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked
         again."""
         agent = self.full_cfg["agent"]
-        return (
-            self.full_cfg | {"agent": agent | {"logger": "tensorboard"}}
-            if agent.get("logger") == "wandb"
-            else self.full_cfg
-        )
+        here = agent | {"logger": "tensorboard"} if agent.get("logger") == "wandb" else agent
+        return self.full_cfg | {"agent": here}
 
     def payload(self) -> dict[str, Any]:
         """Return everything that a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
