@@ -8,9 +8,10 @@ import math
 import mujoco_warp as mjw
 import pytest
 import warp as wp
-from worlds import grasp_env
+from worlds import task_cfg
 
 from dexsim.sim.beside import Beside
+from dexsim.tasks import make_env
 
 
 class Stream:
@@ -33,8 +34,10 @@ def arrays(values):
 
 
 @pytest.mark.slow
-def test_no_stage_writes_what_another_beside_it_uses(monkeypatch):
-    env = grasp_env(worlds=2, engine="warp")
+@pytest.mark.parametrize("task", ["grasp", "rotate", "rotate_fingertips"])
+def test_no_stage_writes_what_another_beside_it_uses(task, monkeypatch):
+    env = make_env(task_cfg(task=task, worlds=2), 2, "cpu", 0, "warp")
+    assert not env.engine.mjm.neq and not env.engine.mjm.ntendon  # with them, one after the other
     engine, launches = env.engine, []
     here = now = Stream("here")
     launch, launch_tiled, zero = wp.launch, wp.launch_tiled, wp.array.zero_

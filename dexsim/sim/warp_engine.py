@@ -85,10 +85,11 @@ class WarpEngine(Engine):
             if self.narrow is not None and not self.narrow.number:
                 self.narrow = None
             self.newton = newton.NewtonSolver(self.m, self.d) if solver != "mujoco" and not no_solver else None
-            by_contact = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY).any()  # its moments are of contacts
-            ours = device.startswith("cuda") and self.narrow is not None and self.newton is not None
+            plain = device.startswith("cuda") and self.narrow is not None and self.newton is not None
+            # moments of contacts, rows of speeds: what is computed beside is needed
+            by_contact = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY).any() or coupled
             more = (_warp_stream(torch.cuda.Stream()) for _ in range(2))
-            self.beside = Beside(*more) if ours and not (deterministic or by_contact) else None
+            self.beside = Beside(*more) if plain and not (deterministic or by_contact) else None
             P = len(self.pairs)
             w = self.wp
             w.time, w.qpos, w.qvel, w.qfrc_applied = self.d.time, self.d.qpos, self.d.qvel, self.d.qfrc_applied
