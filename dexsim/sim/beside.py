@@ -37,13 +37,13 @@ class Beside:
             (constraint, "_efc_contact_init", [(primitives, contacts)], primitives),
             (solver, "solve", [(here, contacts), (here, primitives)], here),
         )
-        kept = [(owner, name, getattr(owner, name)) for owner, name, *_ in stages]
-        for (owner, name, theirs), (*_, waits, stream) in zip(kept, stages, strict=True):
+        original = [(owner, name, getattr(owner, name)) for owner, name, *_ in stages]
+        for (owner, name, theirs), (*_, waits, stream) in zip(original, stages, strict=True):
             setattr(owner, name, _launched(theirs, waits, stream))
         try:
             yield
         finally:
-            for owner, name, theirs in kept:
+            for owner, name, theirs in original:
                 setattr(owner, name, theirs)
 
 
