@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -146,6 +147,20 @@ def test_a_bad_position_or_command_makes_the_joint_unusable(rig, tmp_path, kind,
     bad = [f["regime"].split(":")[0] for f in d.data["findings"]]
     assert kind in bad and all(f["effect"] == "bad_channel" for f in d.data["findings"])
     assert d.data["verdict"] == "unusable" and kind in d.sentence and d.data["held_out"]["before"] is None
+
+
+def test_commands_that_are_stamped_late_in_all_recordings_are_no_term_of_the_loop(rig, tmp_path):
+    """Their answer comes less than 60 ms before them, and in some motions that looks like a lag: each alone is no
+    proof, and a feed-forward of speed follows them well."""
+
+    def late(r):
+        r.commands.t, r.commands.stamp = r.commands.t + 0.08, None
+
+    d = judged(rig, tmp_path, late, keep=(0, 1, 2, 3), allowed={"controller_term", "inertia"})
+    (found,) = d.data["findings"]
+    assert found["effect"] == "bad_channel" and "in all recordings" in found["regime"]
+    said = float(re.search(r"(\d+) ms before these", found["regime"])[1])
+    assert abs(said - 80) < 3 and d.data["verdict"] == "unusable" and "clock_skew" in d.sentence
 
 
 @pytest.mark.slow

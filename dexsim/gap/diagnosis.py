@@ -36,7 +36,7 @@ from dexsim.gap.judge.joint_answer import JointAnswer
 from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
 from dexsim.gap.plant.columns import DRAGGERS
 from dexsim.gap.plant.mechanics import chain
-from dexsim.gap.read import Run, conditions, inputs, stage_tests
+from dexsim.gap.read import Run, channels, conditions, inputs, stage_tests
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.rules import JUDGE, SEARCH
@@ -47,12 +47,14 @@ from dexsim.gap.search.search import (
     Outcome,
     SearchedJoint,
     Trial,
+    late_commands,
     plain_of,
     search_joint,
     settle_found,
     without_search,
 )
 from dexsim.gap.touch.diagnosis import Touch
+from dexsim.recording.schema import COMMANDS, STATES
 
 
 def diagnose(
@@ -173,6 +175,7 @@ class Drives(Steps):
         self.stages: Sequence[stage_tests.Stage] = ()
         self.by_torque: Sequence[logged_torque.IdentifiedJoint] = ()
         self.unknown_controllers: set[str] = set()
+        self.late: dict[str, float] = {}  # s by which commands are stamped late in all recordings, by joint
         self.searched: list[SearchedJoint] = []
         self.answers: list[JointAnswer] = []
         # what of the judgement needs no other joint, by the search that it is of (`_judged_ahead`)
@@ -318,7 +321,9 @@ class Drives(Steps):
             case = search.case
             if not case.moved:
                 w.notes.append(f"{case.joint} does not move: nothing can be said of it")
-            if found is None:
+            if self.late.get(case.joint):
+                self._told_late(case.joint)
+            elif found is None:
                 w.notes.append(f"{case.joint}: no stretch long enough to simulate")
             else:
                 self.searched.append(SearchedJoint(case, search, found))
@@ -331,7 +336,18 @@ class Drives(Steps):
                 "not looked for",
             )
         w.clock.lap("search")
+        if any(self.late.values()) and not self.searched:
+            raise NothingToJudge("; ".join(f.regime for f in w.channel if f.regime.startswith("clock_skew")))
         self._take_back()
+
+    def _told_late(self, joint: str) -> None:
+        """Says that a joint's commands are stamped late in all recordings, in the place of what some of them show."""
+        w, ms = self.w, 1e3 * self.late[joint]
+        text = f"{joint} acts on its targets {ms:.0f} ms before these are stamped, in all recordings"
+        told = channels.finding("clock_skew", text, joint, [COMMANDS, STATES], [])
+        skewed = lambda f: f.regime.startswith("clock_skew") and (not f.joints or joint in f.joints)  # noqa: E731
+        w.channel = [*(f for f in w.channel if not skewed(f)), told]
+        w.notes.append(f"{joint} is left out ({told.regime}): stamp both by one clock, or set the commands' back")
 
     def _take_back(self) -> None:
         """What was held out against what was found: an effect that it refutes is taken back. Nothing is searched any
@@ -374,9 +390,13 @@ class Drives(Steps):
             found = ringing.answered(search, search_joint(search))
         else:
             found = without_search(search)
-        settle_found(search, found)
+        self.late[case.joint] = late_commands(search, found.best)
+        if not self.late[case.joint]:
+            settle_found(search, found)
         search.took = time.monotonic() - begun
         self._left -= 1
+        if self.late[case.joint]:
+            return search, None
         self._judged_ahead(search, found)
         return search, found
 

@@ -3,6 +3,7 @@ was found on whole recordings, and intervals."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +16,7 @@ from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
-from dexsim.gap.rules import BELIEF, SEARCH
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, SIGNAL
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, huber_square, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, named, subset
@@ -45,6 +46,7 @@ Rivals = dict[str, tuple[list[tuple[str, float]], float]]
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
 LISTED = 6  # effects of a short list
 HOPELESS = 2.0  # x what would do: a draft that leaves more after its first steps is given up
+LATEST = 0.5  # s by which commands may be stamped late
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
 
 
@@ -656,6 +658,29 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
         search.whole = search.case.plant.refined(FINER)
     search.tell("on whole recordings")
     polished(search, found.best), polished(search, found.none)  # kept for the judgement
+
+
+def late_commands(search: JointSearch, best: Trial) -> float:
+    """Return s by which all commands are stamped after they acted: a term of the loop that runs ahead of its target
+    (`controller_term`) looks like it. 0 where that term follows nearly as well."""
+    if "controller_term" not in best.ids:
+        return 0.0
+    ahead = Param("late_by", ("late_by",), "set", -LATEST, 0.0, 0.0, "s")
+    shifts = np.linspace(-LATEST, 0.0, 101)
+    one = {p.key: x for p, x in zip(best.fit.params, best.fit.x, strict=True)}
+    fits = []
+    for members in ((), best.but(best.ids.index("controller_term"))[0]):
+        params = [*(p for m in members for p in named(m)), *(p for p in best.fit.params if p.nuisance), ahead]
+        fitter = copy.copy(search.fitter.given(members))
+        fitter.fixed = (*fitter.fixed, ("late_group", 2.0**31 - 1))  # all commands are one group
+        x0 = np.array([p.start if p.nuisance else one.get(p.key, 0.0) for p in params])
+        tried = np.repeat(x0[None], len(shifts), 0)
+        tried[:, -1] = shifts
+        x0[-1] = shifts[np.argmin(fitter.loss(fitter.residuals(params, tried)))]
+        fits.append(fitter.fit(params, x0=x0, iterations=8))
+    fit = min(fits, key=lambda f: f.loss)
+    told = fit.loss < (1 - JUDGE.removed) * best.fit.loss and -fit.x[-1] > SIGNAL.early
+    return -float(fit.x[-1]) if told else 0.0
 
 
 def simpler(search: JointSearch, trial: Trial) -> Trial:
