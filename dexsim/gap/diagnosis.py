@@ -602,6 +602,8 @@ class Drives(Steps):
         if engine != "none" and w.limit.spent(1 - PLANNING):
             w.limit.leave_out("not replayed in the engine that trains")
             engine = "none"
+        if cases and engine != "none":
+            w.say("  what may be written is replayed, and the best chosen")
         try:
             self.written = best(s.device, engine, lambda: w.limit.until(1 - PLANNING), w.progress)
         except UserError as error:
