@@ -36,8 +36,9 @@ GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside
 AT_ONCE = 49  # guesses that are simulated together: between them there is a look at the clock
 ITERATIONS = 10  # of the fit from each guess
 WHOLE, FAR = 1200.0, 0.05  # s of recordings that are run whole; rad (m) from which an error there counts linearly
-GAIN, DAMPING, LIMIT = (0.2, 5.0), 20.0, (0.3, 3.0)  # x what is believed, where no range is stated
-WIDER = 2.0  # x: a stated range may be off by as much
+# x what is believed: a figure, or its stated range, may be off by as much; a gain that nobody has measured, or guessed
+# from a datasheet, by more: twice and half of it cost a quarter on a robot's legs
+WIDER, GAIN, DAMPING = 2.0, (0.2, 5.0), 20.0
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
 MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
 OFFSET = 1.0  # of a joint's typical torque
@@ -94,7 +95,7 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
     to what drives it."""
     s, out = case.scales, []
 
-    def factor(name: str, wide: tuple[float, float]) -> None:
+    def factor(name: str, wide: tuple[float, float] = (1 / WIDER, WIDER)) -> None:
         value = s.nominal[name]
         if 0 < value < 1e8:
             low, high = case.ranges.get(name, (0.0, 0.0))
@@ -121,8 +122,8 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
                 0.0,
             )
         )
-    factor("torque_limit", LIMIT)
-    factor("no_load_speed", LIMIT)
+    factor("torque_limit")
+    factor("no_load_speed")
     if not case.told:  # friction that the recorded torque has told is known
         room = min(min(room_for_friction(case, train).values()) - case.constants.friction, s.tau)
         stated = case.ranges.get("coulomb_friction", (0.0, 0.0))[1]

@@ -662,25 +662,34 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
 
 def late_commands(search: JointSearch, best: Trial) -> float:
     """Return s by which all commands are stamped after they acted: a term of the loop that runs ahead of its target
-    (`controller_term`) looks like it. 0 where that term follows nearly as well."""
+    (`controller_term`) looks like it. 0 unless that is of little use beside such a clock, and the clock of much beside
+    the term."""
     if "controller_term" not in best.ids:
         return 0.0
-    ahead = Param("late_by", ("late_by",), "set", -LATEST, 0.0, 0.0, "s")
+    late = Param("late_by", ("late_by",), "set", -LATEST, 0.0, 0.0, "s")
     shifts = np.linspace(-LATEST, 0.0, 101)
-    one = {p.key: x for p, x in zip(best.fit.params, best.fit.x, strict=True)}
-    fits = []
-    for members in ((), best.but(best.ids.index("controller_term"))[0]):
-        params = [*(p for m in members for p in named(m)), *(p for p in best.fit.params if p.nuisance), ahead]
+
+    def fit(members: Sequence[Member], known: dict[str, float]) -> Fitted:
+        """Fit members and the clock, from what is known and the shift that follows best with that."""
+        params = [*(p for m in members for p in named(m)), *(p for p in best.fit.params if p.nuisance), late]
         fitter = copy.copy(search.fitter.given(members))
         fitter.fixed = (*fitter.fixed, ("late_group", 2.0**31 - 1))  # all commands are one group
-        x0 = np.array([p.start if p.nuisance else one.get(p.key, 0.0) for p in params])
+        x0 = np.array([known.get(p.key, p.start) for p in params])
         tried = np.repeat(x0[None], len(shifts), 0)
         tried[:, -1] = shifts
         x0[-1] = shifts[np.argmin(fitter.loss(fitter.residuals(params, tried)))]
-        fits.append(fitter.fit(params, x0=x0, iterations=8))
-    fit = min(fits, key=lambda f: f.loss)
-    told = fit.loss < (1 - JUDGE.removed) * best.fit.loss and -fit.x[-1] > SIGNAL.early
-    return -float(fit.x[-1]) if told else 0.0
+        return fitter.fit(params, x0=x0, iterations=8)
+
+    found = dict(zip([p.key for p in best.fit.params], best.fit.x.tolist(), strict=True))
+    own = {k: x for k, x in found.items() if "." in k}  # of effects, not of beliefs
+    rest = best.but(best.ids.index("controller_term"))[0]
+    clock = min(fit((), {}), fit(rest, own), key=lambda f: f.loss)
+    at = dict(zip([p.key for p in clock.params], clock.x.tolist(), strict=True))
+    both = min(fit(best.members, found), fit(best.members, own | {"controller_term.gain": 0.0} | at), clock,
+               key=lambda f: f.loss)  # fmt: skip
+    gained = best.fit.loss - both.loss
+    told = gained > JUDGE.part * best.fit.loss and clock.loss - both.loss < JUDGE.removed * gained
+    return -at["late_by"] if told and -at["late_by"] > SIGNAL.early else 0.0
 
 
 def simpler(search: JointSearch, trial: Trial) -> Trial:
