@@ -688,7 +688,7 @@ def late_commands(search: JointSearch, best: Trial) -> float:
     both = min(fit(best.members, found), fit(best.members, own | {"controller_term.gain": 0.0} | at), clock,
                key=lambda f: f.loss)  # fmt: skip
     gained = best.fit.loss - both.loss
-    told = gained > JUDGE.part * best.fit.loss and clock.loss - both.loss < JUDGE.removed * gained
+    told = gained > SEARCH.least * best.fit.loss and clock.loss - both.loss < JUDGE.part * gained
     return -at["late_by"] if told and -at["late_by"] > SIGNAL.early else 0.0
 
 
