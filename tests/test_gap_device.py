@@ -8,12 +8,14 @@ import pytest
 import warp as wp
 from test_gap import demo, plant_run
 
+from dexsim.actuator.columns import COLUMNS
 from dexsim.errors import UserError
 from dexsim.gap import command, compute
 from dexsim.gap.compute import map_joints, workers
 from dexsim.gap.plant import batch as plants
+from dexsim.gap.plant import kernel
 from dexsim.gap.plant.case import build
-from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.columns import INDEX, NAMES
 
 GPU = wp.get_cuda_device_count() > 0
 
@@ -140,6 +142,29 @@ def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
     begun: list[int] = []  # in another's launch on six of the eight cores, two are free
     compute.run(lambda *part: begun.append(len(compute.parts(steps, 8))), [(slice(0, 3), slice(0, 1))] * 6)
     assert begun == [2] * 6 and len(compute.parts(steps, 8)) == 8
+
+
+def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
+    """All columns that such guesses may have, drawn at random; among them one with a play, which is not of them."""
+    plant, params, _ = guesses
+    rng, many = np.random.default_rng(3), np.repeat(params[:1], 21, 0)
+    servo = {c.name: c for c in COLUMNS}
+    for k in kernel.USUAL:
+        name, value = NAMES[k], many[:, :, k]
+        away = 0.02 if name not in servo else min(servo[name].usual, servo[name].high - servo[name].neutral)
+        shift = rng.uniform(0, 1, (21, 1)) * (0.5 * value if value.any() else away)
+        many[:, :, k] = value + (shift if np.isfinite(shift).all() and (value < 1e8).all() else 0.0)
+    many[7, :, INDEX["backlash"]] = 0.02
+    inits = 0.01 * rng.normal(size=(21, 2))
+    vectors = [which.tolist() for which, lanes in plant._side_by_side(many[:, 0], 0) if lanes > 1]
+    assert vectors == [[k for k in range(21) if k != 7]]
+    for length in (1.0, None):
+        at_once = plant.simulate(many, plant.windows(length), inits)
+        with monkeypatch.context() as m:
+            m.setattr(plants, "SIDE_BY_SIDE", False)
+            alone = plant.simulate(many, plant.windows(length), inits)
+        assert np.ptp(alone[0], axis=0).max() > 1e-3
+        assert all(np.abs(a - b).max() < 1e-9 for a, b in zip(at_once, alone, strict=True))
 
 
 def test_a_fault_in_a_part_is_not_lost(monkeypatch):

@@ -62,11 +62,11 @@ def added(kind: str, features: frozenset[str]) -> Any:
 
 def _plus(before: Any, law: Any, at: int) -> Any:
     @wp.func
-    def first(of: wp.array(dtype=Any), q: Any, v: Any):
+    def first(of: Any, q: Any, v: Any):
         return law(of, wp.static(at), q, v)
 
     @wp.func
-    def both(of: wp.array(dtype=Any), q: Any, v: Any):
+    def both(of: Any, q: Any, v: Any):
         return before(of, q, v) + law(of, wp.static(at), q, v)
 
     return first if before is None else both
@@ -100,7 +100,7 @@ def encoder_error(features: frozenset[str] = frozenset()) -> Any:
     position is from what is shown, take the encoder from these two, at any time: none of our encoders remembers."""
 
     @wp.func
-    def error(of: wp.array(dtype=Any), q: Any, memory: Any, fresh: bool):
+    def error(of: Any, q: Any, memory: Any, fresh: bool):
         """Return (first, error, slope): first + error [rad] at position q [rad] of what the encoder turns with, and
         the slope of that in q. Two parts, since each kernel keeps the order of its sum, as of `dry_friction`."""
         first = type(q)(0.0)
@@ -127,7 +127,7 @@ def command_delay(features: frozenset[str] = frozenset()) -> Any:
     long)."""
 
     @wp.func
-    def delay(of: wp.array(dtype=Any), t: Any, memory: Any, fresh: bool, dt: Any):
+    def delay(of: Any, t: Any, memory: Any, fresh: bool, dt: Any):
         """(delay [s], memory) of the targets that a step uses which begins at time t [s] of the run."""
         late = type(t)(0.0)
         late += of[DELAY]
@@ -149,7 +149,7 @@ def dragged_target(features: frozenset[str] = frozenset()) -> Any:
     (a tendon that is slack at first, one that gives: terms of `shift`); needs the feature `rare`."""
 
     @wp.func
-    def dragged(of: wp.array(dtype=Any), away: Any, memory: Any, fresh: bool, dt: Any):
+    def dragged(of: Any, away: Any, memory: Any, fresh: bool, dt: Any):
         """(shift of the target [rad], memory) where the other joint is `away` [rad] from its home."""
         shift = type(away)(0.0)
         if wp.static("rare" in features):
@@ -185,7 +185,7 @@ def heard_speed(features: frozenset[str] = frozenset(), skips: bool = False) -> 
     keeps its own, as of `dry_friction`."""
 
     @wp.func
-    def heard(of: wp.array(dtype=Any), v: Any, memory: Any, fresh: bool, dt: Any):
+    def heard(of: Any, v: Any, memory: Any, fresh: bool, dt: Any):
         """Return ((now, end, share), memory): speed [rad/s] of what the encoder turns with as kd has it now, and at
         the end of a step of dt [s] in which v does not change; share of a change of v that passes in the step.
 
@@ -224,7 +224,7 @@ def warm_motor(features: frozenset[str] = frozenset()) -> Any:
     a term of `warm`, or a factor of what is returned."""
 
     @wp.func
-    def motor(of: wp.array(dtype=Any), warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any):
+    def motor(of: Any, warmth: Any, torque: Any, voltage: bool, memory: Any, fresh: bool, dt: Any):
         """Return ((stall torque [N.m], no-load speed [rad/s], efficiency, factor on the friction), memory) of a
         drive `warmth` [degC] above the temperature that its figures hold at (`warmed`); torque: what it gave in the
         step before [N.m].
@@ -264,7 +264,7 @@ def supply_left(features: frozenset[str] = frozenset()) -> Any:
     limits) is one more step from the supply to what is left. Needs the feature `sag`."""
 
     @wp.func
-    def remaining(of: wp.array(dtype=Any), supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
+    def remaining(of: Any, supply: Any, others: Any, memory: Any, fresh: bool, dt: Any):
         """(supply over nominal, memory), where it would be `supply` without load and the other motors give |torque| of
         `others` [N.m] together."""
         there = supply
@@ -438,7 +438,7 @@ def dry_friction(features: frozenset[str] = frozenset(), gone: float = math.inf)
 
     @wp.func
     def friction(
-        of: wp.array(dtype=Any), q: Any, v: Any, motor: Any, outside: Any, carries: bool, warm: Any, memory: Any,
+        of: Any, q: Any, v: Any, motor: Any, outside: Any, carries: bool, warm: Any, memory: Any,
         fresh: bool, dt: Any,
     ):  # fmt: skip
         """Return (level [N.m], memory), the level as four parts of a sum: what neither speed nor load changes; what
@@ -482,7 +482,7 @@ def friction_acts(features: frozenset[str] = frozenset()) -> Any:
     a rest). What gives way needs the feature `presliding`."""
 
     @wp.func
-    def acts(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
+    def acts(of: Any, q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
         """Return ((uneven, give), memory) at position q [rad] of the joint and speed v [rad/s] of the motor. uneven:
         the level moving positive is 1 + uneven of the mean of both directions, moving negative 1 - uneven; give: how
         far the joint gives way before it slides [rad], 0 not at all (`preslide`)."""
@@ -569,7 +569,7 @@ def parasitic_torque(features: frozenset[str] = frozenset()) -> Any:
     own = added("parasitic_torque", features)
 
     @wp.func
-    def parasitic(of: wp.array(dtype=Any), q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
+    def parasitic(of: Any, q: Any, v: Any, memory: Any, fresh: bool, dt: Any):
         """Return ((torque [N.m], its slopes in position [N.m/rad] and in speed [N.m.s/rad]), memory) at position q
         [rad] of the joint and speed v [rad/s] of the motor, on whose side of a play or an elasticity it acts."""
         torque = type(q)(0.0)
@@ -643,7 +643,7 @@ def lost_error(features: frozenset[str] = frozenset()) -> Any:
     loop has filtered: terms of `lost` and `slope`)."""
 
     @wp.func
-    def lost_of(of: wp.array(dtype=Any), target: Any, e: Any, memory: Any, fresh: bool, dt: Any):
+    def lost_of(of: Any, target: Any, e: Any, memory: Any, fresh: bool, dt: Any):
         """Return ((lost, slope, acts), memory): lost [rad] of the error e [rad] to a target [rad]; its slope in e at
         that target; acts: 0 no torque at all, 1 all but the error's, 2 all of it, that of the rest of the error.
 

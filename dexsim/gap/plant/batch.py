@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import platform
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from dexsim.actuator.law import brought
 from dexsim.actuator.setpoint import FREE, PROFILE, setpoints
 from dexsim.gap import compute
 from dexsim.gap.plant import kernel as pk
@@ -30,6 +32,8 @@ CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 # guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
 # (two inertias 0.33) and a GPU 5 us (14), whose thousands of threads are no use to a fit that asks for a hundred
 FEW = 16
+# guesses that simulate as fast alone as in a vector, and whether this machine has vectors of some width
+FILLED, SIDE_BY_SIDE = 3, platform.machine() in ("x86_64", "AMD64")
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
 _VERSIONS = itertools.count()  # of plants: what one simulated is not what another would
@@ -377,13 +381,19 @@ class JointPlant:
         if self._on_cpu(H * len(windows.window)):
             for group, begin in zip(groups.values(), begins, strict=True):
                 pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
-                alone = len(groups) == 1  # nothing to put together
-                oq, ot = (q, torque) if alone else (np.empty((H, len(windows.sample_row[keep]))) for _ in range(2))
-                shared = (_up(oq, copy=False), _up(ot, copy=False))
-                guesses = (_up(params[:, group[0]]), _up(_of(inits, pick)), _up(begin), _up(consts))
-                self._split(H, steps, recorded(*guesses, *rest, *shared))
-                if not alone:
-                    q[:, keep], torque[:, keep] = oq, ot
+                rows, moves = params[:, group[0]], _of(inits, pick)
+                for which, lanes in self._side_by_side(rows, open_stage):
+                    alone = len(groups) == 1 and len(which) == H  # nothing to put together
+                    size = len(which), len(windows.sample_row[keep])
+                    oq, ot = (q, torque) if alone else (np.empty(size) for _ in range(2))
+                    padded = np.r_[which, np.repeat(which[-1:], -len(which) % lanes)]
+                    guesses = (_up(rows[padded]), *(_up(x[which]) for x in (moves, begin)), _up(consts))
+                    given = recorded(*guesses, *rest, *(_up(x, copy=False) for x in (oq, ot)))
+                    kernel = pk.lanes_kernel() if lanes > 1 else pk.plant_kernel()
+                    self._split(len(padded) // lanes, steps, given, kernel)
+                    if not alone:
+                        at = (which, keep) if isinstance(keep, slice) else np.ix_(which, keep)
+                        q[at], torque[at] = oq, ot
             return q, torque
         with _GPU:
             mine = lane(self.device)
@@ -466,9 +476,20 @@ class JointPlant:
         pick, keep, steps, arrays = windows.device[key]
         return pick, keep, steps, [*self._d[device], *arrays]
 
-    def _split(self, H: int, steps: np.ndarray, given: pk.Recorded) -> None:
-        """H guesses in windows of `steps` [W] on the CPU, in parts side by side."""
-        kernel = pk.plant_kernel()
+    def _side_by_side(self, rows: np.ndarray, open_stage: int) -> list[tuple[np.ndarray, int]]:
+        """Return which guesses, of rows [H, C], are simulated how many at a time on the CPU: those with usual columns
+        only, as far as most of a vector of them is filled, and the others."""
+        usual = np.zeros(len(rows), bool)
+        if SIDE_BY_SIDE and not (self.voltage or self.loop == "motor" or open_stage or brought()):
+            usual = (rows[:, pk.UNUSUAL] == pk.ABSENT[pk.UNUSUAL]).all(1)
+        some = np.flatnonzero(usual)
+        few = len(some) % pk.LANES
+        usual[some[len(some) - few :]] = few >= FILLED
+        return [(x, n) for x, n in ((np.flatnonzero(usual), pk.LANES), (np.flatnonzero(~usual), 1)) if len(x)]
+
+    def _split(self, H: int, steps: np.ndarray, given: pk.Recorded, kernel: wp.Kernel) -> None:
+        """H guesses, or as many at a time as the kernel takes, in windows of `steps` [W] on the CPU, in parts side by
+        side."""
 
         def launch(windows: slice, guesses: slice) -> None:
             wp.launch(

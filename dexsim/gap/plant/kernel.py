@@ -13,7 +13,9 @@ approximated by a smooth law.
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
 from functools import cache
+from typing import Any
 
+import numpy as np
 import warp as wp
 
 from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
@@ -54,7 +56,7 @@ from dexsim.actuator.laws import (
     warm_motor,
     wind,
 )
-from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
+from dexsim.gap.plant.columns import INDEX, NEUTRAL, SERIES_INDEX
 
 f64 = wp.float64
 parasitic = parasitic_torque(frozenset(SERVO_FEATURES))
@@ -253,54 +255,54 @@ class Torque:  # of the motor, as a line in the speeds at the end of the step
 
 
 @wp.func
-def guess(c: Recorded, h: int, dt: f64):
+def guess(c: Recorded, of: Any, dt: f64):
     p = Guess()
-    p.kp = c.params[h, P_KP]
-    p.kd = c.params[h, P_KD]
-    p.scale = c.params[h, P_SCALE]
-    p.read_scale = c.params[h, P_READSCALE]
-    p.read_offset = c.params[h, P_READOFFSET]
-    p.offset = c.params[h, P_OFFSET]
-    p.age = c.params[h, P_AGE]
-    p.ki = c.params[h, P_KI]
-    p.steep = c.params[h, P_BRAKING]
-    p.limit_speed = c.params[h, P_LIMITSPEED]
-    p.gap2 = f64(0.5) * c.params[h, P_GAP]
-    p.soft = c.params[h, P_SOFT]
+    p.kp = of[P_KP]
+    p.kd = of[P_KD]
+    p.scale = of[P_SCALE]
+    p.read_scale = of[P_READSCALE]
+    p.read_offset = of[P_READOFFSET]
+    p.offset = of[P_OFFSET]
+    p.age = of[P_AGE]
+    p.ki = of[P_KI]
+    p.steep = of[P_BRAKING]
+    p.limit_speed = of[P_LIMITSPEED]
+    p.gap2 = f64(0.5) * of[P_GAP]
+    p.soft = of[P_SOFT]
     p.two = p.gap2 > f64(0.0) or p.soft > f64(0.0)
     p.dt = dt / f64(ONE_BODY_STEPS)
     if p.two:
         p.dt = dt / f64(TWO_BODY_STEPS)
-    p.staged = c.params[h, P_STAGES] > f64(1.5)
-    p.lag = lag_share(c.params[h, P_LAG] / c.params[h, P_STAGES], p.dt)
-    p.viscous = c.params[h, P_VISC]
-    p.thins = c.params[h, P_THINS]
-    p.thin_speed = c.params[h, P_THINSPEED]
+    p.staged = of[P_STAGES] > f64(1.5)
+    p.lag = lag_share(of[P_LAG] / of[P_STAGES], p.dt)
+    p.viscous = of[P_VISC]
+    p.thins = of[P_THINS]
+    p.thin_speed = of[P_THINSPEED]
     for k in range(wp.static(len(SERVO_FEATURES["load"]))):
-        p.carries = p.carries or c.params[h, P_LOADOUT + k] != f64(0.0)
-    p.gear_load = c.params[h, P_GEARLOAD]
-    p.gear_back = c.params[h, P_GEARBACK]
-    p.gear_power = c.params[h, P_GEARPOWER]
-    p.gear_unit = c.params[h, P_GEARUNIT]
-    p.bias = c.params[h, P_BIAS]
-    p.spring = c.params[h, P_SPRING]
-    p.preload = c.params[h, P_PRELOAD]
-    p.weak_own = c.params[h, P_WEAKOWN]
-    p.feed_v = c.params[h, P_FEEDV]
-    p.feed_a = c.params[h, P_FEEDA]
+        p.carries = p.carries or of[P_LOADOUT + k] != f64(0.0)
+    p.gear_load = of[P_GEARLOAD]
+    p.gear_back = of[P_GEARBACK]
+    p.gear_power = of[P_GEARPOWER]
+    p.gear_unit = of[P_GEARUNIT]
+    p.bias = of[P_BIAS]
+    p.spring = of[P_SPRING]
+    p.preload = of[P_PRELOAD]
+    p.weak_own = of[P_WEAKOWN]
+    p.feed_v = of[P_FEEDV]
+    p.feed_a = of[P_FEEDA]
     p.beyond = p.ki != f64(0.0) or p.feed_v != f64(0.0) or p.feed_a != f64(0.0)
-    p.rotor = c.params[h, P_ROTOR] + c.params[h, P_ARM]
-    p.mass = c.params[h, P_PAYLOAD]
-    p.own_mass = c.params[h, P_OWN]
-    p.off_centre = p.mass != f64(0.0) and (c.params[h, P_COUT] != f64(0.0) or c.params[h, P_CACROSS] != f64(0.0))
-    p.tilted = c.params[h, P_TX] != f64(0.0) or c.params[h, P_TY] != f64(0.0) or c.params[h, P_TZ] != f64(0.0)
+    p.rotor = of[P_ROTOR] + of[P_ARM]
+    p.mass = of[P_PAYLOAD]
+    p.own_mass = of[P_OWN]
+    p.off_centre = p.mass != f64(0.0) and (of[P_COUT] != f64(0.0) or of[P_CACROSS] != f64(0.0))
+    p.tilted = of[P_TX] != f64(0.0) or of[P_TY] != f64(0.0) or of[P_TZ] != f64(0.0)
     p.voltage = c.consts[C_VOLTAGE] > f64(0.0)
     p.loop_motor = c.consts[C_LOOP_MOTOR] > f64(0.0)
     p.slide = c.consts[C_SLIDE] >= f64(0.5)
     p.open_ = c.consts[C_OPEN]
     p.base_friction = c.consts[C_FRICTION]
     p.base_damping = c.consts[C_DAMPING]
-    p.motor_share = c.params[h, P_MOTORSHARE]
+    p.motor_share = of[P_MOTORSHARE]
     # what an encoder that misreads has shown lies within the range: no stop is where the joint was recorded to be
     p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) / p.scale)
     p.high = wp.max(c.consts[C_HIGH], (c.consts[C_HIGH] - p.offset) / p.scale)
@@ -312,7 +314,7 @@ def guess(c: Recorded, h: int, dt: f64):
 
 
 @wp.func
-def shown(of: wp.array(dtype=f64), q: f64, x: State, p: Guess):
+def shown(of: Any, q: f64, x: State, p: Guess):
     """(what the encoder shows at position q, what it shows of a speed there over that speed)."""
     error = encoder(of, q, x.memory, x.fresh != f64(0.0))
     m = encoder_line(q, p.scale, p.offset)
@@ -321,7 +323,7 @@ def shown(of: wp.array(dtype=f64), q: f64, x: State, p: Guess):
 
 
 @wp.func
-def position(of: wp.array(dtype=f64), m: f64, x: State, p: Guess):
+def position(of: Any, m: f64, x: State, p: Guess):
     """Where m is reported: its inverse, by two fixed-point steps."""
     at = unread(m, p) - p.offset
     q = at / p.scale
@@ -374,29 +376,29 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
 
 
 @wp.func
-def drive_now(c: Recorded, h: int, g: int, dt: f64, x: State, p: Guess, n: Now):
+def drive_now(c: Recorded, of: Any, g: int, dt: f64, x: State, p: Guess, n: Now):
     """(`n` with what the supply, the temperature and the other joints make of the drive at grid point g, what the
     drive remembers)."""
-    dragger = int(c.params[h, P_FROM])
+    dragger = int(of[P_FROM])
     fresh = x.fresh != f64(0.0)
-    shift, kept = drags(c.params[h], c.series[g, XDRAG + dragger], x.memory, fresh, dt)
+    shift, kept = drags(of, c.series[g, XDRAG + dragger], x.memory, fresh, dt)
     n.target += shift
-    n.carried = c.params[h, P_LINKAGE] * c.series[g, XDV + dragger]
+    n.carried = of[P_LINKAGE] * c.series[g, XDV + dragger]
     if p.loop_motor:
-        n.target += c.params[h, P_LINKAGE] * c.series[g, XDRAG + dragger]
-    n.load = c.params[h, P_REACTION] * c.series[g, XPULL + dragger]
-    n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * p.rotor
+        n.target += of[P_LINKAGE] * c.series[g, XDRAG + dragger]
+    n.load = of[P_REACTION] * c.series[g, XPULL + dragger]
+    n.load -= of[P_LINKAGE] * c.series[g, XDA + dragger] * p.rotor
     n.load = c.series[g, XR] + n.load
 
-    warm, kept = motor(c.params[h], c.series[g, XWARM], x.last, p.voltage, kept, fresh, dt)
+    warm, kept = motor(of, c.series[g, XWARM], x.last, p.voltage, kept, fresh, dt)
     n.tau0 = warm[0]
     n.no_load = warm[1]
     n.efficiency = warm[2]
     n.friction = warm[3]
-    supply = c.params[h, P_SUPPLY] * c.series[g, XSUP]
-    supply, kept = leaves(c.params[h], supply, c.series[g, XOTH], kept, fresh, dt)
+    supply = of[P_SUPPLY] * c.series[g, XSUP]
+    supply, kept = leaves(of, supply, c.series[g, XOTH], kept, fresh, dt)
     n.supply = supply
-    n.weak = c.params[h, P_WEAK] * c.series[g, XOTH]
+    n.weak = of[P_WEAK] * c.series[g, XOTH]
     if p.open_ > f64(0.0):
         n.drive = c.series[g, XDRIVE]
     n.enabled = c.series[g, XON] >= f64(0.5)
@@ -404,27 +406,27 @@ def drive_now(c: Recorded, h: int, g: int, dt: f64, x: State, p: Guess, n: Now):
 
 
 @wp.func
-def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
+def body_now(c: Recorded, of: Any, g: int, p: Guess, n: Now):
     """`n` with the inertia about the joint and the gravity on it at grid point g."""
     mass = p.mass
-    inertia = c.params[h, P_ISCALE] * c.series[g, XI] + c.params[h, P_ARM] + mass * c.series[g, XLI]
-    gc = c.params[h, P_GSCALE] * c.series[g, XGC] + mass * c.series[g, XLC]
-    gs = c.params[h, P_GSCALE] * c.series[g, XGS] + mass * c.series[g, XLS]
+    inertia = of[P_ISCALE] * c.series[g, XI] + of[P_ARM] + mass * c.series[g, XLI]
+    gc = of[P_GSCALE] * c.series[g, XGC] + mass * c.series[g, XLC]
+    gs = of[P_GSCALE] * c.series[g, XGS] + mass * c.series[g, XLS]
     own = p.own_mass
     if own != f64(0.0):
         inertia += own * c.series[g, XOWI]
         gc += own * c.series[g, XOWC]
         gs += own * c.series[g, XOWS]
     if p.off_centre:
-        out = c.params[h, P_COUT]
-        across = c.params[h, P_CACROSS]
+        out = of[P_COUT]
+        across = of[P_CACROSS]
         inertia += mass * (out * c.series[g, XOI] + across * c.series[g, XAI] + out * out + across * across)
         gc += mass * (out * c.series[g, XOC] + across * c.series[g, XAC])
         gs += mass * (out * c.series[g, XOS] + across * c.series[g, XAS])
     if p.tilted:
-        tx = c.params[h, P_TX]
-        ty = c.params[h, P_TY]
-        tz = c.params[h, P_TZ]
+        tx = of[P_TX]
+        ty = of[P_TY]
+        tz = of[P_TZ]
         gc += tx * c.series[g, XTXC] + ty * c.series[g, XTYC] + tz * c.series[g, XTZC]
         gs += tx * c.series[g, XTXS] + ty * c.series[g, XTYS] + tz * c.series[g, XTZS]
     n.inertia = wp.max(inertia, f64(1.0e-9))
@@ -435,7 +437,7 @@ def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
 
 
 @wp.func
-def pair_now(c: Recorded, h: int, p: Guess, n: Now):
+def pair_now(of: Any, p: Guess, n: Now):
     """What the sub-steps of rotor and link share: divisions and a root are most of what one costs."""
     b = Pair()
     if p.two:
@@ -443,11 +445,11 @@ def pair_now(c: Recorded, h: int, p: Guess, n: Now):
         b.rotor = wp.clamp(p.rotor, least, wp.static(f64(1.0 - LEAST_ROTOR)) * n.inertia)
         b.link = n.inertia - b.rotor
         b.stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
-        b.hardening = c.params[h, P_HARD]
+        b.hardening = of[P_HARD]
         if p.soft <= f64(0.0):
             b.stiff = p.stop
             b.hardening = f64(0.0)
-        b.damping = transmission_damping(c.params[h, P_REBOUND], b.stiff, b.rotor, b.link, n.inertia)
+        b.damping = transmission_damping(of[P_REBOUND], b.stiff, b.rotor, b.link, n.inertia)
         b.rotor_rate = b.rotor / p.dt
         b.link_rate = b.link / p.dt
         b.on_rotor = n.efficiency * p.dt / b.rotor
@@ -457,14 +459,27 @@ def pair_now(c: Recorded, h: int, p: Guess, n: Now):
 
 @wp.func
 def turned(gc: f64, gs: f64, dq: f64):
-    """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated. Near there, where a
-    step mostly is, by Taylor's series, true to 4e-12 and several times as fast."""
-    if wp.abs(dq) > f64(0.15):
-        return gc * wp.cos(dq) + gs * wp.sin(dq)
-    x = dq * dq
+    """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated, by Taylor's series,
+    true to 4e-12; farther off from a sixteenth of the angle, doubled four times, true to 1e-6 over a turn."""
+    far = wp.abs(dq) > f64(0.15)
+    y = dq
+    if far:
+        y = wp.clamp(dq, f64(-6.3), f64(6.3)) * f64(1.0 / 16.0)
+    x = y * y
     c = f64(1.0) - x * (f64(0.5) - x * (f64(1.0 / 24.0) - x * f64(1.0 / 720.0)))
-    s = dq * (f64(1.0) - x * (f64(1.0 / 6.0) - x * (f64(1.0 / 120.0) - x * f64(1.0 / 5040.0))))
+    s = y * (f64(1.0) - x * (f64(1.0 / 6.0) - x * (f64(1.0 / 120.0) - x * f64(1.0 / 5040.0))))
+    if far:
+        c, s = doubled(c, s)
+        c, s = doubled(c, s)
+        c, s = doubled(c, s)
+        c, s = doubled(c, s)
     return gc * c + gs * s
+
+
+@wp.func
+def doubled(c: f64, s: f64):
+    """(cosine, sine) of twice an angle."""
+    return f64(1.0) - f64(2.0) * s * s, f64(2.0) * s * c
 
 
 # -- the drive ---------------------------------------------------------------------------------------------------------
@@ -584,7 +599,7 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64
 
 
 @wp.func
-def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64, stop_d: f64, drag: f64,
+def two_bodies(x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64, stop_d: f64, drag: f64,
                grease: f64, dt: f64, p: Guess, n: Now, b: Pair):  # fmt: skip
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
     the step. grease: viscous friction, drag: what else is by the speed of the rotor [N.m.s/rad]."""
@@ -653,7 +668,7 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
 
 
 @wp.func
-def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
+def substep(of: Any, x: State, p: Guess, n: Now, b: Pair):
     """The joint after a sub-step."""
     dt = p.dt
     zero = f64(0.0)
@@ -672,9 +687,9 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         if p.loop_motor:
             v_l = v_drive
     fresh = x.fresh != zero
-    seen = shown(c.params[h], q_l, x, p)
+    seen = shown(of, q_l, x, p)
     shows = seen[1]
-    heard, kept = hears(c.params[h], v_l, x.memory, fresh, dt)
+    heard, kept = hears(of, v_l, x.memory, fresh, dt)
     e = n.target - seen[0] + p.age * shows * v_l  # a sampled loop acts on where the joint was
     rate = shows * heard[0]
 
@@ -688,7 +703,7 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     if by_gear and (n.held or x.fresh != zero):
         x.borne = load
 
-    beside, kept = parasitic(c.params[h], x.q, v_drive, kept, fresh, dt)
+    beside, kept = parasitic(of, x.q, v_drive, kept, fresh, dt)
     drag = wp.max(zero, -beside[2])  # what of it brakes is taken at the end of the step
     grease = p.viscous * n.friction  # at the speed of the step's begin
     if p.thins > zero:
@@ -713,7 +728,7 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
-    off, kept = lost(c.params[h], n.target, e, kept, fresh, dt)
+    off, kept = lost(of, n.target, e, kept, fresh, dt)
     u = pd(e, off, rate, rate, rate, shows, p.kp, p.kd, step, p.age, f64(1.0))
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
@@ -766,8 +781,8 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
     applied = n.efficiency * t.end
     applied += beside[0]
     applied += p.bias
-    parts, kept = dry(c.params[h], x.q, v_drive, before, p.bias - load, p.carries, f64(1.0), kept, fresh, dt)
-    how, kept = acts(c.params[h], x.q, v_drive, kept, fresh, dt)
+    parts, kept = dry(of, x.q, v_drive, before, p.bias - load, p.carries, f64(1.0), kept, fresh, dt)
+    how, kept = acts(of, x.q, v_drive, kept, fresh, dt)
     x.memory = kept
     level = (parts[0] + parts[1] + (parts[2] + parts[3])) * n.friction
     if by_gear:
@@ -789,7 +804,7 @@ def substep(c: Recorded, h: int, x: State, p: Guess, n: Now, b: Pair):
         if p.gap2 > zero:  # a spring behind the play would keep it closed: one that leaves it open is before it
             on_motor = p.preload + p.spring * (x.qm + half * dt * x.vm)
             load -= pulled
-        x = two_bodies(c, x, t, applied - on_motor, load, level, how[1], stop_d, drag, grease, dt, p, n, b)
+        x = two_bodies(x, t, applied - on_motor, load, level, how[1], stop_d, drag, grease, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, how[1], stop_d, visc, grease, theta, dt, p, n)
     if p.staged:
@@ -810,12 +825,12 @@ def moved(c: Recorded, h: int, w: int, x: State):
 
 
 @wp.func
-def begun(c: Recorded, h: int, w: int, g: int, warm: int, p: Guess):
+def begun(c: Recorded, of: Any, h: int, w: int, g: int, warm: int, p: Guess):
     """The joint at the begin of window w: where it was measured."""
     x = State()
     x.fresh = f64(1.0)
-    x.q = position(c.params[h], c.series[g, XQ], x, p)
-    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
+    x.q = position(of, c.series[g, XQ], x, p)
+    x.v = c.series[g, XV] / (p.read_scale * shown(of, x.q, x, p)[1])
     if warm == 0:
         x = moved(c, h, w, x)
     x.qm = x.q
@@ -828,12 +843,12 @@ def begun(c: Recorded, h: int, w: int, g: int, warm: int, p: Guess):
 
 
 @wp.func
-def held(c: Recorded, h: int, w: int, g: int, last: bool, x: State, p: Guess):
+def held(c: Recorded, of: Any, h: int, w: int, g: int, last: bool, x: State, p: Guess):
     """The joint on its recorded motion in window w, while the drive's own state settles; last: it is let go now."""
-    error = encoder(c.params[h], x.q, x.memory, x.fresh != f64(0.0))
+    error = encoder(of, x.q, x.memory, x.fresh != f64(0.0))
     m = unread(c.series[g, XQ], p) - error[0] - error[1]
     x.q = (m - p.offset) / p.scale
-    x.v = c.series[g, XV] / (p.read_scale * shown(c.params[h], x.q, x, p)[1])
+    x.v = c.series[g, XV] / (p.read_scale * shown(of, x.q, x, p)[1])
     if last:
         x = moved(c, h, w, x)
     if not p.two:
@@ -843,11 +858,11 @@ def held(c: Recorded, h: int, w: int, g: int, last: bool, x: State, p: Guess):
 
 
 @wp.func
-def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, x: State, p: Guess):
+def asked_before(c: Recorded, of: Any, k: int, last: int, t: f64, dt: f64, x: State, p: Guess):
     """Steps of dt [s] before t [s] in which a command changed that the drive's lag still holds some of; k, last: the
     command from which on to look, and the end of the run's."""
-    waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
-    begin = t - waits - f64(SETTLES) * c.params[h, P_LAG]
+    waits, kept = late(of, t, x.memory, x.fresh != f64(0.0), dt)
+    begin = t - waits - f64(SETTLES) * of[P_LAG]
     kk = int(k)
     while kk + 1 < last and c.cmd_t[kk + 1] <= begin:
         kk += 1
@@ -857,6 +872,17 @@ def asked_before(c: Recorded, h: int, k: int, last: int, t: f64, dt: f64, x: Sta
     if since <= f64(0.0):
         return 0
     return int(wp.ceil(since / dt)) + 1
+
+
+@wp.func
+def finite(x: State):
+    """The joint, where it has diverged far off and at rest."""
+    if not (wp.abs(x.q) < f64(1.0e4)):
+        x.q = f64(1.0e4)
+        x.v = f64(0.0)
+        x.qm = x.q
+        x.vm = f64(0.0)
+    return x
 
 
 @cache
@@ -881,38 +907,39 @@ def plant_kernel() -> wp.Kernel:
         c_end = c.window[w, 6]
         k = c.window[w, 7]
         t = c.window_t[w]
-        p = guess(c, h, dt)
-        x = begun(c, h, w, g0, warm, p)
+        of = c.params[h]
+        p = guess(c, of, dt)
+        x = begun(c, of, h, w, g0, warm, p)
         lead = int(0)
         if warm == 0:
-            lead = asked_before(c, h, k, c_end, t, dt, x, p)
+            lead = asked_before(c, of, k, c_end, t, dt, x, p)
             t -= f64(lead) * dt
         on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
-        after = shown(c.params[h], x.q, x, p)[0]  # at the end of the step
+        after = shown(of, x.q, x, p)[0]  # at the end of the step
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
             if i <= 0 and lead > 0:  # where it is measured first, only the drive's torque goes on
                 torque = x.last
                 stage = x.stage
-                x = begun(c, h, w, g0, warm, p)
+                x = begun(c, of, h, w, g0, warm, p)
                 if j > 0:
                     x.last = torque
                     x.stage = stage
                     x.fresh = f64(2.0)
-                after = shown(c.params[h], x.q, x, p)[0]
+                after = shown(of, x.q, x, p)[0]
             if i >= 0 and i <= warm and warm > 0:
-                x = held(c, h, w, g, i == warm, x, p)
+                x = held(c, of, h, w, g, i == warm, x, p)
                 if i == 0:
                     x.qm = x.q
                     x.vm = x.v
-                after = shown(c.params[h], x.q, x, p)[0]
+                after = shown(of, x.q, x, p)[0]
                 if on_motor:
-                    after = shown(c.params[h], x.qm, x, p)[0]
+                    after = shown(of, x.qm, x, p)[0]
             reported = after
             n = Now()
             n.held = i < warm or i < 0
-            waits, kept = late(c.params[h], t, x.memory, x.fresh != f64(0.0), dt)
+            waits, kept = late(of, t, x.memory, x.fresh != f64(0.0), dt)
             x.memory = kept
             end = t + dt - waits
             while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
@@ -920,24 +947,19 @@ def plant_kernel() -> wp.Kernel:
             aim = command(c, c_begin, k, c_end, end, dt, p)
             n.target = aim[0]
             n.feed = aim[1]
-            n, kept = drive_now(c, h, g, dt, x, p, n)
+            n, kept = drive_now(c, of, g, dt, x, p, n)
             x.memory = kept
-            n = body_now(c, h, g, p, n)
-            b = pair_now(c, h, p, n)
+            n = body_now(c, of, g, p, n)
+            b = pair_now(of, p, n)
             n_sub = int(ONE_BODY_STEPS)
             if p.two:
                 n_sub = TWO_BODY_STEPS
             for _ in range(n_sub):
-                x = substep(c, h, x, p, n, b)
-
-            if not (wp.abs(x.q) < f64(1.0e4)):  # diverged: keep it finite, far off
-                x.q = f64(1.0e4)
-                x.v = f64(0.0)
-                x.qm = x.q
-                x.vm = f64(0.0)
-            after = shown(c.params[h], x.q, x, p)[0]
+                x = substep(of, x, p, n, b)
+            x = finite(x)
+            after = shown(of, x.q, x, p)[0]
             if on_motor:
-                after = shown(c.params[h], x.qm, x, p)[0]
+                after = shown(of, x.qm, x, p)[0]
             elif i < warm:
                 after = reported
             while s < s_end and c.sample_step[s] == i:
@@ -947,3 +969,176 @@ def plant_kernel() -> wp.Kernel:
             t += dt
 
     return plant
+
+
+# -- guesses side by side ----------------------------------------------------------------------------------------------
+# On a CPU a step of one guess waits for its own divisions, one after the other. Of guesses that have none but the usual
+# columns several are simulated at a time, which the compiler makes vectors of: all other columns are constants there,
+# so that no call and no second body is left.
+
+LANES = 8  # guesses side by side
+USUAL = tuple(
+    INDEX[n] for n in (
+        "kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "lag",
+        "delay", "friction_asymmetry", "presliding", "deadband", "deadband_kind", "speed_lag", "braking_slope", "rotor",
+        "supply", "position_offset", "position_scale", "inertia_scale", "gravity_scale", "armature", "payload",
+        "tilt_x", "tilt_y", "tilt_z", "bias", "feedback_delay", "limit_speed", "motor_share", "effort_fresh",
+        "effort_gain", "effort_offset", "readout_scale", "readout_offset", "spring", "spring_preload",
+    )
+)  # fmt: skip
+Lanes = wp.types.vector(length=LANES, dtype=f64)
+Columns = wp.types.vector(length=LANES * len(USUAL), dtype=f64)
+Row = wp.types.vector(length=len(NEUTRAL), dtype=f64)
+ABSENT = np.where(np.isfinite(NEUTRAL), NEUTRAL, 1e9)  # as a plant has columns of what is not there
+UNUSUAL = [k for k in range(len(NEUTRAL)) if k not in USUAL]
+COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
+
+
+@cache
+def lanes_kernel() -> wp.Kernel:
+    """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
+    torque drive in one piece, as far as the usual columns say. Rows of params: as many as threads have."""
+    given = wp.config.cpu_compiler_flags
+    flags = f"{'-march=native' if given is None else given} -fno-slp-vectorize -mprefer-vector-width=512"
+
+    @wp.kernel(module="unique", enable_backward=False,
+               module_options={"cpu_compiler_flags": flags, "max_unroll": COLUMNS})  # fmt: skip
+    def plant_lanes(first_window: int, first: int, dt: f64, c: Recorded):
+        ww, hh = wp.tid()
+        w = first_window + ww
+        h0 = LANES * (first + hh)
+        g0 = c.window[w, 0]
+        warm = c.window[w, 2]
+        s = c.window[w, 3]
+        s_end = s + c.window[w, 4]
+        c_begin = c.window[w, 5]
+        c_end = c.window[w, 6]
+        t = c.window_t[w]
+        columns = Columns()
+        qs = Lanes()
+        vs = Lanes()
+        lasts = Lanes()
+        olders = Lanes()
+        heards = Lanes()
+        takens = Lanes()
+        fresh = Lanes()
+        ks = Lanes()
+        targets = Lanes()
+        before = Lanes()
+        after = Lanes()
+        leads = Lanes()
+        lead = int(0)
+        l = int(0)
+        while l < LANES:
+            of = c.params[h0 + l]
+            for m in range(wp.static(len(USUAL))):
+                columns[wp.static(LANES * m) + l] = of[wp.static(USUAL[m])]
+            p = guess(c, of, dt)
+            x = begun(c, of, wp.min(h0 + l, c.inits.shape[0] - 1), w, g0, warm, p)
+            qs[l] = x.q
+            vs[l] = x.v
+            fresh[l] = f64(1.0)
+            ks[l] = f64(c.window[w, 7])
+            after[l] = shown(of, x.q, x, p)[0]
+            if warm == 0:
+                leads[l] = f64(asked_before(c, of, c.window[w, 7], c_end, t, dt, x, p))
+                lead = wp.max(lead, int(leads[l]))
+            l += 1
+        t -= f64(lead) * dt
+        usual = guess(c, c.params[h0], dt)  # no command of them is late, none asks for a feed-forward
+        for j in range(c.window[w, 1] + lead):
+            i = j - lead
+            g = g0 + wp.max(i, 0)
+            if (i <= 0 and lead > 0) or (i <= warm and warm > 0):
+                l = int(0)
+                while l < LANES:
+                    of = c.params[h0 + l]
+                    h = wp.min(h0 + l, c.inits.shape[0] - 1)
+                    p = guess(c, of, dt)
+                    x = State()
+                    if warm > 0:
+                        x.q = qs[l]
+                        x.v = vs[l]
+                        x.fresh = fresh[l]
+                        x = held(c, of, h, w, g, i == warm, x, p)
+                    else:
+                        x = begun(c, of, h, w, g0, warm, p)
+                        heards[l] = f64(0.0)
+                        takens[l] = f64(0.0)
+                        fresh[l] = f64(1.0)
+                        if i > -int(leads[l]):
+                            fresh[l] = f64(2.0)
+                    qs[l] = x.q
+                    vs[l] = x.v
+                    after[l] = shown(of, x.q, x, p)[0]
+                    l += 1
+            l = int(0)
+            while l < LANES:
+                before[l] = after[l]
+                wait = columns[wp.static(LANES * USUAL.index(P_DELAY)) + l]
+                end = t + dt - wait
+                if l > 0 and wait == columns[wp.static(LANES * USUAL.index(P_DELAY)) + l - 1]:
+                    targets[l] = targets[l - 1]
+                    ks[l] = ks[l - 1]
+                else:
+                    k = int(ks[l])
+                    while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
+                        k += 1
+                    ks[l] = f64(k)
+                    targets[l] = command(c, c_begin, k, c_end, end, dt, usual)[0]
+                l += 1
+            l = int(0)
+            # becomes vectors while no call and no loop is in it, and no variable of another loop (a struct of two loops
+            # is kept in memory)
+            while l < LANES:
+                row = Row()
+                for m in range(COLUMNS):
+                    if wp.static(m in UNUSUAL):
+                        row[m] = wp.static(f64(ABSENT[m]))
+                for m in range(wp.static(len(USUAL))):
+                    row[wp.static(USUAL[m])] = columns[wp.static(LANES * m) + l]
+                fixed = guess(c, row, dt)
+                fixed.two = False
+                fixed.voltage = False
+                fixed.loop_motor = False
+                fixed.open_ = f64(0.0)
+                one = State()
+                one.q = qs[l]
+                one.v = vs[l]
+                one.qm = one.q
+                one.vm = one.v
+                one.last = lasts[l]
+                one.memory[FILTERED] = heards[l]
+                one.taken = takens[l]
+                one.fresh = fresh[l]
+                n = Now()
+                n.held = i < warm or i < 0
+                n.target = targets[l]
+                n, kept = drive_now(c, row, g, dt, one, fixed, n)
+                one.memory = kept
+                n = body_now(c, row, g, fixed, n)
+                one = finite(substep(row, one, fixed, n, Pair()))
+                qs[l] = one.q
+                vs[l] = one.v
+                lasts[l] = one.last
+                olders[l] = one.older
+                heards[l] = one.memory[FILTERED]
+                takens[l] = one.taken
+                fresh[l] = one.fresh
+                after[l] = shown(row, one.q, one, fixed)[0]
+                l += 1
+            while s < s_end and c.sample_step[s] == i:
+                for l in range(LANES):
+                    h = h0 + l
+                    if h < c.out_q.shape[0]:
+                        end_q = after[l]
+                        if i < warm:
+                            end_q = before[l]
+                        of = c.params[h]
+                        shows = before[l] + c.sample_part[s] * (end_q - before[l])
+                        c.out_q[h, s] = of[P_READSCALE] * shows + of[P_READOFFSET]
+                        c.out_torque[h, s] = lasts[l] - of[P_FRESH] * olders[l]
+                s += 1
+            t += dt
+
+    return plant_lanes
