@@ -145,7 +145,7 @@ def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
 
 
 def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
-    """All columns that such guesses may have, drawn at random; among them one with a play, which is not of them."""
+    """All columns that such guesses may have, drawn at random; some have a play, one a ripple and is not of them."""
     plant, params, _ = guesses
     rng, many = np.random.default_rng(3), np.repeat(params[:1], 21, 0)
     servo = {c.name: c for c in COLUMNS}
@@ -154,10 +154,13 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
         away = 0.02 if name not in servo else min(servo[name].usual, servo[name].high - servo[name].neutral)
         shift = rng.uniform(0, 1, (21, 1)) * (0.5 * value if value.any() else away)
         many[:, :, k] = value + (shift if np.isfinite(shift).all() and (value < 1e8).all() else 0.0)
-    many[7, :, INDEX["backlash"]] = 0.02
+    many[10:20, :, INDEX["backlash"]] = 0.02
+    many[14:20, :, INDEX["softness"]] = 0.05
+    many[14:20, :, INDEX["rebound"]] = 0.1
+    many[7, :, INDEX["torque_ripple"]] = 0.1
     inits = 0.01 * rng.normal(size=(21, 2))
-    vectors = [which.tolist() for which, lanes in plant._side_by_side(many[:, 0], 0) if lanes > 1]
-    assert vectors == [[k for k in range(21) if k != 7]]
+    vectors = {columns: which.tolist() for which, columns in plant._side_by_side(many[:, 0], 0)}
+    assert vectors[kernel.TWO] == [*range(10, 18)] and vectors[kernel.USUAL] == [*range(7), 8]
     for length in (1.0, None):
         at_once = plant.simulate(many, plant.windows(length), inits)
         with monkeypatch.context() as m:

@@ -25,7 +25,7 @@ from dexsim.gap.plant.mechanics import JointConstants
 # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch of a fit has fewer blocks
 # than there are; one of a scan has more, and takes a quarter longer in blocks of 32
 BLOCK = 64
-PROFILED = [INDEX[name] for name in PROFILE]
+PROFILED, PLAY = [INDEX[name] for name in PROFILE], [INDEX["backlash"], INDEX["softness"]]
 WARM = 0.15  # s before a window in which the recorded motion is held
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
@@ -382,14 +382,15 @@ class JointPlant:
             for group, begin in zip(groups.values(), begins, strict=True):
                 pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 rows, moves = params[:, group[0]], _of(inits, pick)
-                for which, lanes in self._side_by_side(rows, open_stage):
+                for which, columns in self._side_by_side(rows, open_stage):
+                    lanes = pk.LANES if columns else 1
                     alone = len(groups) == 1 and len(which) == H  # nothing to put together
                     size = len(which), len(windows.sample_row[keep])
                     oq, ot = (q, torque) if alone else (np.empty(size) for _ in range(2))
                     padded = np.r_[which, np.repeat(which[-1:], -len(which) % lanes)]
                     guesses = (_up(rows[padded]), *(_up(x[which]) for x in (moves, begin)), _up(consts))
                     given = recorded(*guesses, *rest, *(_up(x, copy=False) for x in (oq, ot)))
-                    kernel = pk.lanes_kernel() if lanes > 1 else pk.plant_kernel()
+                    kernel = pk.lanes_kernel(columns) if columns else pk.plant_kernel()
                     self._split(len(padded) // lanes, steps, given, kernel)
                     if not alone:
                         at = (which, keep) if isinstance(keep, slice) else np.ix_(which, keep)
@@ -476,16 +477,19 @@ class JointPlant:
         pick, keep, steps, arrays = windows.device[key]
         return pick, keep, steps, [*self._d[device], *arrays]
 
-    def _side_by_side(self, rows: np.ndarray, open_stage: int) -> list[tuple[np.ndarray, int]]:
-        """Return which guesses, of rows [H, C], are simulated how many at a time on the CPU: those with usual columns
-        only, as far as most of a vector of them is filled, and the others."""
-        usual = np.zeros(len(rows), bool)
-        if SIDE_BY_SIDE and not (self.voltage or self.loop == "motor" or open_stage or brought()):
-            usual = (rows[:, pk.UNUSUAL] == pk.ABSENT[pk.UNUSUAL]).all(1)
-        some = np.flatnonzero(usual)
-        few = len(some) % pk.LANES
-        usual[some[len(some) - few :]] = few >= FILLED
-        return [(x, n) for x, n in ((np.flatnonzero(usual), pk.LANES), (np.flatnonzero(~usual), 1)) if len(x)]
+    def _side_by_side(self, rows: np.ndarray, open_stage: int) -> list[tuple[np.ndarray, tuple[int, ...]]]:
+        """Return which guesses, of rows [H, C], have which columns only (`kernel.lanes_kernel`), as far as most of a
+        vector of them is filled; the others, with none."""
+        left, out = np.ones(len(rows), bool), []
+        if SIDE_BY_SIDE and not (self.voltage or "motor" in (self.loop, self.position) or open_stage or brought()):
+            for columns in (pk.USUAL, pk.TWO):
+                rest = np.setdiff1d(np.arange(rows.shape[1]), columns)
+                two = (rows[:, PLAY] > 0).any(1) == (columns == pk.TWO)
+                some = np.flatnonzero(left & two & (rows[:, rest] == pk.ABSENT[rest]).all(1))
+                some = some[: len(some) - len(some) % pk.LANES * (len(some) % pk.LANES < FILLED)]
+                left[some] = False
+                out.append((some, columns))
+        return [(x, columns) for x, columns in (*out, (np.flatnonzero(left), ())) if len(x)]
 
     def _split(self, H: int, steps: np.ndarray, given: pk.Recorded, kernel: wp.Kernel) -> None:
         """H guesses, or as many at a time as the kernel takes, in windows of `steps` [W] on the CPU, in parts side by

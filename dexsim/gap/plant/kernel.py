@@ -986,18 +986,21 @@ USUAL = tuple(
         "effort_gain", "effort_offset", "readout_scale", "readout_offset", "spring", "spring_preload",
     )
 )  # fmt: skip
+TWO = USUAL + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
 Lanes = wp.types.vector(length=LANES, dtype=f64)
-Columns = wp.types.vector(length=LANES * len(USUAL), dtype=f64)
 Row = wp.types.vector(length=len(NEUTRAL), dtype=f64)
 ABSENT = np.where(np.isfinite(NEUTRAL), NEUTRAL, 1e9)  # as a plant has columns of what is not there
-UNUSUAL = [k for k in range(len(NEUTRAL)) if k not in USUAL]
 COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
 
 
 @cache
-def lanes_kernel() -> wp.Kernel:
+def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
-    torque drive in one piece, as far as the usual columns say. Rows of params: as many as threads have."""
+    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, or `TWO`). Rows of params: as many as
+    threads have."""
+    Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
+    two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
+    substeps = TWO_BODY_STEPS if two else ONE_BODY_STEPS
     given = wp.config.cpu_compiler_flags
     flags = f"{'-march=native' if given is None else given} -fno-slp-vectorize -mprefer-vector-width=512"
 
@@ -1017,6 +1020,8 @@ def lanes_kernel() -> wp.Kernel:
         columns = Columns()
         qs = Lanes()
         vs = Lanes()
+        qms = Lanes()
+        vms = Lanes()
         lasts = Lanes()
         olders = Lanes()
         heards = Lanes()
@@ -1031,12 +1036,14 @@ def lanes_kernel() -> wp.Kernel:
         l = int(0)
         while l < LANES:
             of = c.params[h0 + l]
-            for m in range(wp.static(len(USUAL))):
-                columns[wp.static(LANES * m) + l] = of[wp.static(USUAL[m])]
+            for m in range(wp.static(count)):
+                columns[wp.static(LANES * m) + l] = of[wp.static(usual[m])]
             p = guess(c, of, dt)
             x = begun(c, of, wp.min(h0 + l, c.inits.shape[0] - 1), w, g0, warm, p)
             qs[l] = x.q
             vs[l] = x.v
+            qms[l] = x.q
+            vms[l] = x.v
             fresh[l] = f64(1.0)
             ks[l] = f64(c.window[w, 7])
             after[l] = shown(of, x.q, x, p)[0]
@@ -1045,7 +1052,7 @@ def lanes_kernel() -> wp.Kernel:
                 lead = wp.max(lead, int(leads[l]))
             l += 1
         t -= f64(lead) * dt
-        usual = guess(c, c.params[h0], dt)  # no command of them is late, none asks for a feed-forward
+        plain = guess(c, c.params[h0], dt)  # no command of them is late, none asks for a feed-forward
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
@@ -1059,8 +1066,13 @@ def lanes_kernel() -> wp.Kernel:
                     if warm > 0:
                         x.q = qs[l]
                         x.v = vs[l]
+                        x.qm = qms[l]
+                        x.vm = vms[l]
                         x.fresh = fresh[l]
                         x = held(c, of, h, w, g, i == warm, x, p)
+                        if i == 0:
+                            x.qm = x.q
+                            x.vm = x.v
                     else:
                         x = begun(c, of, h, w, g0, warm, p)
                         heards[l] = f64(0.0)
@@ -1070,14 +1082,16 @@ def lanes_kernel() -> wp.Kernel:
                             fresh[l] = f64(2.0)
                     qs[l] = x.q
                     vs[l] = x.v
+                    qms[l] = x.qm
+                    vms[l] = x.vm
                     after[l] = shown(of, x.q, x, p)[0]
                     l += 1
             l = int(0)
             while l < LANES:
                 before[l] = after[l]
-                wait = columns[wp.static(LANES * USUAL.index(P_DELAY)) + l]
+                wait = columns[wp.static(wait_at) + l]
                 end = t + dt - wait
-                if l > 0 and wait == columns[wp.static(LANES * USUAL.index(P_DELAY)) + l - 1]:
+                if l > 0 and wait == columns[wp.static(wait_at) + l - 1]:
                     targets[l] = targets[l - 1]
                     ks[l] = ks[l - 1]
                 else:
@@ -1085,48 +1099,52 @@ def lanes_kernel() -> wp.Kernel:
                     while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
                         k += 1
                     ks[l] = f64(k)
-                    targets[l] = command(c, c_begin, k, c_end, end, dt, usual)[0]
+                    targets[l] = command(c, c_begin, k, c_end, end, dt, plain)[0]
                 l += 1
-            l = int(0)
-            # becomes vectors while no call and no loop is in it, and no variable of another loop (a struct of two loops
-            # is kept in memory)
-            while l < LANES:
-                row = Row()
-                for m in range(COLUMNS):
-                    if wp.static(m in UNUSUAL):
-                        row[m] = wp.static(f64(ABSENT[m]))
-                for m in range(wp.static(len(USUAL))):
-                    row[wp.static(USUAL[m])] = columns[wp.static(LANES * m) + l]
-                fixed = guess(c, row, dt)
-                fixed.two = False
-                fixed.voltage = False
-                fixed.loop_motor = False
-                fixed.open_ = f64(0.0)
-                one = State()
-                one.q = qs[l]
-                one.v = vs[l]
-                one.qm = one.q
-                one.vm = one.v
-                one.last = lasts[l]
-                one.memory[FILTERED] = heards[l]
-                one.taken = takens[l]
-                one.fresh = fresh[l]
-                n = Now()
-                n.held = i < warm or i < 0
-                n.target = targets[l]
-                n, kept = drive_now(c, row, g, dt, one, fixed, n)
-                one.memory = kept
-                n = body_now(c, row, g, fixed, n)
-                one = finite(substep(row, one, fixed, n, Pair()))
-                qs[l] = one.q
-                vs[l] = one.v
-                lasts[l] = one.last
-                olders[l] = one.older
-                heards[l] = one.memory[FILTERED]
-                takens[l] = one.taken
-                fresh[l] = one.fresh
-                after[l] = shown(row, one.q, one, fixed)[0]
-                l += 1
+            part = int(0)
+            while part < wp.static(substeps):
+                l = int(0)
+                # becomes vectors while no call, no loop and no struct of another loop is in it
+                while l < LANES:
+                    row = Row()
+                    for m in range(COLUMNS):
+                        if wp.static(m not in usual):
+                            row[m] = wp.static(f64(ABSENT[m]))
+                    for m in range(wp.static(count)):
+                        row[wp.static(usual[m])] = columns[wp.static(LANES * m) + l]
+                    fixed = guess(c, row, dt)
+                    fixed.two = wp.static(two)
+                    fixed.voltage = False
+                    fixed.loop_motor = False
+                    fixed.open_ = f64(0.0)
+                    one = State()
+                    one.q = qs[l]
+                    one.v = vs[l]
+                    one.qm = qms[l]
+                    one.vm = vms[l]
+                    one.last = lasts[l]
+                    one.memory[FILTERED] = heards[l]
+                    one.taken = takens[l]
+                    one.fresh = fresh[l]
+                    n = Now()
+                    n.held = i < warm or i < 0
+                    n.target = targets[l]
+                    n, kept = drive_now(c, row, g, dt, one, fixed, n)
+                    one.memory = kept
+                    n = body_now(c, row, g, fixed, n)
+                    one = finite(substep(row, one, fixed, n, pair_now(row, fixed, n)))
+                    qs[l] = one.q
+                    vs[l] = one.v
+                    qms[l] = one.qm
+                    vms[l] = one.vm
+                    lasts[l] = one.last
+                    olders[l] = one.older
+                    heards[l] = one.memory[FILTERED]
+                    takens[l] = one.taken
+                    fresh[l] = one.fresh
+                    after[l] = shown(row, one.q, one, fixed)[0]
+                    l += 1
+                part += 1
             while s < s_end and c.sample_step[s] == i:
                 for l in range(LANES):
                     h = h0 + l
