@@ -29,8 +29,8 @@ PROFILED, PLAY = [INDEX[name] for name in PROFILE], [INDEX["backlash"], INDEX["s
 WARM = 0.15  # s before a window in which the recorded motion is held
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 CHUNK = 16  # of them that are copied in one call, and forgotten when all are
-# guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.07 us
-# (two inertias 0.33) and a GPU 5 us (14), whose thousands of threads are no use to a fit that asks for a hundred
+# guesses x windows a core up to which a CPU is faster than one thread of a GPU each: a step of one takes a core 0.04 us
+# (two inertias 0.16) and a GPU 5 us (14), whose thousands of threads are no use to a fit that asks for a hundred
 FEW = 16
 # guesses that simulate as fast alone as in a vector, and whether this machine has vectors of some width
 FILLED, SIDE_BY_SIDE = 3, platform.machine() in ("x86_64", "AMD64")

@@ -1052,7 +1052,7 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                 lead = wp.max(lead, int(leads[l]))
             l += 1
         t -= f64(lead) * dt
-        plain = guess(c, c.params[h0], dt)  # no command of them is late, none asks for a feed-forward
+        plain = guess(c, c.params[h0], dt)  # none asks for a feed-forward
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
