@@ -383,32 +383,31 @@ class JointPlant:
                 pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 rows, moves = params[:, group[0]], _of(inits, pick)
                 for which, columns in self._side_by_side(rows, open_stage):
-                    lanes = pk.LANES if columns else 1
+                    kernel, lanes = (pk.lanes_kernel(columns), pk.LANES) if columns else (pk.plant_kernel(), 1)
                     alone = len(groups) == 1 and len(which) == H  # nothing to put together
-                    size = len(which), len(windows.sample_row[keep])
-                    oq, ot = (q, torque) if alone else (np.empty(size) for _ in range(2))
+                    size = (len(which), len(windows.sample_row[keep]))
+                    oq, ot = (x if alone else np.empty(size) for x in (q, torque))
                     padded = np.r_[which, np.repeat(which[-1:], -len(which) % lanes)]
                     guesses = (_up(rows[padded]), *(_up(x[which]) for x in (moves, begin)), _up(consts))
                     given = recorded(*guesses, *rest, *(_up(x, copy=False) for x in (oq, ot)))
-                    kernel = pk.lanes_kernel(columns) if columns else pk.plant_kernel()
                     self._split(len(padded) // lanes, steps, given, kernel)
                     if not alone:
-                        at = (which, keep) if isinstance(keep, slice) else np.ix_(which, keep)
-                        q[at], torque[at] = oq, ot
+                        put = (which, keep) if isinstance(keep, slice) else np.ix_(which, keep)
+                        q[put], torque[put] = oq, ot
             return q, torque
         with _GPU:
             mine = lane(self.device)
             with wp.ScopedStream(mine.stream, sync_enter=False):
                 host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
                 inputs = [self._inputs(windows, tuple(group), self.device) for group in groups.values()]
-                rows = [params[:, group[0]] for group in groups.values()]
-                constants, *sent = mine.up([consts, *rows, *(_of(inits, pick) for pick, *_ in inputs), *begins])
+                told = [params[:, group[0]] for group in groups.values()]
+                constants, *sent = mine.up([consts, *told, *(_of(inits, pick) for pick, *_ in inputs), *begins])
                 at, parts = 0, []
-                of_guesses = (sent[k * len(rows) : (k + 1) * len(rows)] for k in range(3))
+                of_guesses = (sent[k * len(told) : (k + 1) * len(told)] for k in range(3))
                 for guess, moves, begin, (_, keep, steps, rest) in zip(*of_guesses, inputs, strict=True):
                     count = len(windows.sample_row[keep])
-                    size = H * count
-                    mine_q, mine_t = (mine.part(out, at + k * size, (H, count)) for k in (0, 1))
+                    room = H * count
+                    mine_q, mine_t = (mine.part(out, at + k * room, (H, count)) for k in (0, 1))
                     given = recorded(guess, moves, begin, constants, *rest, mine_q, mine_t)
                     wp.launch(
                         pk.plant_kernel(),
@@ -417,14 +416,14 @@ class JointPlant:
                         device=self.device,
                         block_dim=BLOCK,
                     )
-                    parts.append((keep, at, size))
-                    at += 2 * size
+                    parts.append((keep, at, room))
+                    at += 2 * room
                 wp.copy(host, out, count=at)
         wp.synchronize_stream(mine.stream)
         numbers = host.numpy()
-        for keep, at, size in parts:
-            q[:, keep] = numbers[at : at + size].reshape(H, -1)
-            torque[:, keep] = numbers[at + size : at + 2 * size].reshape(H, -1)
+        for keep, at, room in parts:
+            q[:, keep] = numbers[at : at + room].reshape(H, -1)
+            torque[:, keep] = numbers[at + room : at + 2 * room].reshape(H, -1)
         return q, torque
 
     def _setpoints(self, rows: np.ndarray, windows: Windows, group: Sequence[int]) -> np.ndarray:
