@@ -603,6 +603,7 @@ def test_final_observations_are_those_before_the_reset(env):
     (("task", "contact", "impedance", 1.0), "impedance"),
     (("task", "critic", "oracle"), "task.critic"),
     (("task", "termination", "untouched", -1.0), "termination.untouched"),
+    (("task", "command", "zero", -0.1), "command.zero"),
     (("task", "objects", "train", ["cube"]), "cube"),
     (("task", "objects", "held_out", []), "held_out"),
 ])  # fmt: skip

@@ -58,6 +58,28 @@ def test_without_one_it_is_paid_for_a_band():
     env.close()
 
 
+def test_a_share_of_commands_is_zero_and_asks_no_finger_to_touch():
+    env = grasp_env(*FEW, "task.command.zero=0.5", "task.command.hold_s=[0.05,0.1]", worlds=64)
+    seen = torch.stack([obs["actor"][:, -1] for obs in steps(env, 20)])
+    assert 0.3 < float((seen == 0).float().mean()) < 0.7 and float(seen.max()) > 0.9
+    command = env.command.clone()
+    assert bool((command == 0).any()) and bool((command > 0.1).any())
+    env.tip_force.zero_()
+    off = env.rewards()
+    weight = env.task["rewards"]["force"]
+    assert torch.allclose(off["force"][command == 0], torch.tensor(4 * weight))
+    assert not off["force"][command > 0.1].any()
+    assert not off["grip"].any()  # nor does the thumb touch
+    env.tip_force[:, env.opposing] = 5.0
+    thumb = env.rewards()
+    full = env.task["rewards"]["grip"]
+    assert torch.allclose(thumb["grip"][command == 0], torch.tensor(full))
+    assert not thumb["grip"][command > 0.1].any()
+    env.tip_force[:, env.others] = 2.0  # more than is asked
+    assert bool((env.rewards()["force"] < thumb["force"])[command == 0].all())
+    env.close()
+
+
 @pytest.mark.parametrize("value", ["0.5", "[0.5]", "[0.6,0.4]", "[0,1.5]", "[a,b]"])
 def test_a_range_that_is_none_is_refused(value):
     with pytest.raises(UserError, match="task.command.thumb"):

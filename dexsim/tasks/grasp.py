@@ -103,8 +103,9 @@ class GraspEnv(Launches):
                 f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high"
                 " <= 1"
             )
-        if not 0 <= (rate := t["termination"].get("untouched", 0.0)) <= 1:
-            raise UserError(f"task.termination.untouched={rate}: must lie in [0, 1]")
+        for part, name in (("termination", "untouched"), ("command", "zero")):
+            if not 0 <= (share := t[part].get(name, 0.0)) <= 1:
+                raise UserError(f"task.{part}.{name}={share}: must lie in [0, 1]")
         self.thumb_range = t["command"].get("thumb")
         if self.thumb_range is not None and not _is_range(self.thumb_range):
             raise UserError(

@@ -33,6 +33,7 @@ class Orders:
 @wp.struct
 class CommandRange:
     fixed: bool
+    zero: float  # share of commands that are 0
     low: float
     span: float
     hold_low: float  # s
@@ -43,7 +44,10 @@ class CommandRange:
 def new_command(w: int, r: CommandRange, d: Draws, o: Orders):
     value = d.value[w]
     if not r.fixed:
-        value = r.low + r.span * value
+        if value < r.zero:
+            value = float(0.0)
+        else:
+            value = r.low + r.span * (value - r.zero) / (1.0 - r.zero)
     o.command[w] = value
     o.command_left[w] = r.hold_low + r.hold_span * d.hold[w]
 

@@ -88,8 +88,9 @@ class Launches(Task):
         """Return forms of rewards and terminations as the settings have them now."""
         r, end, u = self.task["reward"], self.task["termination"], self.unit
         names = ("force_sigma", "force_low", "force_high", "torque_sigma", "torque_low", "torque_high")
+        lift = r["force_low"] if self.task["command"].get("zero") else 0.0
         return filled(
-            grasp_rewards.Shape, **{name: float(r[name]) for name in names}, f_max=self.f_max,
+            grasp_rewards.Shape, **{name: float(r[name]) for name in names}, f_max=self.f_max, lift=lift,
             contact=r["contact_threshold"], reach_length=u * r["reach_length"], beside=self.beside,
             centre_length=u * CENTRE_LENGTH, distance=u * end["distance"], below=u * end["below"] + self.rise,
             **self._hand_shape,
@@ -107,8 +108,8 @@ class Launches(Task):
         c, s, fixed = self.task["command"], self.sampler, self.fixed_command
         (first, last), low = c["hold_s"], c["low"]
         how = filled(
-            kernels.CommandRange, fixed=fixed is not None, low=low, span=c["high"] - low, hold_low=first,
-            hold_span=last - first,
+            kernels.CommandRange, fixed=fixed is not None, zero=c.get("zero", 0.0), low=low, span=c["high"] - low,
+            hold_low=first, hold_span=last - first,
         )  # fmt: skip
         drawn = filled(
             kernels.Draws, value=s.uniform() if fixed is None else fixed, hold=s.uniform(),

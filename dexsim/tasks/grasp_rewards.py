@@ -45,6 +45,7 @@ class Shape:
 
     f_max: float  # N, F_max
     contact: float  # N, from which a finger touches
+    lift: float  # command below which the others may as well lift off
     force_sigma: float  # these as fractions of F_max or of the largest torque
     force_low: float
     force_high: float
@@ -104,6 +105,12 @@ def touches(f: int, w: int, s: State, shape: Shape):
 
 
 @wp.func
+def lifts(w: int, s: State, shape: Shape):
+    """Return whether the fingers beside the opposing ones are told to press with next to nothing."""
+    return s.command[w] < shape.lift
+
+
+@wp.func
 def opposes(f: int, shape: Shape):
     """Return whether a finger presses against the others, wherever it stands in the hand's order."""
     found = bool(False)
@@ -128,13 +135,15 @@ def tracking(x: float, command: float, x_max: float, sigma: float, low: float, h
 
 @wp.func
 def force(w: int, s: State, shape: Shape):
-    """Return R_force: sum over the fingers that touch of R_i at their force."""
+    """Return R_force: sum over the fingers that touch, or need not, of R_i at their force."""
     total = float(0.0)
     for f in range(s.tip_force.shape[1]):
-        if touches(f, w, s, shape):
-            command = wp.where(opposes(f, shape), s.thumb_command[w], s.command[w])
-            total += tracking(s.tip_force[w, f], command, shape.f_max, shape.force_sigma, shape.force_low,
-                              shape.force_high)  # fmt: skip
+        thumb = opposes(f, shape)
+        free = lifts(w, s, shape) and not thumb
+        if touches(f, w, s, shape) or free:
+            command = wp.where(thumb, s.thumb_command[w], s.command[w])
+            low = wp.where(free, float(0.0), shape.force_low)
+            total += tracking(s.tip_force[w, f], command, shape.f_max, shape.force_sigma, low, shape.force_high)
     return total
 
 
@@ -329,7 +338,8 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[wp.static(AT["termination"])] = wp.where(is_dropped(w, s, shape), float(1.0), float(0.0))
     value[wp.static(AT["action"])] = action(w, s)
     value[wp.static(AT["velocity"])] = velocity(w, s)
-    value[wp.static(AT["grip"])] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
+    n = float(shape.others.shape[0])
+    value[wp.static(AT["grip"])] = wp.where(thumb, wp.where(lifts(w, s, shape), n, fingers) / n, float(0.0))
     value[wp.static(AT["force_near"])] = near(False, w, s, shape)
     value[wp.static(AT["reach"])] = reach(shape.others, w, s, shape)
     value[wp.static(AT["self"])] = at_most(squeeze / shape.f_max, 5.0)
