@@ -91,6 +91,7 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("gear_load_friction_backdriven", 0.0, "1", "the same where the joint drives the gear"),
     ("gear_load_power", 1.0, "1", "both are shares of unit * (|torque| / unit)^power; 2/3: Hertz's contact"),
     ("gear_load_unit", 1.0, "N.m", "that unit"),
+    ("late_by", 0.0, "s", "all commands act later by as much: what their clock is off, no delay of the drive"),
 )
 
 NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)

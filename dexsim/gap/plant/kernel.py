@@ -111,6 +111,7 @@ P_BRAKING = INDEX["braking_slope"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
+P_LATE = INDEX["late_by"]
 P_MOTORSHARE = INDEX["motor_share"]
 P_STAGES = INDEX["lag_stages"]
 P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
@@ -862,6 +863,7 @@ def asked_before(c: Recorded, of: Any, k: int, last: int, t: f64, dt: f64, x: St
     """Steps of dt [s] before t [s] in which a command changed that the drive's lag still holds some of; k, last: the
     command from which on to look, and the end of the run's."""
     waits, kept = late(of, t, x.memory, x.fresh != f64(0.0), dt)
+    waits = waits + of[P_LATE]
     begin = t - waits - f64(SETTLES) * of[P_LAG]
     kk = int(k)
     while kk + 1 < last and c.cmd_t[kk + 1] <= begin:
@@ -940,6 +942,7 @@ def plant_kernel() -> wp.Kernel:
             n = Now()
             n.held = i < warm or i < 0
             waits, kept = late(of, t, x.memory, x.fresh != f64(0.0), dt)
+            waits = waits + of[P_LATE]
             x.memory = kept
             end = t + dt - waits
             while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:

@@ -3,7 +3,6 @@ was found on whole recordings, and intervals."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -472,8 +471,7 @@ def late_commands(search: JointSearch, best: Trial) -> float:
     def fit(members: Sequence[Member], known: dict[str, float]) -> Fitted:
         """Fit members and the clock, from what is known and the shift that follows best with that."""
         params = [*(p for m in members for p in named(m)), *(p for p in best.fit.params if p.nuisance), late]
-        fitter = copy.copy(search.fitter.given(members))
-        fitter.fixed = (*fitter.fixed, ("late_group", 2.0**31 - 1))  # all commands are one group
+        fitter = search.fitter.given(members)
         x0 = np.array([known.get(p.key, p.start) for p in params])
         tried = np.repeat(x0[None], len(shifts), 0)
         tried[:, -1] = shifts
