@@ -461,33 +461,25 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
 
 def late_commands(search: JointSearch, best: Trial) -> float:
     """Return s by which all commands are stamped after they acted: a term of the loop that runs ahead of its target
-    (`controller_term`) looks like it. 0 unless that is of little use beside such a clock, and the clock of much beside
-    the term."""
+    (`controller_term`) looks like it. 0 unless a feed-forward of speed is of little use to a plain model beside such a
+    clock, and the clock of much beside the feed-forward."""
     if "controller_term" not in best.ids:
         return 0.0
+    plain, nominal = baseline.plain_model(search.case, search.train), search.case.scales.nominal
+    most = 3 * max(nominal["kd"], 0.2 * nominal["kp"])
+    ahead = Param("ahead", ("speed_feedforward",), "set", 0.0, most, 0.0)
     late = Param("late_by", ("late_by",), "set", -LATEST, 0.0, 0.0, "s")
-    shifts = np.linspace(-LATEST, 0.0, 101)
-
-    def fit(members: Sequence[Member], known: dict[str, float]) -> Fitted:
-        """Fit members and the clock, from what is known and the shift that follows best with that."""
-        params = [*(p for m in members for p in named(m)), *(p for p in best.fit.params if p.nuisance), late]
-        fitter = search.fitter.given(members)
-        x0 = np.array([known.get(p.key, p.start) for p in params])
-        tried = np.repeat(x0[None], len(shifts), 0)
-        tried[:, -1] = shifts
-        x0[-1] = shifts[np.argmin(fitter.loss(fitter.residuals(params, tried)))]
-        return fitter.fit(params, x0=x0, iterations=8)
-
-    found = dict(zip([p.key for p in best.fit.params], best.fit.x.tolist(), strict=True))
-    own = {k: x for k, x in found.items() if "." in k}  # of effects, not of beliefs
-    rest = best.but(best.ids.index("controller_term"))[0]
-    clock = min(fit((), {}), fit(rest, own), key=lambda f: f.loss)
-    at = dict(zip([p.key for p in clock.params], clock.x.tolist(), strict=True))
-    both = min(fit(best.members, found), fit(best.members, own | {"controller_term.gain": 0.0} | at), clock,
-               key=lambda f: f.loss)  # fmt: skip
-    gained = best.fit.loss - both.loss
-    told = gained > SEARCH.least * best.fit.loss and clock.loss - both.loss < JUDGE.part * gained
-    return -at["late_by"] if told and -at["late_by"] > SIGNAL.early else 0.0
+    shifts, box = np.linspace(-LATEST, 0.0, 101), Box(plain)
+    believed = np.clip(box.centre, box.low, box.high)
+    fit = lambda more, x: search.fitter.fit([*plain, *more], x0=np.array(x), iterations=12)  # noqa: E731
+    tried = np.column_stack([np.repeat(believed[None], len(shifts), 0), shifts])
+    first = shifts[np.argmin(search.fitter.loss(search.fitter.residuals([*plain, late], tried)))]
+    term, clock = fit([ahead], [*believed, 0.0]), fit([late], [*believed, first])
+    both = [fit([ahead, late], x) for x in ([*term.x, 0.0], [*clock.x[:-1], 0.0, clock.x[-1]])]
+    least = min(f.loss for f in (term, clock, *both))
+    gained = term.loss - least
+    told = gained > SEARCH.least * term.loss and clock.loss - least < JUDGE.part * gained
+    return -float(clock.x[-1]) if told and -clock.x[-1] > SIGNAL.early else 0.0
 
 
 def polished(search: JointSearch, trial: Trial) -> Trial:
