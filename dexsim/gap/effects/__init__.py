@@ -209,6 +209,7 @@ class Effect:
     misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
     rings: ClassVar[bool] = False  # may make a loop ring by itself
+    leads: ClassVar[bool] = False  # acts ahead of the target, as a drive does whose commands are stamped late
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
     slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
     # effects that are this one with a size of nothing, whatever else is like them

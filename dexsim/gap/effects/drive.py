@@ -326,6 +326,7 @@ class ControllerTerm(Effect):
     motions = ("ladder", "holds")
     kinds = 2
     demo = {"speed_feedforward": 0.06}
+    leads = True
 
     def variants(self, s: Scales) -> list[Variant]:
         kp, kd = s.nominal["kp"], s.nominal["kd"]

@@ -460,10 +460,10 @@ def settle_found(search: JointSearch, found: Outcome) -> None:
 
 
 def late_commands(search: JointSearch, best: Trial) -> float:
-    """Return s by which all commands are stamped after they acted: a term of the loop that runs ahead of its target
-    (`controller_term`) looks like it. 0 unless a feed-forward of speed is of little use to a plain model beside such a
-    clock, and the clock of much beside the feed-forward."""
-    if "controller_term" not in best.ids:
+    """Return s by which all commands are stamped after they acted: a term of the loop that leads its target looks like
+    it. 0 unless a feed-forward of speed is of little use to a plain model beside such a clock, and the clock of much
+    beside the feed-forward."""
+    if not any(m.effect.leads for m in best.members):
         return 0.0
     plain, nominal = baseline.plain_model(search.case, search.train), search.case.scales.nominal
     most = 3 * max(nominal["kd"], 0.2 * nominal["kp"])
