@@ -14,7 +14,8 @@ from dexsim.gap.judge.joint_answer import stretched, traded
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted, bounded
-from dexsim.gap.search.search import JointSearch, Member, Trial
+from dexsim.gap.search.scan import scan_catalogue
+from dexsim.gap.search.search import JointSearch, Member, Trial, begun_again
 from tests.test_gap import model, plant_run
 
 BRAKES = ("torque_limit", "viscous_friction", "braking_limit")
@@ -30,6 +31,29 @@ def test_a_millisecond_is_short_enough_for_a_lag_and_for_braking_at_the_limit(ch
         params[..., INDEX[name]] = value
     coarse, fine = (p.simulate(params, p.windows(None))[0][0] for p in (plant, plant.refined(20)))
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 1.5e-4  # of 0.5 rad
+
+
+@pytest.mark.slow
+def test_no_effect_is_begun_again_from_where_an_effect_ended():
+    runs = [
+        plant_run(name, kind, 5.0, {"delay": 6e-4, "*kp": 0.97}, seed)
+        for name, kind, seed in (("a", 0, 1), ("b", 1, 2), ("c", 2, 3))
+    ]
+    s = JointSearch(build(model(), runs)[0], [0, 1, 2], None, [0, 1, 2])
+    none = s.start()
+    listed = scan_catalogue(s, none)
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in listed if m.id == "command_delay")
+    there = s.fit((member,), start, none)
+    params = none.fit.params
+    x = none.fit.x.copy()
+    x[[p.key for p in params].index("kp")] = 1.04
+    short = Trial((), s.fitter.fit(params, x0=x, iterations=0))  # a fit that has stopped on the way
+    assert short.fit.loss > 1.2 * there.fit.loss
+    again = begun_again(s, short, [there])
+    assert again is not short and s.objective(again) < 1.05 * s.objective(none)
+    assert begun_again(s, again, [there]) is again  # what follows as well is left alone
+    worse = replace(there, fit=replace(there.fit, loss=2 * short.fit.loss))
+    assert begun_again(s, short, [worse]) is short
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.008])

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
@@ -20,14 +21,31 @@ from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Box, Fitted, Fitter
-from dexsim.gap.search.scan import free_run_errors, scan_catalogue
-from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found
+from dexsim.gap.search.scan import cross_validated, free_run_errors, refolded, saved_by, scan_catalogue
+from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found, subset
 from tests.test_gap import model, plant_run
 
 
 def searched(changes: dict[str, float]) -> JointSearch:
     runs = [plant_run(name, kind, 5.0, changes, seed) for name, kind, seed in (("a", 0, 1), ("b", 1, 2), ("c", 2, 3))]
     return JointSearch(build(model(), runs)[0], [0, 1, 2], None, [0, 1, 2])
+
+
+@pytest.mark.slow
+def test_refold_fits_each_condition_left_out_better_than_one_step_does():
+    s = searched({"torque_limit": 0.12})
+    none = s.start()
+    listed = scan_catalogue(s, none)
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in listed if m.id == "torque_limit")
+    step = s.fit((member,), start, none)
+    cross_validated(s, step)
+    own = refolded(s, step)
+    assert own.left_out is not step.left_out and own.fit is step.fit
+    for number, x, y in zip(np.unique(s.fold_of), step.folds, own.folds, strict=True):
+        fitter = Fitter(s.case.plant, subset(s.long, s.fold_of != number), s.r)
+        loss = [fitter.loss(fitter.evaluate(step.fit.params, g)[None])[0] for g in (x, y)]
+        assert loss[1] <= 1.02 * loss[0]
+    assert own.left_out.sum() <= 1.25 * step.left_out.sum()  # what is free to fit noise does, a little
 
 
 @pytest.mark.slow
@@ -42,6 +60,37 @@ def test_conditions_left_out_are_run_free_with_fits_of_their_own():
     assert before.shape == after.shape == (3,) and free_run_errors(s, trial) is after
     # what limits the torque is the same in each condition, whichever is left out
     assert after.mean() < 0.5 * before.mean() and after.mean() < 3.0
+
+
+def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
+    """What a guess saves is the bounded least squares of residuals and beliefs with it and without it."""
+    rng = np.random.default_rng(3)
+    n, P, H = 200, 5, 3
+    params = [
+        Param(f"p{i}", ("kp",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025 if i < 3 else 0.0) for i in range(P)
+    ]
+    span, x = 0.1, np.array([1.05, 0.96, 1.0, 0.95, 1.02])  # the first and the fourth stand at their bounds
+    J, d = rng.standard_normal((n, P)), rng.standard_normal((H, n))
+    d[0] += 2 * J[:, 0]  # does what the first belief does
+    r = 0.8 * d[0] - 0.6 * J[:, 0] + 0.3 * rng.standard_normal(n)
+    weight = np.array([30.0 / 0.025**2 * span**2] * 3 + [0.0] * 2)
+    owners = [(SimpleNamespace(id=str(i)), np.zeros(1)) for i in range(H)]
+    got = {m.id: g for g, m, _ in saved_by(owners, d @ r, (d * d).sum(1), d @ J, J, r, params, x)}
+    off = (x - 1.0) / span
+
+    def least(column: np.ndarray | None) -> float:
+        # r - c d + J z, and the beliefs' own residuals
+        A = np.vstack([J, np.diag(np.sqrt(weight))])
+        b = np.r_[-r, -np.sqrt(weight) * off]
+        low, high = (0.95 - x) / span, (1.05 - x) / span + 1e-12
+        if column is not None:
+            A = np.column_stack([A, np.r_[-column, np.zeros(P)]])
+            low, high = np.r_[low, 0.0], np.r_[high, 2.0]
+        return 2 * lsq_linear(A, b, (low, high), tol=1e-14).cost
+
+    for i in range(H):
+        assert got[str(i)] == pytest.approx(1 - least(d[i]) / least(None), abs=1e-6)
+    assert max(got, key=got.get) == "0"
 
 
 def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted(monkeypatch):

@@ -23,7 +23,7 @@ class SearchRules:
     # chance that the scan's best effect is there by accident, at most; four times as much are still tried
     price: float = 0.05
     # relative: what a fitted effect is off by whatever the residuals say: a further one must remove more than this of
-    # what the earlier ones did
+    # what the earlier ones did; of its room, a plain model's figure must differ by more from what is believed
     doubt: float = 0.015
     # relative, of its loss: what a hypothesis must do better that can imitate simpler ones, as an eccentricity whose
     # zero is anywhere imitates a zero error
@@ -35,6 +35,9 @@ class SearchRules:
     # of the loss: nearer than this, fits without each condition decide; of the squared error on what was held out:
     # nearer than this it speaks neither for an effect nor against it
     tie: float = 0.02
+    # share of the squared error where it was fitted that an effect must remove where that is within the noise without
+    # it
+    clear: float = 0.11
     # relative, of a loss: finer than this nothing is to be trusted. A rival as much worse than the best counts for a
     # third of it in one draw, and laws of one effect that come within twice as much may each be the true one; a
     # parameter costs as much, and an effect must promise as much in the scan; of its misfit without any effect a signal
@@ -97,6 +100,8 @@ class JudgeRules:
     earns: float = 0.1
     # of the largest of an effect's sizes in fits without one condition each: the least must be as large
     repeated: float = 0.2
+    # share of what was held out that may say nothing of an effect: more of it is not a few moments
+    most_left_out: float = 0.2
     many_on_a_joint: int = 3  # effects on one joint from which on the smaller ones are taken for a series of stand-ins
     # of the squared error before: a further effect that removes less may be what the first one's law gets wrong
     least_share: float = 0.04

@@ -23,6 +23,7 @@ class CommandDelay(Effect):
     words = "acts on its commands later than believed"
     shows = "in proportion to speed"
     experiment = "steps and a fast chirp"
+    plain = ("delay",)
     classes = ("late",)
     motions = ("steps", "chirp")
     slows = True

@@ -24,7 +24,7 @@ from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
 from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
 from dexsim.gap.judge.held_out import rms
-from dexsim.gap.judge.joint_answer import JointAnswer, nuisances
+from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, nuisances
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
@@ -256,10 +256,14 @@ def _take_back(
         if not mine or joint in rings or _less(v["after"], v["before"]):
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
-        if reason:
+        elsewhere = _less(v["told_after"], v["told_before"])  # but for moments that nothing follows
+        if reason or elsewhere:
             for e in d.evidence:
                 if e.joint == joint and not EFFECTS[e.effect].effort_only:
-                    e.doubt(reason)
+                    if reason:
+                        e.doubt(reason)
+                    elif MUTE not in e.reasons:
+                        e.hint(MUTE)
             continue
         refuted.add(joint)
         d.notes += [

@@ -27,6 +27,8 @@ from dexsim.gap.search.search import law_spread, loss_by_run, polished, widened
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
+MUTE = "moments of what was held out are followed neither with it nor without; the others alone speak for it"
+
 
 class JointAnswer:
     """A searched joint on what was held out.
@@ -69,12 +71,21 @@ class JointAnswer:
     @property
     def numbers(self) -> dict[str, float]:
         """Errors for the page."""
+        told_before, told_after = self.told
         return {
             "before": rms(self.before),
             "after": rms(self.after),
             "sigma": self.case.sigma,
             "fitted": self._followed,
+            "told_before": told_before,
+            "told_after": told_after,
         }
+
+    @property
+    def told(self) -> tuple[float, float]:
+        """Errors before and after (rms) where what was held out can speak of what was found (`held_out.telling`)."""
+        on = held_out.telling(self.before, self.after, self.t, self.case.sigma)
+        return rms(self.before[on]), rms(self.after[on])
 
     @property
     def shown(self) -> np.ndarray:
@@ -169,6 +180,12 @@ class JointAnswer:
         else:
             was, left = rms(lost), rms(self.after)
         evidence = self._judged(mm, trial, raw, was, left, gain[0])
+        on = held_out.telling(lost, self.after, self.t, self.case.sigma)
+        if not effort_only and not on.all():  # what the other moments say of it, as a hint
+            part = held_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
+            other = self._judged(mm, trial, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
+            other.hint(MUTE)
+            evidence = max(other, evidence, key=lambda e: e.confidence)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.level][:2]

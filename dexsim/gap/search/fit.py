@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
+PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 ROUNDS, GUESSES = 2, 20  # of what is tried about a fit, and guesses of each
 LOOK = 2  # steps of a fit after which it may be given up
@@ -292,6 +293,22 @@ class Fitter:
             f = self.fit(params, x0=moved[best], iterations=4, tolerance=5e-3, slopes=slopes_of(f))
         return f
 
+    def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
+        """Return [H, P] guesses about x [P]: each effect's parameter scaled, each belief moved, one at a time."""
+        out = []
+        for i, p in enumerate(params):
+            zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
+            moves = (
+                [0.1 * p.span, -0.1 * p.span, 0.03 * p.span, -0.03 * p.span]
+                if p.nuisance
+                else [(f - 1) * (x[i] - zero) for f in PATTERN]
+            )
+            for d in moves:
+                g = x.copy()
+                g[i] += d
+                out.append(g)
+        return np.array(out)
+
     def _score(self, box: Box, x: np.ndarray, res: np.ndarray) -> np.ndarray:
         """Return loss and disbelief at x [.., P], where res [.., m] is left."""
         return self.loss(res) + ((x - box.centre) ** 2 @ box.prior) / res.shape[-1]
@@ -380,7 +397,15 @@ class Fitter:
                     fresh = False
                     it += 1
                     continue
-                done, fresh = True, False
+                # a kinked loss has no slope to follow: try sizes outright
+                trial = np.clip(self.pattern(params, x), low, high)
+                tried = self._tried(box, params, trial, s)
+                best = int(np.argmin(tried))
+                if not tried[best] < loss * (1 - tolerance):
+                    done, fresh = True, False
+                    continue
+                x, damping, fresh, moved = trial[best], 1e-2, True, None
+                it += 1
                 continue
             moved, last = (trial[best] - x) / span, res
             x, damping, fresh = trial[best], max(lambdas[best] * 0.3, 1e-6), True

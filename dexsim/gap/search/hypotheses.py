@@ -15,7 +15,7 @@ from dexsim.gap.effects.catalogue import CATALOGUE, compatible
 from dexsim.gap.effects.friction import give
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
-from dexsim.gap.plant.columns import Param, Scales
+from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read import BLOCK
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, Fitter, Residuals, disbelief, slopes_of
@@ -272,7 +272,8 @@ EXTREMES = (
     "position error",
 )  # regime variables whose largest values are never thinned out
 EXTREME, OF_RUN = 12, 3  # windows that are kept for their extremes, and of one recording
-MAYBE = ("limit_speed", "motor_share")  # of which nothing is likelier: what may be so or otherwise in a drive
+PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
+MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
 
 class JointSearch:
@@ -328,11 +329,13 @@ class JointSearch:
             ]
         self.blocks = self._blocks(self.fitter, self.long)
         # what it finds as it goes: losses by block without any effect; the best fit by effects; the first of an
-        # effect's laws, by effect and label; what each effect costs when dropped, by condition; by effect the
-        # hypothesis by every law that it may have
+        # effect's laws, by effect and label; what a scan's guesses save in hindsight, and other starts; what each
+        # effect costs when dropped, by condition; by effect the hypothesis by every law that it may have
         self.none_loss = np.zeros(0)
         self.fitted: dict[frozenset[str], Trial] = {}
         self.first_laws: dict[tuple[str, str], Variant] = {}
+        self.saved: list[tuple[float, Member, np.ndarray]] = []
+        self.other_start: dict[str, np.ndarray] = {}
         self.costs: dict[str, list[float]] = {}
         self.by_law: dict[str, list[Trial]] = {}
         # made once: by the trial's id, which is kept so that it stays its own, its polished fit and errors of free runs
@@ -456,13 +459,34 @@ class JointSearch:
     ) -> Trial:
         """Return the draft refitted on long windows. quick: fewer steps, and beliefs are not drawn back to their
         prior."""
-        params, x, slopes = short.params, short.x, slopes_of(like.fit) if like is not None else None
+        added, at = self._newly_identifiable(members, short)
+        params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
+        x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
         fitter = self.fitter.given(members)
         a = fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
         if like is not None and not quick and a.loss > like.fit.loss:
             b = fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
             a = b if b.loss < a.loss else a
         return Trial(members, a)
+
+    def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
+        """Return beliefs that left no trace without any effect and leave one with these, and what is believed of them
+        [n]: a drive that turns out to be slow may reach a limit that nothing was known of. Without them a hypothesis
+        that imitates another by such a belief would be the only one that may."""
+        taken = {c for p in short.params for c in p.columns}
+        without_trace = [p for p in self.all_nuisances if not taken & set(p.columns)]
+        if not without_trace:
+            return [], np.zeros(0)
+        base = self.case.plant.base()[0]
+        at = np.array([{"factor": 1.0, "add": 0.0}.get(p.mode, base[INDEX[p.columns[0]]]) for p in without_trace])
+        params, n = [*short.params, *without_trace], len(short.params)
+        x = np.repeat(np.concatenate([short.x, at])[None], len(without_trace) + 1, 0)
+        for i, p in enumerate(without_trace):
+            x[i + 1, n + i] += PROBE * p.span * (1.0 if at[i] < 0.5 * (p.low + p.high) else -1.0)
+        r = self.scan_fitter.given(members).residuals(params, x)
+        trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / PROBE
+        awake = trace > BELIEF.trace
+        return [p for p, on in zip(without_trace, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:
         """Return the trial fitted again from perturbed starts, and with its beliefs drawn back to their prior."""
