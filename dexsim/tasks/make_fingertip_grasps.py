@@ -200,7 +200,7 @@ def generate(
     pads = Pads(hand_of(cfg), rng)
     first = candidates(worlds, sizes, pads, rng)
     # physics and drives alone: nothing is observed, and nothing paid (the fingertip task has a reward more)
-    cfg = {**cfg, "task": {**cfg["task"], "perception": "imu", "rewards": {}}}
+    cfg = {**cfg, "task": {**cfg["task"], "perception": "imu", "observations": {}, "rewards": {}}}
     env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=first[0])
     found: list[GraspSet] = []
     total = tried = 0
