@@ -183,7 +183,7 @@ def test_a_linkage_with_a_joint_further_off_is_found(ratio):
     drives.w = SimpleNamespace(settings=settings, limit=TimeLimit(None), progress=None)
     drives.cases, drives.unknown_controllers = several(ratio), set()
     drives.parts, drives.fold_groups = SimpleNamespace(train=[0, 1, 2], span_train=None), [0, 1, 2]
-    drives._left = 1
+    drives._left, drives.late = 1, {}
     search = drives._begun(0, lambda _: None)
     assert isinstance(search, JointSearch)
     first = search_joint(search)
