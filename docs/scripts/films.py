@@ -150,7 +150,8 @@ def still(film: Path, frame: int, path: Path) -> None:
     width, height = next(reader)["size"]
     for k, data in enumerate(reader):
         if k == frame:
-            Image.fromarray(np.frombuffer(data, np.uint8).reshape(height, width, 3)).save(path, optimize=True)
+            picture = Image.fromarray(np.frombuffer(data, np.uint8).reshape(height, width, 3))
+            picture.quantize(256).save(path, optimize=True)
             return
 
 
