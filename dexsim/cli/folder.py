@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,18 @@ def _claim(folder: Path, setting: str) -> Path:
     except OSError as error:
         raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
     return folder
+
+
+@contextlib.contextmanager
+def kept_if_begun(folder: Path) -> Iterator[None]:
+    """Leave nothing of a run that is refused before it has begun: the same out= may be typed again."""
+    try:
+        yield
+    except UserError:
+        (folder / CONFIG).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+        raise
 
 
 def tidy(folders: Iterable[Path]) -> None:

@@ -61,7 +61,7 @@ def _run(
         folder.write_config(where, cfg)
     ranks.on_loss("")
     facts = {"run": where} if ranks.size == 1 else {"ranks": f"{ranks.size}, {cfg['worlds']} worlds each", "run": where}
-    with ranks.one_compiles():
+    with ranks.one_compiles(), folder.kept_if_begun(where):
         env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts, start.given)
     open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
