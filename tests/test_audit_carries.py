@@ -257,6 +257,7 @@ def test_the_xhands_recording_needs_no_model(tmp_path, capsys):
     main([str(path)])
     said = capsys.readouterr().out
     assert f"next: dexsim diagnose recordings={path} out=out/diagnosis" in said
+    assert "stamped late alike in all files" in said
 
 
 def test_the_true_rate_of_each_signal_is_said(tmp_path, capsys):

@@ -390,6 +390,7 @@ def main(argv: Sequence[str]) -> int:
             print(f"{own['out']}: model.xml, servo.yaml to begin with, of guesses: put in what you know\n")
         missing = [] if xhand else [k for k in ("model", "servo") if not own.get(k)]
         asked = own | {k: {"model": "MODEL.xml", "servo": "SERVO.yaml"}[k] for k in missing}
+        print("commands stamped late alike in all files look like a drive that leads: only a fit, `diagnose`, tells")
         print(f"next: {next_command(given, asked, options)}")
         if missing:
             print(f"  ({' and '.join(missing)} of the machine; out=FOLDER writes what is missing, to begin with)")
