@@ -593,22 +593,6 @@ def test_saved_state_continues_bitwise():
     np.testing.assert_array_equal(run(engine, servo, 0.05), first)
 
 
-def test_rotor_and_link_encoders():
-    """Driving a rotor joint while the loop's encoder sits on the link joint: index arrays, not the driven joint."""
-    engine = StubEngine(1, 2, wp.float64)
-    table = ServoTable.from_dict({"joints": {"j0": {"kp": 2.0, "kd": 0.1}}})
-    servo = Servo(engine, ["j0"], table, loop=["j1"], reported=["j1"])
-    engine.t.qpos[:, 7:] = torch.tensor([0.3, 0.1], dtype=torch.float64)
-    engine.t.qvel[:, 6:] = torch.tensor([5.0, 1.0], dtype=torch.float64)
-    servo.before_each()
-    assert servo.torque[0, 0].item() == pytest.approx(-2.0 * 0.1 - 0.1 * 1.0)
-    damping = 0.1 + 2.0 * 0.005
-    net = engine.t.qfrc_applied[0, 6].item() - damping * 5.0  # at the present rotor speed
-    assert net == pytest.approx(-2.0 * (0.1 + 0.005 * 1.0) - 0.1 * 1.0)
-    assert engine.t.qfrc_applied[0, 7].item() == 0.0
-    assert servo.position()[0, 0].item() == pytest.approx(0.1)
-
-
 def test_queue_outlasts_the_longest_delay():
     engine = StubEngine(1, 1, wp.float64)
     table = ServoTable.from_dict({"joints": {"j0": {"kp": 1.0, "delay": [0.0, 0.1]}}})
@@ -621,7 +605,7 @@ def test_wrong_names_are_answered():
     with pytest.raises(UserError, match="'j00'.*Did you mean 'j0'.*j0, j1"):
         Servo(engine, ["j00"], table)
     with pytest.raises(UserError, match="driven twice"):
-        Servo(engine, ["j0", "j1"], table, driven=["j0", "j0"])
+        Servo(engine, ["j0", "j0"], table)
     with pytest.raises(UserError, match="Did you mean 'deadband'"):
         column("dead_band")
 

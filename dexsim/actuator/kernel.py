@@ -124,8 +124,6 @@ def drives(real: type) -> Any:
         # addresses, [J]
         dof: wp.array(dtype=int)
         dof_q: wp.array(dtype=int)
-        loop_q: wp.array(dtype=int)
-        loop_dof: wp.array(dtype=int)
         loop_motor: wp.array(dtype=int)  # the loop's encoder is on the rotor
         # what is believed, [N, J, C] and [N, J]
         params: wp.array3d(dtype=real)
@@ -276,8 +274,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     @wp.func
     def sense(dt: real, fresh: bool, r: Rotor, memory: Memory, d: Drives, w: int, j: int):
         """Return (what the loop's encoder shows, memory)."""
-        turned = d.qpos[w, d.loop_q[j]]
-        turning = d.qvel[w, d.loop_dof[j]]
+        turned = d.qpos[w, d.dof_q[j]]
+        turning = d.qvel[w, d.dof[j]]
         if wp.static(play):
             if r.on_loop:
                 turned = r.q

@@ -49,11 +49,8 @@ class Servo:
         joints: names of the joints, in the order of every [N, J] array here.
         table: what is believed of the drives; written to every world.
         control_period: shortest time between targets [s], so that the queue outlasts the longest delay (else 8).
-        driven, loop, reported: names of the joints that the motor drives, that the loop's encoder reads and that
-            `position()` reports, where a mechanism has separate rotor joints; default `joints`.
         varied: names of the columns that will be given values other than the table's (by randomization, say): what of
-        the
-            kernel is left out where no drive needs it (`columns.FEATURES`) follows from the table and from these.
+            the kernel is left out where no drive needs it (`columns.FEATURES`) follows from the table and from these.
 
     Where the table states play or elasticity (`backlash`, `softness`), a rotor of its own is simulated, and the table's
     `loop_encoder` and `position_encoder` say on which side of it the encoders are.
@@ -75,7 +72,6 @@ class Servo:
 
     def __init__(
         self, engine: Any, joints: Sequence[str], table: ServoTable, *, control_period: float | None = None,
-        driven: Sequence[str] | None = None, loop: Sequence[str] | None = None, reported: Sequence[str] | None = None,
         varied: Sequence[str] = (),
     ):  # fmt: skip
         self.engine = engine
@@ -84,11 +80,9 @@ class Servo:
         mjm, n, device, real = engine.mjm, engine.n, engine.device, engine.real
         known = [name for name in (mjm.joint(i).name for i in range(mjm.njnt)) if name]
         table.check_joints([*known, *self.joints])
-        dof_q, dof = _addresses(mjm, driven or joints, known, len(self.joints))
-        loop_q, loop_dof = _addresses(mjm, loop or joints, known, len(self.joints))
-        reported_q, reported_dof = _addresses(mjm, reported or joints, known, len(self.joints))
+        dof_q, dof = _addresses(mjm, self.joints, known)
         if len(set(dof)) != len(dof):
-            raise UserError(f"servo: a joint is driven twice in {list(driven or joints)}; each joint has one drive.")
+            raise UserError(f"servo: a joint is driven twice in {list(joints)}; each joint has one drive.")
 
         nominal = table.nominal(self.joints)
         _check_drags(table, self.joints, nominal)
@@ -122,7 +116,7 @@ class Servo:
         self._base_armature, self._home, self._given = zeros(n, j), zeros(n, j), zeros(n)
         self._target, self._stamp = zeros(n, j), zeros(n)
         self._mask = wp.zeros(n, dtype=wp.bool, device=device)
-        self._dof, self._dof_q, self._loop_q, self._loop_dof = index(dof), index(dof_q), index(loop_q), index(loop_dof)
+        self._dof, self._dof_q = index(dof), index(dof_q)
 
         self.params, self.state, self.torque = (wp.to_torch(a) for a in (self._params, self._state, self._torque))
         self._by_name = {name: self.params[:, :, i] for name, i in INDEX.items()}  # views
@@ -132,8 +126,7 @@ class Servo:
         self._target_t, self._stamp_t, self._mask_t = (wp.to_torch(a) for a in (self._target, self._stamp, self._mask))
         as_tensor = lambda x: torch.as_tensor(x, dtype=self.params.dtype, device=self.params.device)  # noqa: E731
         self._as_tensor = as_tensor
-        self.reported_q = torch.as_tensor(reported_q, device=self.params.device)  # [J] in qpos
-        self._reported_dof = torch.as_tensor(reported_dof, device=self.params.device)
+        self.qpos, self._qvel = (torch.as_tensor(x, device=self.params.device) for x in (dof_q, dof))  # [J] addresses
 
         self.nominal = as_tensor(nominal)
         self.params[:] = self.nominal
@@ -143,15 +136,9 @@ class Servo:
         self.base_frictionloss[:] = as_tensor(mjm.dof_frictionloss[dof])
         self.base_armature[:] = as_tensor(mjm.dof_armature[dof])
         self.home[:] = as_tensor(mjm.qpos0[dof_q])
-        rotor_inside = driven is None and loop is None
-        sides = {
-            which: [rotor_inside and side == "motor" for side in table.encoder(which, self.joints)]
-            for which in ("loop", "position")
-        }
-        self._loop_motor = index([int(x) for x in sides["loop"]])
-        self._position_motor = (
-            torch.as_tensor(sides["position"], device=self.params.device) if any(sides["position"]) else None
-        )
+        on_loop, on_position = ([x == "motor" for x in table.encoder(at, self.joints)] for at in ("loop", "position"))
+        self._loop_motor = index([int(x) for x in on_loop])
+        self._position_motor = torch.as_tensor(on_position, device=self.params.device) if any(on_position) else None
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
@@ -167,7 +154,7 @@ class Servo:
         self._drives = drives(real)()
         own = (
             "params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home",
-            "given", "dof", "dof_q", "loop_q", "loop_dof", "loop_motor",
+            "given", "dof", "dof_q", "loop_motor",
         )  # fmt: skip
         for name in own:
             setattr(self._drives, name, getattr(self, f"_{name}"))
@@ -175,7 +162,7 @@ class Servo:
             setattr(self._drives, name, getattr(self._wp, name))
         for name, field in self._fields.items():
             setattr(self._drives, name, field)
-        self.reset(None, as_tensor(mjm.qpos0[loop_q]).expand(n, j))
+        self.reset(None, as_tensor(mjm.qpos0[dof_q]).expand(n, j))
 
     # -- parameters ------------------------------------------------------------
 
@@ -240,7 +227,7 @@ class Servo:
     # -- what an observer reads ------------------------------------------------------------
 
     def position(self) -> torch.Tensor:
-        """Return [N, J] position that the encoders report: scale * position + offset of the reported joints [rad]."""
+        """Return [N, J] position that the encoders report: scale * position + offset of the joints [rad]."""
         return self.measured(self._turned()[0])
 
     def velocity(self) -> torch.Tensor:
@@ -276,7 +263,7 @@ class Servo:
     def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return ([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors
         before a play."""
-        q, v = self.engine.t.qpos[:, self.reported_q], self.engine.t.qvel[:, self._reported_dof]
+        q, v = self.engine.t.qpos[:, self.qpos], self.engine.t.qvel[:, self._qvel]
         here = self._position_motor
         if here is None or not self.at_rotor:
             return q, v
@@ -335,13 +322,9 @@ def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
     ]
 
 
-def _addresses(
-    mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int
-) -> tuple[list[int], list[int]]:
+def _addresses(mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str]) -> tuple[list[int], list[int]]:
     """Return the qpos and dof addresses of the named joints; UserError for an unknown name or a joint not a hinge or
     slide."""
-    if len(names) != count:
-        raise UserError(f"servo: {len(names)} joints given where {count} are driven: {list(names)}.")
     qpos, dof = [], []
     for name in names:
         if name not in known:

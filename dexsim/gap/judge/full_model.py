@@ -523,7 +523,7 @@ def _stepped(
                 for x, y in zip(memory, before, strict=True):
                     x[...] = y
         if turned is not None:
-            seen = servo.measured(turned[:, :, servo.reported_q])
+            seen = servo.measured(turned[:, :, servo.qpos])
     else:  # a step is a graph of launches
         for k in range(steps):
             if not k % TOLD:
