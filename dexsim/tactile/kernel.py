@@ -39,6 +39,8 @@ HAND_WIDTH = 8
 """Lanes that ask whether a group of pads in a world touches the hand itself, which a warp then measures."""
 MAX_UNROLL = 16
 """Rounds of taxels, one a lane, whose distances are kept in registers; more go through a thread's memory."""
+REGISTERS = 64
+"""Most registers of a thread on CUDA: 1 to 2 % faster on an H200 than 80, so than as many as the compiler likes."""
 CHUNK = 4
 """Rounds of taxels that are measured at a time: all their loads are under way before the first is used."""
 LINEAR = 0
@@ -119,7 +121,6 @@ class Surroundings:
     shape_size: wp.array2d(dtype=wp.vec3)  # [N, O] m, of grids the scale first
     pair_column: wp.array2d(dtype=int)  # [G, O] the pair of a group and an object
     link_body: wp.array(dtype=int)  # [L] bodies of the hand whose surfaces pads may touch
-    tip_column: wp.array2d(dtype=int)  # [G, L] the pair of a group and such a body; -1: not declared
     self_column: wp.array(dtype=int)  # [G] the pair of a group's body and the rest of the hand
 
 
@@ -244,15 +245,6 @@ def centre_of(pads: Pads, f: int, total: wp.vec4):
 
 
 @wp.func
-def may_meet(g: int, j: int, here: Surroundings, groups: Groups, w: int):
-    """Return whether group g may touch link j: another body, and pressed where the physics says so."""
-    near = here.link_body[j] != groups.body[g]
-    if near and here.tip_column[g, j] >= 0:
-        near = here.pair_normal[w, here.tip_column[g, j]] > 0.0
-    return near
-
-
-@wp.func
 def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j: int):
     """Return a distance [m] below which no taxel of group g is to link j; far where that is the group's own body. A
     millimetre is for coarse grids."""
@@ -268,7 +260,7 @@ def link_gap(here: Surroundings, groups: Groups, tips: Shapes, w: int, g: int, j
 def touch_kernel(
     lanes: bool, solver: bool, raw: bool, others: bool, *, law: str = "hertz", pads: int = 5, groups: int = 5,
     taxels: int = 120, rounds: int = 4, objects: int = 1, feel_others: bool = False, links: int = 5,
-    selves: bool = False, most: int = 1, units: int = 5, unit_rounds: int = 4, registers: int = 0,
+    selves: bool = False, most: int = 1, units: int = 5, unit_rounds: int = 4,
 ) -> wp.Kernel:  # fmt: skip
     """Return the kernel for one choice of options. Dimensions: serial [N, G]; lanes: see `spans`.
 
@@ -276,7 +268,7 @@ def touch_kernel(
     the hand's own links as well; feel_others: and write them into the taxels' forces; selves: their force too is the
     solver's, spread. pads, groups, taxels, rounds, most: the layout's sizes F, G, T and R (a multiple of `CHUNK`, or
     less than it), and the most pads of a group. units, unit_rounds: U, and the most rounds of one. objects: in each
-    world. links: L. registers: CUDA, at most so many a thread (0: as the compiler likes).
+    world. links: L.
     """
     kind = LAWS[law]
     if not lanes:
@@ -298,7 +290,7 @@ def touch_kernel(
     # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
     options = {"fast_math": lanes, "max_unroll": MAX_UNROLL if rounds <= MAX_UNROLL else CHUNK}
     return wp.kernel(
-        kernel, enable_backward=False, module="unique", grid_stride=False, cuda_max_registers=registers or None,
+        kernel, enable_backward=False, module="unique", grid_stride=False, cuda_max_registers=REGISTERS,
         module_options=options,
     )  # fmt: skip
 
@@ -427,23 +419,22 @@ def _serial(solver: bool, raw: bool, others: bool, kind: int, feel_others: bool,
                             out.readings[w, f, t] = out.readings[w, f, t] + c
         elif wp.static(others):
             for j in range(here.link_body.shape[0]):
-                if may_meet(g, j, here, groups, w):
+                if link_gap(here, groups, tips, w, g, j) < 0.0:
                     a = turn_in(here.xmat, w, body, here.link_body[j])
                     b = pose_in(here.xpos, here.xmat, w, body, here.link_body[j])
-                    if link_gap(here, groups, tips, w, g, j) < 0.0:
-                        for i in range(first, end):
-                            f = groups.pads[i]
-                            stiff = law.scale[w] * law.stiffness[f]
-                            for t in range(pads.count[f]):
-                                p = pads.taxel[f, t]
-                                q = a * xyz(p) + b
-                                if in_box(q, tips.middle[j], tips.half[j]):
-                                    d = sd_grid(tips, j, 1.0, q)
-                                    if d < 0.0:
-                                        c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
-                                        out.force_other[w, f] = out.force_other[w, f] + c
-                                        if wp.static(raw and feel_others):
-                                            out.readings[w, f, t] = out.readings[w, f, t] + c
+                    for i in range(first, end):
+                        f = groups.pads[i]
+                        stiff = law.scale[w] * law.stiffness[f]
+                        for t in range(pads.count[f]):
+                            p = pads.taxel[f, t]
+                            q = a * xyz(p) + b
+                            if in_box(q, tips.middle[j], tips.half[j]):
+                                d = sd_grid(tips, j, 1.0, q)
+                                if d < 0.0:
+                                    c = taxel_force(wp.static(kind), law, stiff, -d, p[3], law.threshold[w])
+                                    out.force_other[w, f] = out.force_other[w, f] + c
+                                    if wp.static(raw and feel_others):
+                                        out.readings[w, f, t] = out.readings[w, f, t] + c
 
     return serial
 
@@ -693,9 +684,7 @@ def _of_hand(
                 if wp.static(selves):
                     busy = here.pair_normal[w, here.self_column[g]] > 0.0
                 else:
-                    busy = may_meet(g, first + k, here, groups, w)
-                    if busy:
-                        busy = link_gap(here, groups, tips, w, g, first + k) < 0.0
+                    busy = link_gap(here, groups, tips, w, g, first + k) < 0.0
             these = lane_ballot(busy)
             while these != 0:
                 bit = lowest_bit(these)

@@ -35,8 +35,6 @@ from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 BLOCK_DIM = 128
 """Threads a block of the touch kernels on CUDA: 4 warps."""
-REGISTERS = 64
-"""Most registers of its threads: 1 to 2 % faster on an H200 than 80, so than as many as the compiler likes."""
 
 
 class Posed(Protocol):
@@ -60,13 +58,11 @@ class Tactile:
     pairs: for sum=solver, name of the engine's contact pair (pad, object) of each pad, [F] (or [F][O] for O objects).
     tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
     other pads feel (others=true); pads beyond them lie where they are.
-    other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
     Pads of one body whose pairs have one name share its force, whole.
     links: in place of the tips, (body, points [V, 3] m of its surface) of all that pads may feel of the hand itself;
     selves: with sum=solver, name of the contact pair of each pad's body and the rest of the hand [F]: what pads on one
     body feel of the hand is then this force, spread by the distance to the nearest link.
-    lanes: a warp for each pad, or pads that share a force (default: on CUDA), else a thread; block_dim, registers:
-    threads of its blocks and most registers of a thread (0: free), for CUDA only.
+    lanes: a warp for each pad, or pads that share a force (default: on CUDA), else a thread.
 
     Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform
     scale first for grids); with O objects [N, O], [N, O, 3].
@@ -78,16 +74,15 @@ class Tactile:
     def __init__(
         self, engine: Posed, layout: TaxelLayout, shapes: ShapeSet, object_body: str | Sequence[str],
         cfg: Mapping | TactileConfig | None = None, *, pairs: Sequence | None = None,
-        tips: Sequence[np.ndarray] | None = None, other_pairs: Sequence[Sequence[str]] | None = None,
-        links: Sequence[tuple[str, np.ndarray]] | None = None, selves: Sequence[str] | None = None, seed: int = 0,
-        lanes: bool | None = None, registers: int = REGISTERS, block_dim: int = BLOCK_DIM,
+        tips: Sequence[np.ndarray] | None = None, links: Sequence[tuple[str, np.ndarray]] | None = None,
+        selves: Sequence[str] | None = None, seed: int = 0, lanes: bool | None = None,
     ):  # fmt: skip
         self.cfg = cfg = tactile_config(cfg)
         self.engine, self.layout, self.shapes = engine, layout, shapes
         self.device, n, f, t = engine.device, engine.n, layout.pads, layout.taxels
         bodies = [object_body] if isinstance(object_body, str) else list(object_body)
         o = len(bodies)
-        self.block_dim = block_dim if self.device != "cpu" else LANES
+        self.block_dim = BLOCK_DIM if self.device != "cpu" else LANES
         if links is None and tips is not None:
             links = list(zip(layout.bodies, tips, strict=True))
         near = links if cfg.others and links is not None and f > 1 else []
@@ -106,13 +101,7 @@ class Tactile:
                 columns[i] = [engine.pair(name) for name in names]
         selves = selves if solver and others else None
         self_columns = np.array([engine.pair(name) for name in selves] if selves else [-1] * f, dtype=np.int32)
-        tip_columns = np.full((f, max(f, len(near))), -1, dtype=np.int32)
-        if other_pairs is not None:
-            for i in range(f):
-                for j in range(f):
-                    if i != j and other_pairs[i][j]:
-                        tip_columns[i, j] = engine.pair(other_pairs[i][j])
-        pressed = zip(layout.bodies, columns.tolist(), tip_columns.tolist(), self_columns.tolist(), strict=True)
+        pressed = zip(layout.bodies, columns.tolist(), self_columns.tolist(), strict=True)
         alike = [str(x) for x in pressed]
         members = [[i for i in range(f) if alike[i] == x] for x in dict.fromkeys(alike)]
         if selves is not None and len(members) > len(set(layout.bodies)):
@@ -139,7 +128,6 @@ class Tactile:
                 shape_size=wp.zeros((n, o), dtype=wp.vec3),
                 pair_column=wp.array(columns[firsts], dtype=int),
                 link_body=wp.array([engine.body(body) for body, _ in near], dtype=int),
-                tip_column=wp.array(tip_columns[firsts], dtype=int),
                 self_column=wp.array(self_columns[firsts], dtype=int),
                 params=wp.zeros((len(COLUMNS), n), dtype=float),
                 force=wp.zeros((n, f), dtype=float),
@@ -166,18 +154,17 @@ class Tactile:
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
         options |= {"links": len(near), "selves": selves is not None, "groups": len(members), "rounds": rounds}
         options |= {"most": max(map(len, members)), "units": len(units), "unit_rounds": max(x.rounds for x in units)}
-        self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
+        self._kernel = touch_kernel(self.lanes, solver, store, others, **options)
         self._hand, self._spans = spans(n, len(members), len(units), others, store and cfg.feel_others)
         kind: Any = FlatFelt if self.lanes else Felt
         self._out = kind()
         for name in kind.vars:
             setattr(self._out, name, getattr(a, name).flatten() if self.lanes else getattr(a, name))
         self._law.scale, self._law.threshold = self._row["stiffness_scale"], self._row["threshold"]
-        contacts = solver or bool((tip_columns >= 0).any())
         self._around = here = Surroundings()
         here.xpos, here.xmat = engine.wp.xpos, engine.wp.xmat
-        here.pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
-        for name in ("object_body", "shape_id", "shape_size", "pair_column", "link_body", "tip_column", "self_column"):
+        here.pair_normal = engine.wp.pair_normal if solver else wp.zeros((1, 1), dtype=float, device=self.device)
+        for name in ("object_body", "shape_id", "shape_size", "pair_column", "link_body", "self_column"):
             setattr(here, name, getattr(a, name))
         assert all(x.is_contiguous for x in (here.xpos, here.xmat, here.pair_normal))  # kernels count on it
         if measured:
