@@ -168,7 +168,7 @@ class GraspEnv(Launches):
 
     # -- what is seen: table "Observation for force-adaptive grasping"; noise is that of `sensors`, by one kernel
     def sense(self, fresh: torch.Tensor) -> None:
-        self.launch_sense(True)
+        self.launch_sense()
         self.vz_seen = observations.height_speed(self.sensed.seen, self.z_seen, self.dt)
         self.z_seen = self.sensed.seen
 

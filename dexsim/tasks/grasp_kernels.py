@@ -242,13 +242,12 @@ class Sensed:
 
 @wp.kernel(enable_backward=False)
 def sense(
-    advance: bool,  # a control step has passed: the camera's pictures move on
     noise: Noise,
     t: Truth,
     # in and out
     s: Sensed,
 ):
-    """Sense each world by encoders, currents and a camera: noisy; the height late too."""
+    """Sense each world by encoders, currents and a camera, a control step later: noisy; the height late too."""
     w, k = wp.tid()
     joints = t.q.shape[1]
     if k < joints:
@@ -261,9 +260,8 @@ def sense(
         off = wp.vec3(noise.tip[w, 3 * f], noise.tip[w, 3 * f + 1], noise.tip[w, 3 * f + 2])
         s.tip[w, f] = t.tips[w, f] + noise.tip_size * off
         return
-    if advance:
-        for i in range(s.z_history.shape[1] - 1):
-            at = s.z_history.shape[1] - 1 - i
-            s.z_history[w, at] = s.z_history[w, at - 1]
-        s.z_history[w, 0] = t.z[w, 0]
-        s.seen[w] = s.z_history[w, int(t.z_delay[w])] + noise.height_size * noise.height[w]
+    for i in range(s.z_history.shape[1] - 1):
+        at = s.z_history.shape[1] - 1 - i
+        s.z_history[w, at] = s.z_history[w, at - 1]
+    s.z_history[w, 0] = t.z[w, 0]
+    s.seen[w] = s.z_history[w, int(t.z_delay[w])] + noise.height_size * noise.height[w]

@@ -137,16 +137,15 @@ class Launches(Task):
         args = (*self._draw_orders(), o.mass, self.outside_force, self._orders, self._xfrc)
         self._launch(kernel, self.num_envs, self.dt, self.pushes, o.body, *args)
 
-    def launch_sense(self, advance: bool) -> None:
-        """Read encoders, currents and the camera, with noise, into `sensed`; without a step no picture is taken."""
+    def launch_sense(self) -> None:
+        """Read encoders, currents and the camera, a control step later, with noise, into `sensed`."""
         s, size, J, F = self.sampler, self.task["sensors"], self.num_actions, self.fingers
-        height = s.normal() if advance else self.z_seen
         noise = filled(
             kernels.Noise, joint_size=size["joint_noise"], torque_size=size["torque_noise"], tip_size=size["tip_noise"],
-            height_size=size["vision_z_noise"], joint=s.normal(J), torque=s.normal(J), tip=s.normal(3 * F),
-            height=height,
+            height_size=size["vision_z_noise"], height=s.normal(), joint=s.normal(J), torque=s.normal(J),
+            tip=s.normal(3 * F),
         )  # fmt: skip
-        self._launch(kernels.sense, (self.num_envs, J + F + 1), advance, noise, self._truth, self._readings)
+        self._launch(kernels.sense, (self.num_envs, J + F + 1), noise, self._truth, self._readings)
 
     def launch_rewards(self) -> dict[str, torch.Tensor]:
         """Return terms by name, weighted [N]; write what the log shows into `measured`."""
