@@ -70,9 +70,9 @@ def played(
 def squeeze(path: Path, most: int = 1_000_000) -> None:
     """Encode a film again, smaller, until it has at most so many bytes."""
     ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    for crf in range(24, 46, 3):
+    for crf in range(32, 46, 3):
         part = path.with_suffix(".part.mp4")
-        how = f"-c:v libx264 -preset slow -crf {crf} -pix_fmt yuv420p -movflags +faststart"
+        how = f"-c:v libx264 -preset medium -tune animation -crf {crf} -pix_fmt yuv420p -movflags +faststart"
         command = [ffmpeg, "-y", "-loglevel", "error", "-i", str(path), *how.split(), str(part)]
         subprocess.run(command, check=True)
         if part.stat().st_size <= most:
