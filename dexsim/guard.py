@@ -119,7 +119,11 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
         if now - begun > wall:
             return f"takes more than {wall:.0f} s to read"
     try:
-        return pickle.loads(receive.recv_bytes())
+        arrays = [bytearray(size) for size in pickle.loads(receive.recv_bytes())]
+        answer = receive.recv_bytes()
+        for part in arrays:
+            receive.recv_bytes_into(part)
+        return pickle.loads(answer, buffers=arrays)
     except EOFError:
         return ""
     except ValueError:  # MuJoCo writes a model cut off where it is given no more memory
@@ -147,8 +151,10 @@ def _child(
         sys.modules["torch"].set_num_threads(1)  # the threads of before the fork are not there
     sys.addaudithook(_opened)
     answer: Any
+    arrays: list[pickle.PickleBuffer] = []  # sent as they lie: a copy of all would be half of the memory
     try:
-        answer = pickle.dumps((function(*args) if wanted else function(*args) and None,), 5)
+        answer = pickle.dumps((function(*args) if wanted else function(*args) and None,), 5,
+                              buffer_callback=arrays.append)  # fmt: skip
     except BaseException as error:  # a reader of a stranger's file raises whatever it likes
         text = " ".join(str(error).split())[:200]
         full = isinstance(error, MemoryError) or FULL.search(text) is not None
@@ -158,7 +164,10 @@ def _child(
             else "is nested too deeply to be read" if isinstance(error, RecursionError)
             else f"cannot be read ({type(error).__name__}{': ' * bool(text)}{text})"
         )  # fmt: skip
-    send.send_bytes(answer)
+        arrays.clear()
+    parts = [array.raw() for array in arrays]
+    for part in (pickle.dumps([part.nbytes for part in parts]), answer, *parts):
+        send.send_bytes(part)
     os._exit(0)
 
 

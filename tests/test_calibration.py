@@ -321,7 +321,7 @@ def test_gains_are_found_and_tell_held_out_loads_better():
 def pads():
     """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp
     edges."""
-    return simulate.delivered(simulate.rolled_recording(HAND, 160, seed=3, frames=9), 3)
+    return simulate.delivered(simulate.rolled_recording(HAND, 160, seed=3, frames=18), 3)
 
 
 def of_pad(r, f):
@@ -339,6 +339,14 @@ def test_healthy_simulated_pads_have_no_findings(pads):
         assert not p.dead and not p.swapped and len(p.unseen) <= 5, xhand.FINGERS[f]
         assert p.scale == pytest.approx(0.1, rel=0.02) and p.held_out < 0.05 and p.hysteresis < 0.01
         assert taxels.inspect(of_pad(pads, f)[0], None, rows=12).dead == []
+
+
+@pytest.mark.slow
+def test_the_rehearsal_of_the_tutorial_finds_what_it_planted(tmp_path, capsys):
+    """264 s of all taxels: the longest recording that dexsim makes for itself, read within the limits of any file."""
+    assert command.main(["simulate_touch=true", "faults=true", f"out={tmp_path / 'o'}"], CONFIGS) == 0
+    touch = yaml.safe_load((tmp_path / "o" / "calibration.yaml").read_text("utf-8"))["touch"]
+    assert touch["dead"] == {"index": [42, 43, 77]} and touch["swapped"] == {"index": [[30, 66]]}
 
 
 def test_faults_of_a_simulated_pad_are_found(pads):
@@ -509,7 +517,7 @@ def test_another_hand_is_calibrated_from_its_own_presses(tmp_path, capsys):
     slope = content["joints"][joint]["sim"]["slope"]["value"]
     assert slope == pytest.approx(1 / abs(arms[finger.flexion[-1]]), rel=0.15)
     assert Calibration.load(tmp_path / "o" / "calibration.yaml", hand=hand).hand.robot == hand.robot
-    rolled = simulate.delivered(simulate.rolled_recording(hand, 45, seed=1, frames=9), 1)
+    rolled = simulate.delivered(simulate.rolled_recording(hand, 45, seed=1, frames=18), 1)
     write(tmp_path / "rolled.mcap", rolled)
     assert command.main([*arguments[:2], f"touch={tmp_path / 'rolled.mcap'}", f"out={tmp_path / 't'}"], CONFIGS) == 0
     touch = yaml.safe_load((tmp_path / "t" / "calibration.yaml").read_text())["touch"]

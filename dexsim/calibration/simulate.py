@@ -145,7 +145,7 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
         posed.t.pair_normal[:, :F] = torch.as_tensor(force, dtype=torch.float32)
 
     forces = _touched(hand, n, pose_pads)
-    t = np.arange(n) * 2 / RATE
+    t = np.arange(n) / RATE
     load = np.zeros((n, 6))
     load[:, 2] = forces[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
     pose = np.tile(hand.pose("open"), (n, 1))

@@ -92,7 +92,7 @@ def array_reader(channel: Channel, schema: Schema | None, part: str) -> Reader[A
 
         def standard(data: bytes) -> Array:
             m = decode(data)
-            return tuple([d.size for d in m.layout.dim]), m.data.astype(float)
+            return tuple([d.size for d in m.layout.dim]), m.data
 
         return Reader(standard, stacked.array_rows)
 

@@ -135,8 +135,7 @@ def array_rows(messages: Sequence[bytes], one: Array) -> list[Array] | None:
     found = take(messages, partial(at_the_end, count=len(one[1]), kind="<f4"))
     if found is None:
         return None
-    values = found[0].astype(float)
-    return list(zip(repeat(one[0]), values, strict=False)) if _equal(values[0], one[1]) else None
+    return list(zip(repeat(one[0]), found[0], strict=False)) if _equal(found[0][0], one[1]) else None
 
 
 @dataclass(frozen=True)
