@@ -115,6 +115,20 @@ def test_figures_that_no_recording_tells_stay_as_they_are_believed(monkeypatch):
     assert not {"torque_limit", "no_load_speed"} & set(plain.at_bound)
 
 
+def test_a_gain_further_off_than_twice_ends_at_its_bound_and_a_stated_range_lets_it_go_further(monkeypatch):
+    runs = [moved(None, seed=k, kp=10.0, kd=0.16) for k in (0, 1)]
+    plain = baseline.judged(case_of(*runs), baseline.fitted(case_of(*runs), [0]), [1])
+    assert plain.value["kp"] == pytest.approx(6.0, rel=1e-3) and plain.at_bound["kp"] == pytest.approx(2.0, rel=1e-3)
+    (said,) = baseline.stopped(baseline.overall([plain]))
+    assert "ends at its bound in kp (2 x what is believed)" in said and "a range in servo.yaml" in said
+    stated = {"kp": {"value": 3.0, "low": 1.5, "high": 6.0}, "kd": 0.1, "torque_limit": 2.0}
+    monkeypatch.setitem(globals(), "BELIEVED", BELIEVED | {"joints": {"*": stated}})
+    case = case_of(*(replace(r, servo=ServoTable.from_dict(BELIEVED)) for r in runs))
+    wide = baseline.judged(case, baseline.fitted(case, [0]), [1])
+    assert wide.value["kp"] == pytest.approx(10.0, rel=0.1) and "kp" not in wide.at_bound
+    assert wide.error < 0.5 * plain.error
+
+
 def test_the_plain_model_is_written_as_it_was_fitted(fitted):
     _, _, plain = fitted
     servo, spec = ServoTable.from_dict(BELIEVED), mujoco.MjSpec.from_string(PENDULUM)

@@ -121,6 +121,7 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
     if felt.before is None and not felt.findings:
         d.data["reason"] = reason
         conclude.decide(d)
+        d.notes[:0] = w.limit.left_out
         return d
     w.notes.append(f"no joint is judged: {reason}")
     left_out = conclude.not_considered((), felt, w.settings.allowed)

@@ -36,9 +36,7 @@ GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted, beside
 AT_ONCE = 49  # guesses that are simulated together: between them there is a look at the clock
 ITERATIONS = 10  # of the fit from each guess
 WHOLE, FAR = 1200.0, 0.05  # s of recordings that are run whole; rad (m) from which an error there counts linearly
-# x what is believed: a figure, or its stated range, may be off by as much; a gain that nobody has measured, or guessed
-# from a datasheet, by more: twice and half of it cost a quarter on a robot's legs
-WIDER, GAIN, DAMPING = 2.0, (0.2, 5.0), 20.0
+WIDER = 2.0  # x what is believed, a figure or the ends of its stated range: so far it may be off
 LATEST, SLOWEST = 0.08, 0.05  # s: delay, lag
 MOST_INERTIA, LEAST_INERTIA = 5.0, -0.5  # x the model's about the joint, that is added
 OFFSET = 1.0  # of a joint's typical torque
@@ -61,8 +59,8 @@ class Baseline:
     """Of one joint. value: figures that were fitted, in their units, servo columns but for `inertia` (added) and
     `offset` (a constant torque); factor: of columns in which the recordings differ, on what each states; error_before,
     error: rms of a free run over what was held out [rad or m] with what is believed and with them; squares [n]: those
-    errors squared; at_bound: figures that stopped there; beside: columns of which the servo's file says nothing, as
-    they were when it was judged, where the file's default is another."""
+    errors squared; at_bound: figures that stopped there, x what is believed (None: not tied to it); beside: columns of
+    which the servo's file says nothing, as they were when it was judged, where the file's default is another."""
 
     joint: str
     value: dict[str, float]
@@ -71,7 +69,7 @@ class Baseline:
     squares_before: np.ndarray = field(repr=False)
     squares: np.ndarray = field(repr=False)
     slide: bool = False
-    at_bound: tuple[str, ...] = ()
+    at_bound: dict[str, float | None] = field(default_factory=dict)
     beside: dict[str, float] = field(default_factory=dict)
     factor: dict[str, float] = field(default_factory=dict)
 
@@ -86,7 +84,7 @@ class Baseline:
             "error_before": self.error_before,
             "error": self.error,
             "parameters": {n: {"value": x, "unit": unit(n)} for n, x in self.value.items()},
-            "at_bound": list(self.at_bound),
+            "at_bound": self.at_bound,
         }
 
 
@@ -95,11 +93,11 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
     to what drives it."""
     s, out = case.scales, []
 
-    def factor(name: str, wide: tuple[float, float] = (1 / WIDER, WIDER)) -> None:
+    def factor(name: str) -> None:
         value = s.nominal[name]
         if 0 < value < 1e8:
             low, high = case.ranges.get(name, (0.0, 0.0))
-            low, high = (low / WIDER, WIDER * high) if high > low else (wide[0] * value, wide[1] * value)
+            low, high = (low / WIDER, WIDER * high) if high > low else (value / WIDER, WIDER * value)
             columns = s.damping if name == "kd" else (name,)
             out.append(Param(name, columns, "factor", min(low / value, 1.0), max(high / value, 1.0), 1.0))
 
@@ -107,9 +105,9 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
         value = min(s.nominal[name], high)
         out.append(Param(name, (name,), "set", 0.0, high, value, UNITS[name]))
 
-    factor("kp", GAIN)
+    factor("kp")
     if s.nominal["kd"] > 0:
-        factor("kd", (0.0, DAMPING))
+        factor("kd")
     elif s.nominal["kp"] > 0:  # a loop that is said not to damp: up to critical damping
         stiffness = s.nominal["kp"] * (s.nominal["torque_limit"] if s.voltage else 1.0)
         out.append(
@@ -212,11 +210,11 @@ def judged(
     }
     differ = {n for n in SERVO if len({float(row[SERVO[n]]) for row in case.plant.nominal}) > 1}
     factor = {p.key: float(v) for p, v in zip(params, x, strict=True) if p.mode == "factor" and p.key in differ}
-    stopped = tuple(
-        p.key
+    stopped = {
+        p.key: float(v) if p.mode == "factor" else None
         for p, v in zip(params, x, strict=True)
         if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low != 0)
-    )
+    }
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
     beside = {n: case.scales.nominal[n] for n in UNSTATED if n not in case.stated}
     return Baseline(
@@ -311,12 +309,17 @@ def text(data: dict[str, Any], unit: str) -> str:
 
 def stopped(data: dict[str, Any]) -> list[str]:
     """Return sentences about figures of the plain model that ended at the bounds of what was tried."""
-    return [
-        f"{joint}: the plain least squares ends at its bound in {' and '.join(n.replace('_', ' ') for n in x)}: "
-        "what is believed of the drive is further off than was tried, or another law acts"
-        for joint, b in data.get("joints", {}).items()
-        if (x := b["at_bound"])
-    ]
+    out = []
+    for joint, b in data.get("joints", {}).items():
+        of = {n.replace("_", " "): x for n, x in b["at_bound"].items()}
+        ended = [f"{n} ({x:.3g} x what is believed)" if x is not None else n for n, x in of.items()]
+        if ended:
+            more = "; a range in servo.yaml lets it go to twice and half of its ends" * any(of.values())
+            out.append(
+                f"{joint}: the plain least squares ends at its bound in {' and '.join(ended)}: what is believed of the "
+                f"drive is further off than was tried, or another law acts{more}"
+            )
+    return out
 
 
 # columns of dry friction that may hold a joint at rest
