@@ -39,7 +39,7 @@ class LocalPolynomial:
         self._scale = k * step
         basis = np.stack([(dt / self._scale) ** d for d in range(degree + 1)], -1)  # [S, m, D]
         self._weighted = weight[..., None] * basis
-        self._normal = np.einsum("smd,sme->sde", self._weighted, basis)
+        self._normal = self._weighted.transpose(0, 2, 1) @ basis
         self._normal += 1e-9 * np.eye(degree + 1)
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -47,7 +47,7 @@ class LocalPolynomial:
         if len(self.t) < 5:
             zero = np.zeros_like(x)
             return x.copy(), zero, zero
-        right = np.einsum("smd,smj->sdj", self._weighted, x[self._index])
+        right = self._weighted.transpose(0, 2, 1) @ x[self._index]
         c = np.linalg.solve(self._normal, right)
         return c[:, 0], c[:, 1] / self._scale, 2.0 * c[:, 2] / self._scale**2
 

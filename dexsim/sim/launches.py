@@ -3,7 +3,9 @@ kernel of a few worlds on a CPU, and a simulation launches the same few kernels 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ctypes
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -15,7 +17,7 @@ class Launches:
 
     def __init__(self, device: Any):
         self._device = wp.get_device(device)
-        self._packed: dict[str, tuple[Any, Sequence[Any]]] = {}
+        self._packed: dict[str, tuple[Callable[[], Any], Any]] = {}
 
     def __call__(self, name: str, kernel: Any, dim: int | tuple[int, ...], inputs: Sequence[Any]) -> None:
         """Launches `kernel` over `dim` threads."""
@@ -26,5 +28,13 @@ class Launches:
             command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
             if command is None:  # it was only listed (`dexsim.sim.warmup`)
                 return
-            self._packed[name] = command, inputs
-        self._packed[name][0].launch()
+            self._packed[name] = _call(command), (command, inputs)
+        self._packed[name][0]()
+
+
+def _call(command: wp.Launch) -> Callable[[], Any]:
+    """Return the call of a recorded launch on a CPU; the launch itself builds its arguments in each."""
+    bounds, *given = command.params
+    names = [f"given{k}" for k in range(len(given))]
+    arguments = type("Arguments", (ctypes.Structure,), {"_fields_": [*zip(names, map(type, given), strict=True)]})
+    return partial(command.hooks.forward, ctypes.byref(bounds), ctypes.byref(arguments(*given)))

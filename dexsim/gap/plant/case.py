@@ -620,7 +620,7 @@ def refined_cases(
         by_joint = moved(
             model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False
         ).used
-        _refine(runs, [by_joint[j] for j in range(len(by_joint))])
+        _refine(runs, _shown_by(runs, range(len(by_joint)), [by_joint[j] for j in range(len(by_joint))]))
     return build(model, runs, device, dt, only)
 
 
@@ -628,7 +628,30 @@ def _motions(
     runs: Sequence[Run], j: int, plant: JointPlant, at: np.ndarray | None = None
 ) -> list[tuple[np.ndarray, ...]]:
     """By run what `_one` makes of joint j."""
-    return [_one(plant, i, run, run.q[:, j], at) for i, run in enumerate(runs)]
+    return [_one(plant, i, run, j, at) for i, run in enumerate(runs)]
+
+
+def _shown_by(
+    runs: Sequence[Run], joints: Sequence[int], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]
+) -> list[list[tuple[np.ndarray, ...]]]:
+    """Return by joint and run the motions that plants make of these joints, with what was measured beside them,
+    smoothed: of all joints of a run at once."""
+
+    def one(i: int) -> list[tuple[np.ndarray, ...]]:
+        run, each = runs[i], [by_run[i] for by_run in motions]
+        t, q = run.t, run.q[:, joints]
+        left = q - np.stack([np.interp(t, times, x) for times, x, _, _ in each], 1)
+        rest = np.stack(run.local(WIDTH)(left))
+        # a belief that is far off leaves much of the motion to the smoothing, which must not cut what is fast
+        far = np.std(left - rest[0], 0) > [SEARCH.enough * noise_of(run, j)[0] for j in joints]
+        if far.any():
+            rest[:, :, far] = local_polynomial(t, left[:, far], WIDTH, QUICK)
+        return [
+            (times, *(x + np.interp(times, t, y) for x, y in zip(known, rest[:, :, k], strict=True)))
+            for k, (times, *known) in enumerate(each)
+        ]
+
+    return [list(by_run) for by_run in zip(*compute.each(len(runs), one), strict=True)]
 
 
 def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]) -> None:
@@ -653,7 +676,8 @@ def refine_motion_by_fits(
     place = [runs[0].joints.index(case.joint) for case in cases]
     for case, trial in zip(cases, fitted, strict=True):
         at.append(expand(case.plant, trial.fit.params, trial.fit.x[None], trial.fixed))
-    motion = compute.each(len(cases), lambda k: _motions(runs, place[k], cases[k].plant, at[k]))
+    made = compute.each(len(cases), lambda k: _motions(runs, place[k], cases[k].plant, at[k]))
+    motion = _shown_by(runs, place, made)
     misread = [k for k, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
@@ -691,26 +715,20 @@ def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndar
 
 
 def _one(
-    plant: JointPlant, number: int, run: Run, q: np.ndarray, at: np.ndarray | None = None
+    plant: JointPlant, number: int, run: Run, j: int, at: np.ndarray | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Times [n] s, and position, speed and acceleration [n] of one joint, measured at q [S], in the run of this number;
-    at [1, R, C]: plant parameters (None: believed)."""
+    """Times [n] s, and position, speed and acceleration [n] of joint j, simulated along the run of this number; at [1,
+    R, C]: plant parameters (None: believed)."""
     every, t = max(int(round(EVERY / plant.dt)), 1), run.t
     times, windows = fine_windows(plant, number, every)
     x = plant.simulate(plant.base()[None] if at is None else at, windows)[0][0]
     step = every * plant.dt
-    if not np.isfinite(x).all() or np.abs(x - np.interp(times, t, q)).max() > 1.0:  # the belief does not follow at all
-        x = np.interp(times, t, local_polynomial(t, q[:, None])[0][:, 0])
+    # the belief does not follow at all
+    if not np.isfinite(x).all() or np.abs(x - np.interp(times, t, run.q[:, j])).max() > 1.0:
+        x = np.interp(times, t, run.qs[:, j])
     v = np.gradient(x, step)
     v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
-    a = np.gradient(v, step)
-    left = (q - np.interp(t, times, x))[:, None]
-    miss, dv, da = (c[:, 0] for c in run.local(WIDTH)(left))
-    # a belief that is far off leaves much of the motion to the smoothing, which must not cut what is fast
-    if float(np.std(left[:, 0] - miss)) > SEARCH.enough * noise(t, q)[0]:
-        miss, dv, da = (c[:, 0] for c in local_polynomial(t, left, WIDTH, QUICK))
-    fine = lambda y: np.interp(times, t, y)  # noqa: E731
-    return times, x + fine(miss), v + fine(dv), a + fine(da)
+    return times, x, v, np.gradient(v, step)
 
 
 def fine_windows(plant: JointPlant, run: int, every: int) -> tuple[np.ndarray, Windows]:
