@@ -828,7 +828,8 @@ def composed(
         return next((c for c, _ in done[:first] if all(c[j] in alike[j] for j in by)), best)
 
     while chosen not in [c for c, _ in done] and len(done) < first + TURNS and not passed(1):
-        together = replayed([chosen] if passed(2) else [chosen, safe_of(chosen)])[0]
+        safe = safe_of(chosen)
+        together = replayed([chosen, *([] if passed(2) or safe in [c for c, _ in done] else [safe])])[0]
         done.append((chosen, together))
         # what is as good as the noise stays
         far = {j: max(quiet[j], math.sqrt(1 + SEARCH.tie) * here[j][chosen[j]]) for j in by}

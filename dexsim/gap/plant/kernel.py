@@ -989,6 +989,9 @@ USUAL = tuple(
         "effort_gain", "effort_offset", "readout_scale", "readout_offset", "spring", "spring_preload",
     )
 )  # fmt: skip
+PULLED = USUAL + tuple(  # by another joint, or by what hangs on it
+    INDEX[n] for n in ("linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across")
+)
 TWO = USUAL + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
 Lanes = wp.types.vector(length=LANES, dtype=f64)
 Row = wp.types.vector(length=len(NEUTRAL), dtype=f64)
@@ -999,8 +1002,8 @@ COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
 @cache
 def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
-    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, or `TWO`). Rows of params: as many as
-    threads have."""
+    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `PULLED` or `TWO`). Rows of params:
+    as many as threads have."""
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
     two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
     substeps = TWO_BODY_STEPS if two else ONE_BODY_STEPS
