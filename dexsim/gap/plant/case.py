@@ -466,19 +466,9 @@ def _rates(runs: Sequence[Run], torques: Sequence[np.ndarray], j: int) -> dict[s
 
 
 def _regimes(
-    t: np.ndarray,
-    run_of: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    load: np.ndarray,
-    tau: np.ndarray,
-    asked: np.ndarray,
-    limit: float,
-    cmd: np.ndarray,
-    runs: Sequence[Run],
-    j: int,
-) -> dict[str, np.ndarray]:
+    t: np.ndarray, run_of: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray, tau: np.ndarray,
+    asked: np.ndarray, limit: float, cmd: np.ndarray, runs: Sequence[Run], j: int,
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Return variables [n] of each measured sample, that a residual may depend on."""
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
     since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _rows_by_run(run_of)])
@@ -617,27 +607,16 @@ def refined_cases(
     if len(runs[0].joints) < 2:
         return build(model, runs, device, dt)
     for _ in range(PASSES):
-        by_joint = moved(
-            model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False
-        ).used
-        _refine(runs, _shown_by(runs, range(len(by_joint)), [by_joint[j] for j in range(len(by_joint))]))
+        by_joint = moved(model, runs, lambda j, plant: _alone(runs, j, plant), device, dt, added=False).used
+        _refine(runs, _beside(runs, [*by_joint], [*by_joint.values()]))
     return build(model, runs, device, dt, only)
 
 
-def _motions(
-    runs: Sequence[Run], j: int, plant: JointPlant, at: np.ndarray | None = None
-) -> list[tuple[np.ndarray, ...]]:
-    """By run what `_one` makes of joint j."""
-    return [_one(plant, i, run, j, at) for i, run in enumerate(runs)]
+def _beside(runs: Sequence[Run], joints: Sequence[int], motions: Sequence[Sequence[tuple]]) -> list[list[tuple]]:
+    """Return by joint and run the motions (times, position, speed, acceleration) of plants of these joints, with what
+    was measured beside them, smoothed: of all joints of a run at once."""
 
-
-def _shown_by(
-    runs: Sequence[Run], joints: Sequence[int], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]
-) -> list[list[tuple[np.ndarray, ...]]]:
-    """Return by joint and run the motions that plants make of these joints, with what was measured beside them,
-    smoothed: of all joints of a run at once."""
-
-    def one(i: int) -> list[tuple[np.ndarray, ...]]:
+    def one(i: int) -> list[tuple]:
         run, each = runs[i], [by_run[i] for by_run in motions]
         t, q = run.t, run.q[:, joints]
         left = q - np.stack([np.interp(t, times, x) for times, x, _, _ in each], 1)
@@ -654,7 +633,7 @@ def _shown_by(
     return [list(by_run) for by_run in zip(*compute.each(len(runs), one), strict=True)]
 
 
-def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]) -> None:
+def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple]]) -> None:
     """Writes `Run.fine`, of what each joint does in each run."""
     for i, run in enumerate(runs):
         columns = [by_run[i] for by_run in motions]
@@ -676,8 +655,8 @@ def refine_motion_by_fits(
     place = [runs[0].joints.index(case.joint) for case in cases]
     for case, trial in zip(cases, fitted, strict=True):
         at.append(expand(case.plant, trial.fit.params, trial.fit.x[None], trial.fixed))
-    made = compute.each(len(cases), lambda k: _motions(runs, place[k], cases[k].plant, at[k]))
-    motion = _shown_by(runs, place, made)
+    made = compute.each(len(cases), lambda k: _alone(runs, place[k], cases[k].plant, at[k]))
+    motion = _beside(runs, place, made)
     misread = [k for k, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
@@ -714,31 +693,24 @@ def true_motion(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndar
     return t, x, speed, (a - (after - before) / (2 * TURN) * speed**2) / rate
 
 
-def _one(
-    plant: JointPlant, number: int, run: Run, j: int, at: np.ndarray | None = None
-) -> tuple[np.ndarray, ...]:
-    """Times [n] s, and position, speed and acceleration [n] of joint j, simulated along the run of this number; at [1,
-    R, C]: plant parameters (None: believed)."""
-    every, t = max(int(round(EVERY / plant.dt)), 1), run.t
-    times, windows = fine_windows(plant, number, every)
-    x = plant.simulate(plant.base()[None] if at is None else at, windows)[0][0]
+def _alone(runs: Sequence[Run], j: int, plant: JointPlant, at: np.ndarray | None = None) -> list[tuple]:
+    """By run the times [n] s, and position, speed and acceleration [n] of joint j as its plant moves free from the
+    first sample on; at [1, R, C]: plant parameters (None: believed)."""
+    every, out = max(int(round(EVERY / plant.dt)), 1), []
     step = every * plant.dt
-    # the belief does not follow at all
-    if not np.isfinite(x).all() or np.abs(x - np.interp(times, t, run.q[:, j])).max() > 1.0:
-        x = np.interp(times, t, run.qs[:, j])
-    v = np.gradient(x, step)
-    v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
-    return times, x, v, np.gradient(v, step)
-
-
-def fine_windows(plant: JointPlant, run: int, every: int) -> tuple[np.ndarray, Windows]:
-    """Times [n] s and the window of a whole run, free from its first sample, seen at every `every`-th step."""
-    whole = plant.windows(None, [run], every_run=True, between=True)
-    window = whole.window[:1].copy()
-    steps = np.arange(0, window[0, 1], every, dtype=np.int32)
-    window[0, 3], window[0, 4] = 0, len(steps)
-    n = len(steps)
-    times = whole.window_t[0] + plant.dt * steps
-    return times, Windows(
-        window, whole.window_t[:1], steps, np.zeros(n), np.zeros(n, int), np.zeros(n, int), whole.run[:1]
-    )
+    for i, run in enumerate(runs):
+        whole = plant.windows(None, [i], every_run=True, between=True)
+        window = whole.window[:1].copy()
+        steps = np.arange(0, window[0, 1], every, dtype=np.int32)
+        n = len(steps)
+        window[0, 3:5] = 0, n
+        times, of = whole.window_t[0] + plant.dt * steps, np.zeros(n, int)
+        seen = Windows(window, whole.window_t[:1], steps, np.zeros(n), of, of, whole.run[:1])
+        x = plant.simulate(plant.base()[None] if at is None else at, seen)[0][0]
+        # the belief does not follow at all
+        if not np.isfinite(x).all() or np.abs(x - np.interp(times, run.t, run.q[:, j])).max() > 1.0:
+            x = np.interp(times, run.t, run.qs[:, j])
+        v = np.gradient(x, step)
+        v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
+        out.append((times, x, v, np.gradient(v, step)))
+    return out
