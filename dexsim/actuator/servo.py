@@ -148,7 +148,7 @@ class Servo:
         self._send, self._reset, self._sum = send_kernel(real), reset_kernel(real, extended), given_kernel(real)
         self._period = 1.0 / table.control_rate if table.control_rate else 0.0
         self._shape = (n, j)
-        self._launch = Launches(device)
+        self._launch = Launches(device, captured=engine.kind != "mujoco")
         self._wp = engine.wp
         self._fields = {name: engine.wp_field(name) for name in FIELDS}
         self._drives = drives(real)()

@@ -13,10 +13,11 @@ import warp as wp
 
 class Launches:
     """The launches of one owner, by name. What a name stands for must not change: the same kernel, shape, numbers and
-    arrays (whose contents may). On a GPU, where a graph repeats a step, each is an ordinary launch."""
+    arrays (whose contents may). On a GPU, where a graph repeats a step, each is an ordinary launch. captured: whether a
+    graph may record them."""
 
-    def __init__(self, device: Any):
-        self._device = wp.get_device(device)
+    def __init__(self, device: Any, captured: bool = True):
+        self._device, self._captured = wp.get_device(device), captured
         self._packed: dict[str, tuple[Callable[[], Any], Any]] = {}
 
     def __call__(self, name: str, kernel: Any, dim: int | tuple[int, ...], inputs: Sequence[Any]) -> None:
@@ -28,12 +29,13 @@ class Launches:
             command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
             if command is None:  # it was only listed (`dexsim.sim.warmup`)
                 return
-            self._packed[name] = _call(command), (command, inputs)
+            self._packed[name] = command.launch if self._captured else _call(command), (command, inputs)
         self._packed[name][0]()
 
 
 def _call(command: wp.Launch) -> Callable[[], Any]:
-    """Return the call of a recorded launch on a CPU; the launch itself builds its arguments in each."""
+    """Return the call of a recorded launch on a CPU, which no graph sees; the launch itself builds its arguments in
+    each."""
     bounds, *given = command.params
     names = [f"given{k}" for k in range(len(given))]
     arguments = type("Arguments", (ctypes.Structure,), {"_fields_": [*zip(names, map(type, given), strict=True)]})

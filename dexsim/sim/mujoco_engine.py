@@ -59,7 +59,7 @@ class MujocoEngine(Engine):
     ):  # fmt: skip
         super().__init__(model, worlds, "cpu", fields, pairs)
         self.real = real
-        self._launch = Launches("cpu")
+        self._launch = Launches("cpu", captured=False)
         # A diverged world must keep its NaN, to be seen and reset by the environment like on the other engine. And
         # geoms that move by world are not where the compiler's bounding volumes have them: test every pair of two
         # bodies.
