@@ -153,6 +153,7 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     series, plant = plant.series.copy(), copy.copy(plant)
     series[:, ~series.any(0)] = 0.1 * rng.normal(size=(len(series), 1))  # of joints that pull, of what hangs on it
     plant.set_series(series)
+    monkeypatch.setattr(plants, "MANY", 0)
     servo = {c.name: c for c in COLUMNS}
     for k in kernel.USUAL:
         name, value = NAMES[k], many[:, :, k]
@@ -169,7 +170,7 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     inits = 0.01 * rng.normal(size=(27, 2))
     vectors = {columns: which.tolist() for which, columns in plant._side_by_side(many[:, 0], 0)}
     assert vectors[kernel.TWO] == [*range(10, 18)] and vectors[kernel.USUAL] == [*range(7), 8]
-    assert vectors[kernel.PULLED] == [9, *range(20, 27)]
+    assert vectors[kernel.MORE] == [9, *range(20, 27)]
     for length in (1.0, None):
         at_once = plant.simulate(many, plant.windows(length), inits)
         with monkeypatch.context() as m:

@@ -989,7 +989,7 @@ USUAL = tuple(
         "effort_gain", "effort_offset", "readout_scale", "readout_offset", "spring", "spring_preload",
     )
 )  # fmt: skip
-PULLED = USUAL + tuple(  # by another joint, or by what hangs on it
+MORE = USUAL + tuple(  # by another joint, or by what hangs on it
     INDEX[n] for n in ("linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across")
 )
 TWO = USUAL + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
@@ -1002,7 +1002,7 @@ COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
 @cache
 def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
-    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `PULLED` or `TWO`). Rows of params:
+    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `MORE` or `TWO`). Rows of params:
     as many as threads have."""
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
     two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
