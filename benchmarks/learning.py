@@ -180,6 +180,8 @@ def main(argv: list[str]) -> dict:
                   rest)  # fmt: skip
     cfg = tools.config(rest)
     data = checkpoint.load(own["policy"], cfg["device"])
+    if "command" in cfg["task"]:  # what the policy sees
+        cfg["task"]["command"] |= {"thumb": None} | data["config"]["task"]["command"]
     out: dict = {"benchmark": "learning", **tools.about(cfg["device"]), "rows": []}
     for worlds in tools.numbers(own["worlds"], "worlds"):
         row = measure(cfg, worlds, own["iterations"], own["settle"], data["actor"])

@@ -251,7 +251,7 @@ class Runner(OnPolicyRunner):
         """Return whether the weights and the observations' running normalization are finite."""
         weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
         weights += [b for b in self._buffers() if b.is_floating_point()]
-        return bool(torch.stack([w.isfinite().all() for w in weights]).all())
+        return bool(torch.stack(torch._foreach_norm(weights, math.inf)).isfinite().all())  # two launches
 
     def _first_not_finite(self) -> str:
         """Name of the first weights that are not finite."""

@@ -1,5 +1,5 @@
-"""Kernel launches that are repeated with the same arguments: packed once. Packing takes several times as long as the
-kernel of a few worlds on a CPU, and a simulation launches the same few kernels in every physics step."""
+"""What kernels take, and launches repeated with the same arguments, which are packed once. Packing takes several times
+as long as a kernel of a few worlds on a CPU, and a simulation launches the same few kernels in every physics step."""
 
 from __future__ import annotations
 
@@ -9,6 +9,18 @@ from functools import partial
 from typing import Any
 
 import warp as wp
+
+
+def taken(kind: Any, *owners: object) -> Any:
+    """Return a kernel's struct of the arrays that owners have under its names, the first that has one; others are
+    empty."""
+    struct = kind()
+    for name in kind.vars:
+        for owner in owners:
+            if hasattr(owner, name):
+                setattr(struct, name, getattr(owner, name))
+                break
+    return struct
 
 
 class Launches:

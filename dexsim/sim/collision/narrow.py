@@ -16,6 +16,7 @@ from mujoco_warp._src.warp_util import event_scope
 
 from dexsim.sim.collision import kernels
 from dexsim.sim.collision.shapes import BOX, CAPSULE, CYLINDER, HULL, SPHERE, hull_corners
+from dexsim.sim.launches import taken
 
 VERSION = "4.0.0"
 """The MuJoCo-Warp whose stages this replaces and calls; with another one the setting is refused (see `unsupported`)."""
@@ -74,7 +75,7 @@ class NarrowPhase:
         self.simplex = wp.full((d.nworld, self.number), wp.vec3i(-1, -1, -1), dtype=wp.vec3i)
         self.deep_number = wp.zeros(1, dtype=int)
         self._deep, self._enclosing = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=wp.vec4i)
-        self._pairs = _filled(kernels.Pairs, m)
+        self._pairs = taken(kernels.Pairs, m)
         p = self._pairs
         p.geom_xpos, p.geom_xmat, p.room, p.number = d.geom_xpos, d.geom_xmat, d.naconmax, d.ncollision
         p.hull_first, p.hull_count, p.hull = (
@@ -83,8 +84,8 @@ class NarrowPhase:
             wp.array(corners, dtype=wp.vec3),
         )
         p.slot, p.simplex = wp.array(slot, dtype=int), self.simplex
-        self._mat = _filled(kernels.Materials, m)
-        self._out = _filled(kernels.Contacts, d.contact)
+        self._mat = taken(kernels.Materials, m)
+        self._out = taken(kernels.Contacts, d.contact)
         self._out.nacon = d.nacon
 
     @contextmanager
@@ -123,12 +124,3 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
     )  # fmt: skip
     if n.cylinders:
         wp.launch(kernels.beside_cylinder, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out], block_dim=32)
-
-
-def _filled(kind: Any, source: object, prefix: str = "") -> Any:
-    """Return a kernel's struct, with the arrays of the same names of `source`."""
-    struct = kind()
-    for name in kind.vars:
-        if hasattr(source, prefix + name):
-            setattr(struct, name, getattr(source, prefix + name))
-    return struct

@@ -58,11 +58,10 @@ class Solution:
 
 
 @cache
-def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False) -> wp.Kernel:
+def solve_kernel(nv: int, rows: int, fast_math: bool = False) -> wp.Kernel:
     """Return the kernel for models of `nv` dofs (at most 32); [N * 32] threads, in blocks of whole warps.
 
-    It solves the worlds that have more than `above` and at most `rows` rows beside those of dry friction. registers:
-    CUDA, at most so many a thread (0: as the compiler likes).
+    It solves the worlds that have more than `above` and at most `rows` rows beside those of dry friction.
     """
     if not 0 < nv <= LANES or rows % 4:
         raise ValueError(f"solve_kernel: nv {nv} must be 1 to {LANES}, rows {rows} a multiple of 4")
@@ -76,18 +75,10 @@ def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False
     call = wp.func_native(text(nv, rows))(solve_world)
 
     def solve(
-        above: int,
-        iterations: int,
-        ls_iterations: int,
-        warm: int,
-        njmax: int,
-        problem: Problem,
-        # out
-        solution: Solution,
-    ):
+        above: int, iterations: int, ls_iterations: int, warm: int, njmax: int, problem: Problem, solution: Solution
+    ):  # fmt: skip
         call(wp.tid() // wp.static(LANES), above, iterations, ls_iterations, warm, njmax, problem, solution)
 
     return wp.kernel(
-        solve, enable_backward=False, module="unique", grid_stride=False, cuda_max_registers=registers or None,
-        module_options={"fast_math": fast_math},
+        solve, enable_backward=False, module="unique", grid_stride=False, module_options={"fast_math": fast_math},
     )  # fmt: skip

@@ -12,6 +12,7 @@ from mujoco_warp._src import smooth
 from mujoco_warp._src import solver as theirs
 from mujoco_warp._src.warp_util import event_scope
 
+from dexsim.sim.launches import taken
 from dexsim.sim.solver.kernel import Problem, Solution, solve_kernel
 from dexsim.sim.solver.source import LANES, shared_bytes
 
@@ -62,18 +63,21 @@ class NewtonSolver:
     memory, so that many run at a time; the few with more by one with room for all of `njmax`.
 
     Attributes:
-      rows, worlds_per_block, registers, fast_math: launch choices, see `solve_kernel`; change them before a recording.
+      rows, fast_math: launch choices, see `solve_kernel`; change them before a recording.
     """
 
     def __init__(self, m: mjw.Model, d: mjw.Data, rows: int = 64):
         self.m, self.d = m, d
         self.most = _whole(d.njmax)
         self.rows = min(_whole(rows), self.most)
-        self.worlds_per_block, self.registers = 1, 0
         # Approximate roots and quotients (2 units in the last place) on a GPU, as MuJoCo-Warp's line search has them. A
         # CPU's compiler takes more liberties: not to know what is not finite, for one
         self.fast_math = d.qacc.device.is_cuda
-        self._problem, self._solution = _problem(m, d), _solution(d)
+        problem, self._solution = taken(Problem, m.opt, d, d.efc), taken(Solution, d, d.efc)
+        problem.M_rowind, problem.M_colind, self._solution.niter = m.M_hinit_i, m.M_colind, d.solver_niter
+        for name in ("friction", "dim", "efc_address"):
+            setattr(problem, f"contact_{name}", getattr(d.contact, name))
+        self._problem = problem
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
@@ -100,34 +104,9 @@ class NewtonSolver:
             warm = 0 if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART else 1
         above = -1
         for rows in (self.rows, self.most) if self.rows < self.most else (self.most,):
-            worlds = max(1, min(self.worlds_per_block, _SHARED // shared_bytes(m.nv, rows, 1)))
             wp.launch(
-                solve_kernel(m.nv, rows, self.registers, self.fast_math),
-                dim=d.nworld * LANES,
+                solve_kernel(m.nv, rows, self.fast_math), dim=d.nworld * LANES,
                 inputs=[above, m.opt.iterations, m.opt.ls_iterations, warm, d.njmax, self._problem, self._solution],
-                block_dim=worlds * LANES,
-            )
+                block_dim=LANES,
+            )  # fmt: skip
             above = rows
-
-
-def _problem(m: mjw.Model, d: mjw.Data) -> Problem:
-    """Return the arrays that MuJoCo-Warp's step fills before it solves."""
-    out = Problem()
-    for name in ("tolerance", "ls_tolerance", "impratio_invsqrt"):
-        setattr(out, name, getattr(m.opt, name))
-    out.M_rowind, out.M_colind = m.M_hinit_i, m.M_colind
-    for name in ("M", "qacc_warmstart", "qacc_smooth", "qfrc_smooth", "dof_frictionadr", "ne", "nf", "nefc", "nacon"):
-        setattr(out, name, getattr(d, name))
-    for name in ("friction", "dim", "efc_address"):
-        setattr(out, f"contact_{name}", getattr(d.contact, name))
-    for name in ("type", "id", "J_rownnz", "J_rowadr", "J_colind", "J", "D", "aref", "frictionloss"):
-        setattr(out, name, getattr(d.efc, name))
-    return out
-
-
-def _solution(d: mjw.Data) -> Solution:
-    """Return the arrays that it reads afterwards."""
-    out = Solution()
-    out.qacc, out.qfrc_constraint, out.niter, out.overflow = d.qacc, d.qfrc_constraint, d.solver_niter, d.overflow
-    out.Ma, out.force, out.state = d.efc.Ma, d.efc.force, d.efc.state
-    return out
