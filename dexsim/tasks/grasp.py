@@ -121,36 +121,23 @@ class GraspEnv(Launches):
     def begin(self, mask: torch.Tensor) -> None:
         """Begin episodes: an object falls on the open hand."""
         self.launch_begin(mask)
-        self._command_thumb(mask)
         self.place(mask, self.begun.hand, self.begun.pose, self.begun.velocity)
 
     def before_physics(self) -> None:
         """Change commands that were held for long enough; begin and end pushes."""
         super().before_physics()
-        before = self.command_left if self.thumb_range is None else self.command_left.clone()
         self.launch_orders()
-        self._command_thumb(self.command_left > before)  # a new command is held for longer than was left of the old
-
-    def _command_thumb(self, mask: torch.Tensor) -> None:
-        """Renew the thumb's own command, if it has one, where mask [N] holds."""
-        if self.thumb_range is None:
-            return
-        low, high = self.thumb_range
-        drawn = low + (high - low) * self.sampler.uniform() if self.fixed_thumb is None else self.fixed_thumb
-        self.thumb_command.copy_(torch.where(mask, drawn, self.thumb_command))
 
     def feel(self) -> None:
         super().feel()
         self.clearance.launch()
 
     def update(self) -> None:
-        self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)
-        rate = self.task["termination"].get("untouched")  # not for sure: all worlds would begin anew at once
-        if rate and self.fixed_command is None:  # an evaluation goes on, and counts
-            touches = self.finger_force > 0
-            lost = ~(touches[:, self.opposing].any(1) & touches[:, self.others].any(1))
-            late = self.episode_length_buf * self.dt > grasp_rewards.LATE
-            self._dropped |= lost & late & (self.sampler.uniform() < rate)
+        # not for sure: all worlds would begin anew at once; an evaluation goes on, and counts
+        rate = self.task["termination"].get("untouched", 0.0) if self.fixed_command is None else 0.0
+        drawn = self.sampler.uniform() if rate else self.command
+        args = self.finger_force, float(rate), drawn, self.dt, self._state, self._shape(), self._dropped
+        self._launch(grasp_rewards.dropped, self.num_envs, *args)
 
     @done(name="dropped")
     def is_dropped(self) -> torch.Tensor:

@@ -13,6 +13,7 @@ class Draws:
 
     value: wp.array(dtype=float)  # of the command: in [0, 1) of its range, or as it is where fixed
     hold: wp.array(dtype=float)  # in [0, 1) of its range
+    thumb: wp.array(dtype=float)  # in [0, 1] of the range of the thumb's own command
     weights: wp.array(dtype=float)  # size of the push, of the object's weight
     direction: wp.array2d(dtype=float)  # [N, 3] of any length
     duration: wp.array(dtype=float)  # s
@@ -24,6 +25,7 @@ class Orders:
     """What each world is told and pushed by."""
 
     command: wp.array(dtype=float)
+    thumb_command: wp.array(dtype=float)  # below 0: none of its own
     command_left: wp.array(dtype=float)  # s
     push: wp.array2d(dtype=float)  # [N, 3] N
     push_left: wp.array(dtype=float)  # s
@@ -38,6 +40,8 @@ class CommandRange:
     span: float
     hold_low: float  # s
     hold_span: float  # s
+    thumb_low: float
+    thumb_span: float
 
 
 @wp.func
@@ -49,6 +53,7 @@ def new_command(w: int, r: CommandRange, d: Draws, o: Orders):
         else:
             value = r.low + r.span * (value - r.zero) / (1.0 - r.zero)
     o.command[w] = value
+    o.thumb_command[w] = r.thumb_low + r.thumb_span * d.thumb[w]
     o.command_left[w] = r.hold_low + r.hold_span * d.hold[w]
 
 

@@ -40,6 +40,8 @@ class Launches(Task):
     beside: float
     pushes: bool
     fixed_command: torch.Tensor | None
+    fixed_thumb: torch.Tensor | None
+    thumb_range: list[float] | None
     clearance: Clearance
     centre0: torch.Tensor
     reach: torch.Tensor
@@ -65,7 +67,7 @@ class Launches(Task):
         self._readings = filled(kernels.Sensed, z_history=self.z_history, **vars(self.sensed))
         self._dropped = zeros(dtype=torch.bool)
         self.measured = torch.zeros(len(grasp_rewards.METRICS) + 1, self.num_envs, device=self.device)
-        names = ("command", "command_left", "push_left", "push_wait")
+        names = ("command", "thumb_command", "command_left", "push_left", "push_wait")
         self._orders = filled(kernels.Orders, push=self.push_force, **{name: getattr(self, name) for name in names})
         begun = ("first_xy", "z_history", "z_delay", "z_seen", "torque_bias")
         self._begun = filled(kernels.Begun, **vars(self.begun), **{name: getattr(self, name) for name in begun})
@@ -107,16 +109,18 @@ class Launches(Task):
         """Draw a new command and push for every world, as the kernels take them."""
         c, s, fixed = self.task["command"], self.sampler, self.fixed_command
         (first, last), low = c["hold_s"], c["low"]
+        drawn = self.thumb_range is not None and self.fixed_thumb is None
+        thumb_low, thumb_high = self.thumb_range if drawn else (0.0, 1.0)
         how = filled(
             kernels.CommandRange, fixed=fixed is not None, zero=c.get("zero", 0.0), low=low, span=c["high"] - low,
-            hold_low=first, hold_span=last - first,
+            hold_low=first, hold_span=last - first, thumb_low=thumb_low, thumb_span=thumb_high - thumb_low,
         )  # fmt: skip
-        drawn = filled(
+        return how, filled(
             kernels.Draws, value=s.uniform() if fixed is None else fixed, hold=s.uniform(),
             weights=s.draw("push.weights"), direction=s.normal(3), duration=s.draw("push.duration"),
             wait=s.draw("push.wait"),
+            thumb=s.uniform() if drawn else self.thumb_command if self.fixed_thumb is None else self.fixed_thumb,
         )  # fmt: skip
-        return how, drawn
 
     def launch_begin(self, mask: torch.Tensor) -> None:
         """Draw a fall, a command and a push of a new episode where mask [N] holds, into `begun` and the memory."""

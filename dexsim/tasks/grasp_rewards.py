@@ -317,10 +317,26 @@ def force_error(w: int, s: State, shape: Shape):
     return total / float(shape.others.shape[0])
 
 
+@wp.func
+def any_of(fingers: wp.array(dtype=int), force: wp.array2d(dtype=float), w: int):
+    """Return whether one of these fingers touches, with whatever link."""
+    found = bool(False)
+    for i in range(fingers.shape[0]):
+        if force[w, fingers[i]] > 0.0:
+            found = True
+    return found
+
+
 @wp.kernel(enable_backward=False)
-def dropped(s: State, shape: Shape, out: wp.array(dtype=wp.bool)):
+def dropped(
+    finger_force: wp.array2d(dtype=float), rate: float, drawn: wp.array(dtype=float), period: float, s: State,
+    shape: Shape, out: wp.array(dtype=wp.bool),
+):  # fmt: skip
+    """Compute whether the object is out; or, in a share `rate` (drawn: in [0, 1)), late and let go of. period: s."""
     w = wp.tid()
-    out[w] = is_dropped(w, s, shape)
+    held = any_of(shape.opposing, finger_force, w) and any_of(shape.others, finger_force, w)
+    late = float(s.episode_length[w]) * period > wp.static(LATE)
+    out[w] = is_dropped(w, s, shape) or (rate > 0.0 and drawn[w] < rate and late and not held)
 
 
 @wp.kernel(enable_backward=False)
