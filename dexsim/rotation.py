@@ -18,7 +18,9 @@ def _tables(device: torch.device, dtype: torch.dtype) -> tuple[torch.Tensor, ...
         signs = torch.tensor([1, -1, -1, -1, 1, 1, -1, 1, 1, 1, 1, -1, 1, -1, 1, 1], dtype=dtype, device=device)
         products = torch.tensor(_PRODUCTS, device=device).flatten()
         factors = torch.tensor(_FACTORS, dtype=dtype, device=device)
-        return places, signs, products, factors, torch.eye(3, dtype=dtype, device=device).flatten()
+        identity = torch.eye(4, dtype=dtype, device=device)[0]
+        one = torch.eye(3, dtype=dtype, device=device).flatten()
+        return places, signs, products, factors, one, identity, 2 * identity - 1
 
 
 def _multiply_in_few(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -29,7 +31,7 @@ def _multiply_in_few(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def _to_matrix_in_few(q: torch.Tensor) -> torch.Tensor:
     """Return `to_matrix` in five kernels instead of forty."""
-    _, _, products, factors, one = _tables(q.device, q.dtype)
+    _, _, products, factors, one, *_ = _tables(q.device, q.dtype)
     all_of_them = (q[..., :, None] * q[..., None, :]).flatten(-2)
     terms = all_of_them.index_select(-1, products).unflatten(-1, (9, 2))
     return ((terms * factors).sum(-1) + one).unflatten(-1, (3, 3))
@@ -57,14 +59,13 @@ def about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 def conjugate(q: torch.Tensor) -> torch.Tensor:
     """Return the inverse rotation."""
-    return torch.cat([q[..., :1], -q[..., 1:]], -1)
+    return q * _tables(q.device, q.dtype)[-1]
 
 
 def normalize(q: torch.Tensor) -> torch.Tensor:
     """Return unit quaternion along q; zero becomes the identity."""
     norm = q.norm(dim=-1, keepdim=True)
-    one = torch.cat([torch.ones_like(q[..., :1]), torch.zeros_like(q[..., 1:])], -1)
-    return torch.where(norm > 1e-9, q / norm.clamp(min=1e-9), one)
+    return torch.where(norm > 1e-9, q / norm.clamp(min=1e-9), _tables(q.device, q.dtype)[-2])
 
 
 def angle(q: torch.Tensor) -> torch.Tensor:
