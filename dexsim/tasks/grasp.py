@@ -134,7 +134,7 @@ class GraspEnv(Launches):
 
     def update(self) -> None:
         # not for sure: all worlds would begin anew at once; an evaluation goes on, and counts
-        rate = self.task["termination"].get("untouched", 0.0) if self.fixed_command is None else 0.0
+        rate = 0.0 if self.fixed_command is not None else self.task["termination"].get("untouched") or 0.0
         drawn = self.sampler.uniform() if rate else self.command
         args = self.finger_force, float(rate), drawn, self.dt, self._state, self._shape(), self._dropped
         self._launch(grasp_rewards.dropped, self.num_envs, *args)

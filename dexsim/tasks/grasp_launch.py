@@ -109,8 +109,8 @@ class Launches(Task):
         """Draw a new command and push for every world, as the kernels take them."""
         c, s, fixed = self.task["command"], self.sampler, self.fixed_command
         (first, last), low = c["hold_s"], c["low"]
-        drawn = self.thumb_range is not None and self.fixed_thumb is None
-        thumb_low, thumb_high = self.thumb_range if drawn else (0.0, 1.0)
+        drawn = self.thumb_range if self.fixed_thumb is None else None
+        thumb_low, thumb_high = drawn or (0.0, 1.0)
         how = filled(
             kernels.CommandRange, fixed=fixed is not None, zero=c.get("zero", 0.0), low=low, span=c["high"] - low,
             hold_low=first, hold_span=last - first, thumb_low=thumb_low, thumb_span=thumb_high - thumb_low,
