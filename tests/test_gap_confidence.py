@@ -23,7 +23,7 @@ CASE = SimpleNamespace(
 
 def evidence(**changes) -> Evidence:
     given = (
-        dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, folds=[], members=1, place=0)
+        dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, score=99.0, members=1, place=0)
         | changes
     )
     return Evidence(**given)
@@ -31,6 +31,16 @@ def evidence(**changes) -> Evidence:
 
 def viscous(low=0.0, high=0.1):
     return Param("coefficient", ("viscous_friction",), "set", low, high, 0.002)
+
+
+def test_the_best_of_many_hypotheses_must_be_told_the_better():
+    """The same evidence speaks for one of ten hypotheses and not for one of a thousand; what is plain is not asked how
+    many there were."""
+    for score, tried, most in ((4.0, 10, 0.9), (4.0, 1000, 0.1), (30.0, 1000, 1.0)):
+        e = evidence(score=score, confidence=0.9)
+        confidence.share_odds([e], tried)
+        assert 0.5 * 0.9 * most < e.confidence < 0.9 * most + 1e-9
+        assert bool(e.reasons) is (e.odds < 0.5)
 
 
 @pytest.mark.parametrize(

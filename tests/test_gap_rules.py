@@ -169,7 +169,7 @@ def doubtful(**changes):
         "earned": 1.0,
         "left": 0.0,
         "left_of_rest": 0.0,
-        "folds": [],
+        "score": 99.0,
         "members": 1,
     }
     return confidence.Evidence(**(given | {"place": 0, "confidence": 0.99} | changes))

@@ -113,9 +113,6 @@ class JudgeRules:
     # second that it changes by half as much can speak of it; of several on a joint, one that surely removes less, and
     # without which the error is lower, is taken back
     part: float = 0.2
-    # share of the squared error on what was held out that an effect removes in all but a twentieth of its draws: moving
-    # less than half a count of the encoder, or harming a recording, then makes it doubted, not a hint
-    borne_out: float = 0.15
     # share of the draws of recordings in which an effect may do more harm than good; of the bootstraps that a rival of
     # its class wins without which the name is no set; false-discovery rate of what the rest is said to depend on
     # (Benjamini and Hochberg 1995)
@@ -125,7 +122,7 @@ class JudgeRules:
     stretch_most: float = 4.0  # the largest factor on intervals
     settled: float = 3.0  # x the noise: a motion on which two hypotheses differ by as much settles between them alone
     surest: float = 0.99  # the largest confidence of a name
-    resolved: float = 0.5  # counts of the encoder: an effect that moves the joint by less is doubted
+    resolved: float = 0.5  # counts of the encoder: an effect that moves the joint by less is a hint
     ordered: float = 0.9  # correlation of ranks from which on a temperature is said to follow the clock
     acts: float = 0.25  # of its most: from there on an effect acts, where stretches of time are told
     kept_end: float = 0.25  # of the time of a recording, where its end is held out

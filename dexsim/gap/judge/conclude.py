@@ -412,6 +412,8 @@ def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> li
     leaves them."""
     by = {(e.joint, e.effect): e for e in d.evidence}
     mine = [by[f.joints[0], f.effect] for f in findings]
+    shakes = [e for e in mine if e.joint in d.ringing and EFFECTS[e.effect].rings]  # no window keeps step with it
+    confidence.share_odds([e for e in mine if e not in shakes], sum(len(x.scanned) for x in d.outcomes))
     for joint in {e.joint for e in mine}:
         confidence.doubt_beside_others([e for e in mine if e.joint == joint])
     coupled = {f.joints[0]: f.parameters["from_joint"]["value"] for f in findings if EFFECTS[f.effect].couples}

@@ -26,8 +26,8 @@ EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 class Evidence:
     """What speaks for and against one finding. share: of the bootstraps; earned: 1 where dropping it costs a tenth of
     the error held out; left, left_of_rest: squared error held out that stays, over that before anything was named, and
-    over that without this effect alone; folds: relative cost of dropping it on each condition left out; reasons: why it
-    is doubted."""
+    over that without this effect alone; score: log of the odds [nats] by which conditions left out speak for it; odds:
+    that it is not the best of all that was tried by accident; reasons: why it is doubted."""
 
     effect: str
     joint: str
@@ -35,10 +35,11 @@ class Evidence:
     earned: float
     left: float
     left_of_rest: float
-    folds: list[float]
+    score: float
     members: int
     place: int
     reasons: list[str] = field(default_factory=list)
+    odds: float = 1.0
     confidence: float = 0.0
     of_pose: bool = False  # whether it is a torque that changes slowly with the pose alone
 
@@ -158,6 +159,17 @@ def weigh(e: Evidence, before: float, after: float, without: float, noise: float
     if e.members > 1:  # of what the others leave it has to explain most
         c *= trusted(without, after, noise)
     return float(min(c, JUDGE.surest, JUDGE.doubted if e.reasons else 1.0))
+
+
+def share_odds(all_: list[Evidence], tried: int) -> None:
+    """What the number of hypotheses says: each of all that were `tried`, over all joints, has the same share of the
+    prior, so that what conditions left out say for one (`Evidence.score`) must outweigh their number: the best of many
+    does better by accident than one."""
+    for e in all_:
+        e.odds = float(np.exp(-np.logaddexp(0.0, np.log(max(tried, 1)) - e.score)))
+        e.confidence *= e.odds
+        if e.odds < JUDGE.firm:
+            e.reasons.append(f"of {tried} hypotheses that were tried one does as well by accident")
 
 
 def doubt_beside_others(mine: list[Evidence]) -> None:

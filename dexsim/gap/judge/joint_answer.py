@@ -23,6 +23,7 @@ from dexsim.gap.read import Run
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, intervals
 from dexsim.gap.search.hypotheses import JointSearch, Member, Outcome, Trial
+from dexsim.gap.search.scan import cv_loss
 from dexsim.gap.search.search import law_spread, loss_by_run, polished, widened
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
@@ -186,6 +187,7 @@ class JointAnswer:
             other = self._judged(mm, trial, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
             other.hint(MUTE)
             evidence = max(other, evidence, key=lambda e: e.confidence)
+        evidence.score = self._score(trial)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.level][:2]
@@ -221,8 +223,8 @@ class JointAnswer:
         """Return the evidence of one effect: was, left: rms error of what was held out without and with it; surely:
         share of the squared error that it removes in all but a twentieth of its draws; before: error before anything
         was named, where that is not of all that was held out."""
-        effort_only, borne_out = mm.effect.effort_only, surely >= JUDGE.borne_out
-        evidence = self._weighed(mm, raw, was, left, borne_out, rms(self.before) if before is None else before)
+        effort_only = mm.effect.effort_only
+        evidence = self._weighed(mm, raw, was, left, rms(self.before) if before is None else before)
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
@@ -231,8 +233,14 @@ class JointAnswer:
         elif not effort_only and surely < -SEARCH.tie:
             evidence.hint("the error on what was held out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(without_it)):
-            (evidence.doubt if borne_out else evidence.hint)(harmed)
+            evidence.hint(harmed)
         return evidence
+
+    def _score(self, without_it: Trial) -> float:
+        """Return log of the odds [nats] by which conditions left out speak for what the best hypothesis has beside
+        another: normal residuals of unknown size, alike within half a second and independent beyond."""
+        lost, mine = (cv_loss(self.search, t) for t in (without_it, self.best))
+        return 0.5 * len(mine) * float(np.log(lost.sum() / mine.sum()))
 
     def _harmed(self, without_it: Trial) -> str:
         """Return why an effect is a hint only: what it gains in some recordings it loses in others, as what differs
@@ -262,12 +270,11 @@ class JointAnswer:
         return raw, spread
 
     def _weighed(
-        self, mm: Member, raw: dict[str, float], error_without: float, after: float, borne_out: bool, before: float
+        self, mm: Member, raw: dict[str, float], error_without: float, after: float, before: float
     ) -> confidence.Evidence:
         """Return how sure the name is, and every reason to doubt it. error_without, after: rms error on what was held
         out without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the
-        motion then tells nothing of it). borne_out: whether what was held out surely shows it; before: error of the
-        motion before anything was named."""
+        motion then tells nothing of it). before: error of the motion before anything was named."""
         case, outcome, effort_only, params = self.case, self.outcome, mm.effect.effort_only, mm.variant.params
         # the one effect of the reading: nothing else explains the effort
         before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (before, case.sigma)
@@ -276,7 +283,7 @@ class JointAnswer:
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence[mm.id], earned,
             confidence.left_over(after, before, noise),
-            confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)
+            confidence.left_over(after, error_without, noise), 0.0, len(self.best.members), 0)
         nothing, as_reported = (confidence.holds_nothing(params, x, case) for x in (as_fitted, reported))
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
@@ -301,7 +308,7 @@ class JointAnswer:
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
         if unlike := confidence.not_repeated(params, self._by_fold(mm), case):
             evidence.reasons.append(unlike)
-        if (nothing and as_reported) or small or (blurred and not borne_out) or stopped or unlike:
+        if (nothing and as_reported) or small or blurred or stopped or unlike:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         if not self.kept.proven:
             evidence.doubt("nothing that moves is left to try it on: record the motion twice")

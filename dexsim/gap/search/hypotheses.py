@@ -77,8 +77,6 @@ class Outcome:
     rivals: dict[str, list[tuple[str, float]]]  # by effect: what else would do, with its share of bootstraps
     confidence: dict[str, float]
     scanned: list[tuple[str, float, float]]  # (effect, share of squared error in the scan, its price)
-    # by effect: relative cost of dropping it, by condition left out
-    folds: dict[str, list[float]] = field(default_factory=dict)
 
 
 def named(member: Member) -> list[Param]:
@@ -329,14 +327,13 @@ class JointSearch:
             ]
         self.blocks = self._blocks(self.fitter, self.long)
         # what it finds as it goes: losses by block without any effect; the best fit by effects; the first of an
-        # effect's laws, by effect and label; what a scan's guesses save in hindsight, and other starts; what each
-        # effect costs when dropped, by condition; by effect the hypothesis by every law that it may have
+        # effect's laws, by effect and label; what a scan's guesses save in hindsight, and other starts; by effect
+        # the hypothesis by every law that it may have
         self.none_loss = np.zeros(0)
         self.fitted: dict[frozenset[str], Trial] = {}
         self.first_laws: dict[tuple[str, str], Variant] = {}
         self.saved: list[tuple[float, Member, np.ndarray]] = []
         self.other_start: dict[str, np.ndarray] = {}
-        self.costs: dict[str, list[float]] = {}
         self.by_law: dict[str, list[Trial]] = {}
         # made once: by the trial's id, which is kept so that it stays its own, its polished fit and errors of free runs
         self.polished: dict[int, tuple[Trial, Trial]] = {}

@@ -195,16 +195,6 @@ def bootstrap_sums(search: JointSearch, x: np.ndarray) -> np.ndarray:
     return x[intervals.stretches(len(x), STRETCH, search.rng, BOOTSTRAPS)].sum(1)
 
 
-def gain_by_condition(search: JointSearch, lost: np.ndarray, mine: np.ndarray) -> list[float]:
-    """Return relative gain of `mine` over `lost` (losses by block [B]) on each condition that was left out."""
-    fold = search.fold_of[search.fitter.window]
-    out = []
-    for number in np.unique(fold):
-        pick = np.unique(search.blocks[fold == number])
-        out.append(float(1 - mine[pick].sum() / max(float(lost[pick].sum()), 1e-30)))
-    return out
-
-
 def share_removed(search: JointSearch, new: Trial, old: Trial) -> float:
     """Share of the squared error that `new` removes, with what the beliefs give for it: on conditions left out or
     where it was fitted, whichever is less."""

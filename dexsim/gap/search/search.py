@@ -27,7 +27,6 @@ from dexsim.gap.search.scan import (
     cv_loss,
     earns,
     expand_one,
-    gain_by_condition,
     narrowed,
     price_factor,
     priced_loss,
@@ -119,7 +118,7 @@ def search_joint(search: JointSearch) -> Outcome:
             current = move(search, current)
     current, final = settled(search, current, pool)
     rivals, confidence = {e: x[0] for e, x in final.items()}, {e: x[1] for e, x in final.items()}
-    return Outcome(search.case.joint, none, current, rivals, confidence, scanned, search.costs)
+    return Outcome(search.case.joint, none, current, rivals, confidence, scanned)
 
 
 def beside_alike(search: JointSearch, forks: Sequence[Trial], current: Trial, pool: Pool) -> Trial:
@@ -552,14 +551,12 @@ def rivals_of(
 ) -> Rivals:
     """For each member: what else in its place would do (its share of bootstraps), and its confidence."""
     out = {}
-    search.costs = {}
     mine = cv_loss(search, current)
     short = short_loss(search, current)
     for i, member in enumerate(current.members):
         rest, kept = current.but(i)
         without = search.fit(rest, kept, current, quick=True) if rest else None
         lost = cv_loss(search, without) if without else search.none_loss
-        search.costs[member.id] = gain_by_condition(search, lost, mine)
         others: list[Trial] = []
         for n, (key, (other, start, _)) in enumerate(pool.items(), 1):
             if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
