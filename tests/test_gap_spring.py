@@ -11,7 +11,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects import FittedEffect
-from dexsim.gap.effects.catalogue import EFFECTS, nested
+from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read import Run, conditions
@@ -154,12 +154,6 @@ def test_a_spring_is_named_and_sized_where_no_loop_holds_the_joint():
     assert [m.id for m in best.members][:1] == ["joint_spring"]
     assert best.fit.value("joint_spring.stiffness") == pytest.approx(STIFFNESS, rel=0.1)
     assert best.fit.value("joint_spring.preload") == pytest.approx(PRELOAD, rel=0.2)
-
-
-def test_what_pulls_alike_is_one_torque_while_a_joint_moves():
-    """A friction that differs by direction, and a spring's preload."""
-    assert nested("coulomb_friction", "joint_spring") and not nested("coulomb_friction", "coulomb_friction")
-    assert not nested("coulomb_friction", "payload")
 
 
 UNEVEN, LEVEL = 0.9, 0.01  # of friction by direction, N.m

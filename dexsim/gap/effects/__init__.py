@@ -206,7 +206,6 @@ class Effect:
     every_kind: ClassVar[bool] = False  # listed with one of its kinds, all are: the scan's slopes rank them badly
     fitted_anyway: ClassVar[dict[str, str]] = {}  # servo column that may be unknown -> the parameter that it is
     demo: ClassVar[dict[str, float]] = {}  # servo columns of a drive that hides it, for `demo=`
-    plain: ClassVar[tuple[str, ...]] = ()  # servo columns of it that the plain model (`search.baseline`) fits
     misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
     rings: ClassVar[bool] = False  # may make a loop ring by itself

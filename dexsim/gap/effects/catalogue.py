@@ -165,11 +165,6 @@ def confusable(a: str, b: str) -> bool:
     return bool({*EFFECTS[a].classes} & {*EFFECTS[b].classes}) if a in EFFECTS and b in EFFECTS else False
 
 
-def nested(a: str, b: str) -> bool:
-    """Return whether one of two effects is the other with a size of nothing: one torque while the joint moves."""
-    return a in EFFECTS[b].nests or b in EFFECTS[a].nests
-
-
 def inseparable(effect: str, case: Case, runs: Sequence[int]) -> list[str]:
     """Return effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`BLIND`)."""
     blind = [c for c in EFFECTS[effect].classes if c in BLIND and BLIND[c](case, runs)]

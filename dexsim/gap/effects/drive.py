@@ -27,7 +27,6 @@ class TorqueLimit(Effect):
     words = "gives less (or more) torque than believed when it saturates"
     shows = "at saturation"
     experiment = "large steps against a load"
-    plain = ("torque_limit",)
 
     def variants(self, s: Scales) -> list[Variant]:
         believed = s.nominal["torque_limit"]
@@ -293,7 +292,6 @@ class GainMismatch(Effect):
     parts_stand = True  # there are two
     shows = "with the size of the error"
     experiment = "steps of several sizes against a known load"
-    plain = ("kp", "kd")
     classes = ("with speed", "static load", "loop")
     motions = ("steps", "holds")
 

@@ -26,7 +26,6 @@ class CoulombFriction(Effect):
     words = "has more (or less) dry friction than believed"
     shows = "at reversals and low speed"
     experiment = "slow triangles in both directions at constant load"
-    plain = ("coulomb_friction",)
     classes = ("friction or play", "friction and load", "friction or pull", "friction or dead zone")
     motions = ("triangles", "steps")
     fitted_anyway = {"coulomb_friction": "torque"}
@@ -64,7 +63,6 @@ class ViscousFriction(Effect):
     words = "has friction that grows with speed"
     shows = "at high speed"
     experiment = "constant speeds from slow to fast"
-    plain = ("viscous_friction",)
     classes = ("with speed",)
     motions = ("ladder",)
     kinds = 2

@@ -23,7 +23,6 @@ class CommandDelay(Effect):
     words = "acts on its commands later than believed"
     shows = "in proportion to speed"
     experiment = "steps and a fast chirp"
-    plain = ("delay",)
     classes = ("late",)
     motions = ("steps", "chirp")
     slows = True

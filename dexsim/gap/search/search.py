@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 
 from dexsim import intervals
 from dexsim.gap.effects import Variant
-from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
+from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, SIGNAL
@@ -57,7 +56,6 @@ def search_joint(search: JointSearch) -> Outcome:
     scanned: list[tuple[str, float, float]] = []
     per = len(search.blocks)
     pool: Pool = {}
-    forks: list[Trial] = []
     for _ in range(SEARCH.most):
         loss = cv_loss(search, current).sum() / per
         enough = loss < SEARCH.enough**2
@@ -99,45 +97,19 @@ def search_joint(search: JointSearch) -> Outcome:
             # a pair may be there where neither of its halves is seen alone
             best = current if enough or search.deadline.over() else best_pair(search, current, listed[:3]) or current
             if best is current:
-                instead = in_its_place(search, trials, current)
-                if instead is current:
-                    break
-                current = instead
-                continue
-        rest, last = best.members[:-1], best.ids[-1]
-        forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
+                break
         current = best
         if cv_loss(search, current).sum() / per > SEARCH.unsettled and not search.deadline.over():
             current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
         if len(current.members) > 1 and not search.deadline.over():
             current = swapped(search, current, pool)
     search.tell("what is not needed")
-    current = from_plain(search, beside_alike(search, forks, current, pool))
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws, more_general):
             current = move(search, current)
     current, final = settled(search, current, pool)
     rivals, confidence = {e: x[0] for e, x in final.items()}, {e: x[1] for e, x in final.items()}
     return Outcome(search.case.joint, none, current, rivals, confidence, scanned)
-
-
-def beside_alike(search: JointSearch, forks: Sequence[Trial], current: Trial, pool: Pool) -> Trial:
-    """Return what one effect more makes of hypotheses with what is the same torque while the joint moves in the
-    place of what was added (`nested`): which of them it is may show beside another effect only. `current` where
-    none lasts better, or little is left."""
-    best = current
-    for fork in forks:
-        loss = cv_loss(search, fork).sum() / len(search.blocks)
-        if loss < SEARCH.unsettled or search.deadline.over():
-            continue
-        listed = shortlisted(scan_catalogue(search, fork), LISTED, loss, fork.members)
-        if not listed:
-            continue
-        more = best_of(search, finished_drafts(search, drafts_of(search, listed, fork, pool), fork), fork)
-        lasts = earns(search, more, fork) and priced_loss(search, more) < priced_loss(search, best)
-        if lasts and more.fit.loss < best.fit.loss:
-            best = more
-    return best
 
 
 def more_general(search: JointSearch, current: Trial) -> Trial:
@@ -320,43 +292,6 @@ def plain_of(search: JointSearch) -> tuple[list[Param], np.ndarray] | None:
     return search.plain[0]
 
 
-def from_plain(search: JointSearch, current: Trial) -> Trial:
-    """Return the effects by which a plain least squares differs from what is believed, all at once and from its
-    figures, where they follow better: of several that are missing together each alone may look like another. Those
-    that do not earn their place are let go. `current` where they do not."""
-    enough = cv_loss(search, current).sum() / len(search.blocks) < SEARCH.enough**2
-    if enough or search.deadline.over() or (plain := plain_of(search)) is None:
-        return current
-    at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
-    members: list[Member] = []
-    starts: list[np.ndarray] = []
-    for effect in CATALOGUE:
-        moved = [c for c in effect.plain if c in at and c not in search.wide and _differs(*at[c], search.case)]
-        if not moved or not search.asked(effect):
-            continue
-        variants = [v for v in effect.variants(search.case.scales) if not v.refines and not v.approximate]
-        variant = narrowed(search, effect, variants[0]) if variants else None
-        if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
-            continue
-        values = [
-            _value(p, *at[p.columns[0]], search.case) if p.columns[0] in at else v
-            for p, v in zip(variant.params, variant.starts[0], strict=True)
-        ]
-        members.append(Member(effect, variant))
-        starts.append(np.array(values))
-    if len(members) < 2:
-        return current
-    short = short_loss(search, current)
-    like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
-    draft = search.draft(tuple(members), np.concatenate(starts), like)
-    if draft[2].loss > (1 - SEARCH.least) * short:
-        return current
-    trial = search.thorough(search.finish(*draft, current))
-    if not earns(search, trial, current, further=False):
-        return current
-    return dropped(search, trial)
-
-
 def best_pair(search: JointSearch, current: Trial, listed: Sequence[Scanned]) -> Trial | None:
     best = None
     for i, (_, _, m1, s1) in enumerate(listed):
@@ -394,22 +329,6 @@ def swapped(search: JointSearch, current: Trial, pool: Pool) -> Trial:
             ):
                 best = trial
     return best
-
-
-def in_its_place(search: JointSearch, trials: Sequence[Trial], current: Trial) -> Trial:
-    """Return what was added in the place of what was fitted down to nothing beside it, which had only looked like
-    it; `current` where no trial that follows far better has such a member."""
-    for trial in sorted(trials, key=lambda t: t.fit.loss):
-        if trial.fit.loss > (1 - SEARCH.least) * current.fit.loss or search.deadline.over():
-            break
-        nothing = [k for k, m in enumerate(trial.members) if search.nothing_of(m, trial)]
-        if not 0 < len(nothing) < len(trial.members) or len(trial.members) - 1 in nothing:
-            continue
-        alone = search.fit(*trial.but(*nothing), trial)
-        lasts = cv_loss(search, alone).sum() < (1 - SEARCH.least) * cv_loss(search, current).sum()
-        if lasts and not search.shrunk(alone):
-            return alone
-    return current
 
 
 def dropped(search: JointSearch, current: Trial) -> Trial:
@@ -606,22 +525,6 @@ def _loss(fitter: Fitter, trial: Trial) -> float:
     """Mean Huber square of a fitted hypothesis over the fitter's windows."""
     mine = fitter.given(trial.members)
     return float(mine.loss(mine.evaluate(trial.fit.params, trial.fit.x)[None])[0])
-
-
-def _value(p: Param, plain: Param, x: float, case: Case) -> float:
-    """Return the value of an effect's parameter `p` that writes to its column what the plain model's `plain` does at
-    `x`."""
-    nominal = case.scales.nominal[p.columns[0]]
-    absolute = x * nominal if plain.mode == "factor" else x
-    value = absolute / nominal if p.mode == "factor" else absolute - nominal if p.mode == "add" else absolute
-    return float(np.clip(value, p.low, p.high))
-
-
-def _differs(plain: Param, x: float, case: Case) -> bool:
-    """Return whether the plain model's figure is another than what is believed, as far as that is believed."""
-    nominal = case.scales.nominal[plain.columns[0]]
-    unit = nominal if plain.mode == "factor" else 1.0
-    return abs(x * unit - nominal) > max(BELIEF.tolerance * abs(nominal), SEARCH.doubt * plain.span * unit)
 
 
 FINER = 2  # steps of whole recordings, where an effect was found, in one of the windows'
