@@ -63,6 +63,8 @@ def run(
         joints=JOINTS,
         t=t,
         q=q + 1e-5 * rng.standard_normal(q.shape),
+        cmd_t=t,
+        cmd=q,
         torque=torque,
         torque_unit="N.m",
         read=None,

@@ -344,6 +344,7 @@ HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random
 AROUND = 0.2  # s over which it is measured how much a joint shakes, and how hard it is pushed
 TRAVEL = 0.02  # of its range: a joint that moves by less rests, between counts of its encoder
 CREST = 0.8  # of the largest push: what is as strong is its crest
+JUMP = 0.1  # of a target's whole way: as much from one command to the next is a jump
 DRAWS = 200  # of a bootstrap
 
 
@@ -414,6 +415,9 @@ def find_pushes(
                 int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE),
             )
             moving = _moving_one_another(model, runs[0].joints, j)
+            for run in runs:
+                left = [x for x in spans.pop(run.name, []) if not _asked(x, run, moving)]
+                spans |= {run.name: left} if left else {}
             if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], moving, cutoff):
                 continue
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
@@ -428,6 +432,15 @@ def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) ->
     of the others."""
     chains = [{*chain(model, model.jnt_bodyid[model.joint(x).id])} for x in joints]
     return [k for k, c in enumerate(chains) if c <= chains[j] or chains[j] <= c]
+
+
+def _asked(span: tuple[float, float], run: Run, joints: Sequence[int]) -> bool:
+    """Return whether a stretch [s] lies within `AROUND` of a jump of the target of one of `joints`: the drive asks for
+    what happens then, faster than low-passed readings tell of it. A contact that ends a step lasts longer."""
+    targets = run.cmd[:, joints]
+    jumps = np.abs(np.diff(targets, axis=0)) > JUMP * np.ptp(targets, axis=0)
+    at = run.cmd_t[1:][jumps.any(1)]
+    return bool(np.any((at - AROUND <= span[0]) & (span[1] <= at + AROUND)))
 
 
 def _by_ringing(
