@@ -68,9 +68,9 @@ def test_what_lasts_no_longer_than_a_jump_of_the_target_is_no_push():
     """The drive asks for it; what pushes on after a jump, as what a joint hits does, is told."""
     t = np.arange(0, 20, 0.01)
     jump = SimpleNamespace(cmd_t=t, cmd=np.stack([np.sin(0.3 * t), 1.0 * (t > 5.0)], 1))
-    asked = lambda a, b, joints=(0, 1): logged_torque._asked((a, b), jump, joints)  # noqa: E731
-    assert asked(4.9, 5.15) and not asked(4.9, 5.15, (0,))
-    assert not asked(4.9, 5.5) and not asked(7.0, 7.1)
+    thrown = lambda a, b, joints=(0, 1): logged_torque.thrown((a, b), jump, joints)  # noqa: E731
+    assert thrown(4.9, 5.15) and not thrown(4.9, 5.15, (0,))
+    assert not thrown(4.9, 5.5) and not thrown(7.0, 7.1)
 
 
 def test_what_friction_carries_at_rest_and_noise_are_no_push():

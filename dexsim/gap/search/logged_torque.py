@@ -416,7 +416,7 @@ def find_pushes(
             )
             moving = _moving_one_another(model, runs[0].joints, j)
             for run in runs:
-                left = [x for x in spans.pop(run.name, []) if not _asked(x, run, moving)]
+                left = [x for x in spans.pop(run.name, []) if not thrown(x, run, moving)]
                 spans |= {run.name: left} if left else {}
             if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], moving, cutoff):
                 continue
@@ -434,7 +434,7 @@ def _moving_one_another(model: mujoco.MjModel, joints: Sequence[str], j: int) ->
     return [k for k, c in enumerate(chains) if c <= chains[j] or chains[j] <= c]
 
 
-def _asked(span: tuple[float, float], run: Run, joints: Sequence[int]) -> bool:
+def thrown(span: tuple[float, float], run: Run, joints: Sequence[int]) -> bool:
     """Return whether a stretch [s] lies within `AROUND` of a jump of the target of one of `joints`: the drive asks for
     what happens then, faster than low-passed readings tell of it. A contact that ends a step lasts longer."""
     targets = run.cmd[:, joints]
