@@ -231,18 +231,19 @@ def test_contact_sums_agree_more_than_single_contacts(record):
 
 
 def thrown(steps: int, *settings: str) -> set[int]:
-    """Return the worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than
-    1.5 m/s in
-    one control step: gravity adds 0.2 m/s, a firm catch takes 0.6."""
+    """Return the worlds of 64, played by the included policy on C MuJoCo, whose object gains more than 0.8 m/s of speed
+    in one control step: gravity gives 0.2 m/s, fingers up to 0.6. (A velocity may turn by more: a prism of 41 g that
+    falls between thumb and palm with 1.2 m/s leaves with 0.5, also where the solver ends.)"""
     env, policy = play_env("grasp", 64, *settings)
     env.reset_all()
     obs, found = env.get_observations(), set()
+    speed = env.engine.t.qvel[:, env.object_v[:3]].norm(dim=1)
     with torch.no_grad():
         for _ in range(steps):
-            before = env.engine.t.qvel[:, env.object_v[:3]].clone()
+            before = speed
             obs, _, done, _ = env.step(policy(obs))
-            change = (env.engine.t.qvel[:, env.object_v[:3]] - before).norm(dim=1)
-            found |= set(((change > 1.5) & ~done.bool()).nonzero()[:, 0].tolist())
+            speed = env.engine.t.qvel[:, env.object_v[:3]].norm(dim=1)
+            found |= set(((speed - before > 0.8) & ~done.bool()).nonzero()[:, 0].tolist())
     return found
 
 
