@@ -26,6 +26,8 @@ G = 9.81
 class StubEngine:
     """Arrays only, no physics: N worlds of a model whose joints come after a free body, so that indices are shifted."""
 
+    kind = "mujoco"  # no graph records its launches
+
     def __init__(self, n: int, joints: int, real, dt: float = 0.005):
         links = "".join(
             f'<body pos="{i} 0 0"><joint name="j{i}" type="hinge" axis="0 1 0" damping="0.0{i + 1}"/>'
