@@ -162,7 +162,7 @@ def test_the_live_view_shows_any_hand(hands, pads):
         until = time.monotonic() + 60.0  # two steps, however busy the machine is
         while view.steps < 2 and time.monotonic() < until:
             view.run(seconds=0.5)
-        command = view._commanded(0)
+        command = env.commanded_force()[0].numpy()
         assert np.isnan(command).tolist() == [False, False, True] and view.steps == 2
     finally:
         view.stop()

@@ -190,6 +190,12 @@ class GraspEnv(Launches):
         """Return the speed of the object as the camera has it [N], m/s; 0 as an episode begins."""
         return self.vz_seen.masked_fill(self.episode_length_buf == 0, 0.0)
 
+    def commanded_force(self) -> torch.Tensor:
+        """Return the commanded force of each finger [N, F] in N; NaN for one that is told none."""
+        out = self.command[:, None].repeat(1, len(self.hand.finger_names))
+        out[:, self.opposing] = self.thumb_command.where(self.thumb_command >= 0, torch.nan)[:, None]
+        return self.f_max * out
+
     @observe("F/F_max")
     def contact_force(self) -> torch.Tensor:
         """sum of a pad's normal forces"""

@@ -168,8 +168,8 @@ def _play(
         names = _objects(out, env)
         frames["label"] = [f"{name}, {1000 * m:.0f} g, friction {mu:.1f}" for name, m, mu in
                            zip(names, out["mass"], out["friction"], strict=True)][: len(shot.worlds)]  # fmt: skip
-        for row, share in zip(frames["overlay"], out["command"], strict=False):
-            row["command"] = np.full(steps, share * env.f_max)
+        for row, command in zip(frames["overlay"], env.commanded_force().cpu().numpy(), strict=False):
+            row["command"] = np.broadcast_to(command, (steps, len(command)))
     return out, frames
 
 

@@ -299,22 +299,13 @@ class LiveView:
             self._image.image = self._map.image(forces, self._full_taxel)
         force = env.touch.force[w].cpu().numpy()
         fingers = force[: len(self.fingers)]
-        self._forces.content = panels.force_bars(self.fingers, fingers, self._commanded(w), self._full_force)
+        commanded = env.commanded_force()[w].cpu().numpy() if hasattr(env, "commanded_force") else None
+        self._forces.content = panels.force_bars(self.fingers, fingers, commanded, self._full_force)
         terms = {k: float(v[w]) for k, v in self._terms.items()}
         self._full_reward = max([0.99 * self._full_reward, 0.05, *(abs(v) for v in terms.values())])
         if terms:
             self._reward_html.content = panels.reward_bars(terms, self._totals, self._full_reward)
         self._facts.content = panels.facts(self._about(w))
-
-    def _commanded(self, world: int) -> np.ndarray | None:
-        """Return commanded force of each finger (N), NaN for those that press against the others, which are not told
-        one; None without commands."""
-        command, full = getattr(self.env, "command", None), getattr(self.env, "f_max", None)
-        if command is None or full is None or command.dim() != 1:
-            return None
-        commands = np.full(len(self.fingers), float(command[world]) * full)
-        commands[list(self.env.hand.opposing)] = np.nan
-        return commands
 
     def _about(self, world: int) -> dict[str, object]:
         env = self.env

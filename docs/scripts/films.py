@@ -50,8 +50,8 @@ def played(
         rows["qpos"].append(env.engine.t.qpos.double().cpu().numpy().copy())
         rows["force"].append(env.touch.force_clean.cpu().numpy().copy())
         rows["taxels"].append(env.touch.raw.cpu().numpy().copy())
-        if hasattr(env, "command"):
-            rows["command"].append((env.command * env.f_max).cpu().numpy().copy())
+        if hasattr(env, "commanded_force"):
+            rows["command"].append(env.commanded_force().cpu().numpy().copy())
             rows["push"].append(env.engine.t.xfrc_applied[:, env.objects.body, :3].cpu().numpy().copy())
     arrays = {k: np.stack(v, 1) for k, v in rows.items() if v}
     names = [env.objects.scene.variants[int(v)].shape.name for v in env.objects.variant]
@@ -224,7 +224,7 @@ def overview(out: Path) -> None:
     bars, hand = (page.crop([int(v * scale) for v in box]) for box in ((360, 275, 845, 405), (40, 270, 350, 605)))
     still.paste("white", (860, 56, 1284, 440))
     for picture, (x, y, width, height) in (
-        (turning[60].crop((140, 50, 640, 518)), (0, 56, 424, 384)),
+        (turning[60].resize((1280, 720)).crop((140, 50, 640, 518)), (0, 56, 424, 384)),
         (touched.crop((400, 150, 800, 460)), (430, 56, 424, 328)),
         (touched.crop((0, 555, 1280, 720)), (430, 385, 424, 55)),
         (bars, (866, 62, 412, 118)),
