@@ -164,6 +164,9 @@ def test_the_live_view_shows_any_hand(hands, pads):
             view.run(seconds=0.5)
         command = env.commanded_force()[0].numpy()
         assert np.isnan(command).tolist() == [False, False, True] and view.steps == 2
+        env.thumb_command.fill_(0.3)  # one of its own
+        share = env.commanded_force() / env.f_max
+        assert torch.allclose(share[:, 2], torch.tensor(0.3)) and torch.allclose(share[:, 0], env.command)
     finally:
         view.stop()
 
