@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.finding import Finding
 from dexsim.gap.judge import confidence, held_out
@@ -23,7 +22,7 @@ CASE = SimpleNamespace(
 
 def evidence(**changes) -> Evidence:
     given = (
-        dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, score=99.0, members=1, place=0)
+        dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, score=99.0, members=1)
         | changes
     )
     return Evidence(**given)
@@ -121,37 +120,11 @@ def test_weigh_takes_every_doubt_into_account():
     assert confidence.weigh(evidence(earned=0.3), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)
 
 
-def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_are_many():
-    sure, doubtful = evidence(effect="backlash", confidence=0.99), evidence(effect="deadband", confidence=0.4)
-    later = evidence(effect="supply_sag", confidence=0.99)
-    confidence.doubt_beside_others([sure, doubtful])
-    assert sure.confidence == 0.99
-    confidence.doubt_beside_others([doubtful, later])
-    assert later.confidence == DOUBTED and "deadband" in later.reasons[0]
-    crowd = [evidence(effect=x, confidence=0.99) for x in ("backlash", "deadband", "supply_sag")]
-    confidence.doubt_beside_others(crowd)
-    assert [e.confidence for e in crowd] == [0.99, DOUBTED, DOUBTED]
-
-
 def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():
     drags, dragged, other = (evidence(effect="payload", joint=j, confidence=0.99) for j in ("a", "b", "c"))
     dragged.effect = "joint_coupling"
     confidence.of_the_whole([drags, dragged, other], {"b": "a"}, {"c"})
     assert drags.confidence == DOUBTED and dragged.confidence == 0.99 and other.confidence == DOUBTED
-
-
-def test_two_torques_of_the_pose_can_be_any():
-    case = SimpleNamespace(scales=SimpleNamespace(span=1.5))
-    assert EFFECTS["payload"].of_pose({"mass": 0.1}, case) and EFFECTS["torque_ripple"].of_pose({"per_turn": 4.9}, case)
-    assert not EFFECTS["torque_ripple"].of_pose({"per_turn": 20}, case) and not EFFECTS["lag"].of_pose({}, case)
-    load, slow, fast = (
-        evidence(effect=e, confidence=0.99, of_pose=o)
-        for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False))
-    )
-    confidence.doubt_beside_others([load, fast])
-    assert load.confidence == fast.confidence == 0.99
-    confidence.doubt_beside_others([load, slow])
-    assert load.confidence == slow.confidence == DOUBTED and "any torque" in load.reasons[0]
 
 
 def test_what_hangs_on_a_misread_pose_is_doubted():
@@ -202,15 +175,6 @@ def test_temperature_that_follows_something_else(starts, gains, what):
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
     assert held_out.verdict([], 1.0, before, low, before, structured) == word
-
-
-def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():
-    both = [evidence(effect="lag", confidence=0.99), evidence(effect="inertia", confidence=0.9)]
-    confidence.doubt_beside_others(both)
-    assert both[0].confidence == 0.99 and both[1].confidence == DOUBTED and "what is fast" in both[1].reasons[0]
-    different = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
-    confidence.doubt_beside_others(different)
-    assert [e.confidence for e in different] == [0.99, 0.9]
 
 
 def test_what_is_neutral_is_not_believed_to_a_few_percent():

@@ -42,10 +42,7 @@ class Judged(JointAnswer):
         return {}, {}
 
     def _weighed(self, *_):
-        return confidence.Evidence("lag", "j", 0.95, 1.0, 0.0, 0.0, 0.0, 1, 0, confidence=0.95)
-
-    def _harmed(self, without_it):
-        return ""
+        return confidence.Evidence("lag", "j", 0.95, 1.0, 0.0, 0.0, 0.0, 1, confidence=0.95)
 
     def _score(self, without_it):
         return 99.0
@@ -102,7 +99,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="") -> confidence
     answer.outcome = SimpleNamespace(confidence={"lag": 1.0}, best=SimpleNamespace(folds=[]))
     answer.search = SimpleNamespace(unasked=set(), r=SimpleNamespace(sigma_torque=1.0))
     answer.member.variant.params = []
-    answer.member.effect.doubts, answer.member.effect.of_pose = lambda *_: [], lambda *_: False
+    answer.member.effect.doubts = lambda *_: []
     monkeypatch.setattr(confidence, "holds_nothing", lambda params, spread, case: spread)
     monkeypatch.setattr(confidence, "too_small", lambda *_: "")
     monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)

@@ -90,8 +90,8 @@ def test_play_rings_on_where_it_was_struck():
 def test_a_name_that_makes_a_joint_ring_as_it_does_is_as_sure_as_that():
     """What no free run keeps step with is judged by how it rings; a doubted name at most."""
     for rings, share, sure in ((0.95, 1.0, 0.7), (0.8, 0.6, 0.4), (0.4, 0.9, 0.45), (0.95, 0.3, 0.275)):
-        e = confidence.Evidence("backlash", "elbow", share, 0.0, 1.0, 1.0, [], 1, 0, ["not borne out"], 0.0)
-        other = confidence.Evidence("backlash", "wrist", 1.0, 0.0, 1.0, 1.0, [], 1, 0, ["not borne out"], 0.0)
+        e = confidence.Evidence("backlash", "elbow", share, 0.0, 1.0, 1.0, [], 1, ["not borne out"], 0.0)
+        other = confidence.Evidence("backlash", "wrist", 1.0, 0.0, 1.0, 1.0, [], 1, ["not borne out"], 0.0)
         conclude._judged_by_ringing(SimpleNamespace(evidence=[e, other]), {"elbow": rings})
         assert e.confidence == pytest.approx(sure, abs=0.01) and len(e.reasons) == 1, (rings, share)
         assert other.confidence == 0.0 and other.reasons == ["not borne out"]
@@ -120,7 +120,7 @@ def test_a_joint_that_rings_is_exempt_only_where_its_error_does_not_surely_rise(
     answer.after = 3.6 * answer.before
     names, worse = written()
     assert "by more with it" in worse["joint"] and not any(n.startswith("found") for n in names)
-    e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, 0, [], 0.0)
+    e = confidence.Evidence("compliance", "joint", 1.0, 0.0, 1.0, 1.0, [], 1, [], 0.0)
     d = SimpleNamespace(evidence=[e], notes=[])
     conclude._judged_by_ringing(d, {"joint": 0.95})
     conclude._not_better(d, worse)

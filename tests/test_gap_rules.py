@@ -172,7 +172,7 @@ def doubtful(**changes):
         "score": 99.0,
         "members": 1,
     }
-    return confidence.Evidence(**(given | {"place": 0, "confidence": 0.99} | changes))
+    return confidence.Evidence(**(given | {"confidence": 0.99} | changes))
 
 
 def test_one_reason_against_a_name_makes_it_doubted():
@@ -198,16 +198,6 @@ def test_what_removes_nothing_keeps_nothing():
 def test_a_name_earns_its_confidence_by_what_it_removes():
     less = lambda after: handed_on.earned(named(held_out={"before": 1.0, "after": after}))  # noqa: E731
     assert less(0.89) == 1.0 and 0.85 < less(0.91) < 0.95
-
-
-def test_many_effects_on_one_joint_are_doubted():
-    pair, three, five = (
-        [doubtful(effect=e) for e in ("deadband", "supply_sag", "backlash", "lag", "thermal")[:n]] for n in (2, 3, 5)
-    )
-    for mine in (pair, three, five):
-        confidence.doubt_beside_others(mine)
-    crowded = lambda mine: [any("effects on one joint" in r for r in e.reasons) for e in mine]  # noqa: E731
-    assert not any(crowded(pair)) and crowded(three) == [False, True, True] and all(crowded(five)[1:])
 
 
 def test_what_is_small_beside_another_effect_is_doubted():

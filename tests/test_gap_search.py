@@ -93,28 +93,6 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
     assert max(got, key=got.get) == "0"
 
 
-def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted(monkeypatch):
-    """before, after: in windows of what was held out; ratio: of a free run over it; gain: where it was fitted and on
-    conditions left out."""
-
-    def reason(before: float, after: float, ratio: float, gain: float, loss: float, reported: bool = False) -> str:
-        none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace(members=())
-        monkeypatch.setattr(conclude, "polished", lambda search, t: t)
-        monkeypatch.setattr(conclude, "share_removed", lambda search, a, b: gain)
-        monkeypatch.setattr(conclude, "loss_in_windows", lambda search, t, runs, span: before if t is none else after)
-        search = SimpleNamespace(case=SimpleNamespace(told=reported))
-        return conclude._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
-
-    assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
-    assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
-    assert reason(5.0, 1.1, 1.3, 0.8, 5.7, reported=True) == ""  # the recorded torque knows better
-    assert "does not show it" in reason(1.0, 1.0, 1.0, 0.6, 2.1)  # a limit that was not reached there
-    assert reason(1.0, 1.1, 1.02, 0.6, 2.1) == "" and reason(1.0, 1.0, 1.0, 0.15, 2.1) == ""
-    assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found
-    # beliefs moved out to follow: its windows miss it, a free run of it hardly
-    assert "moment to moment" in reason(1.4, 1.0, 1.0, 0.3, 1.1)
-
-
 def test_what_only_the_recording_held_out_shows_is_said():
     def alone(before: float, fitted: float, *found: Finding) -> list[str]:
         return conclude._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))

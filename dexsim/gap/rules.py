@@ -69,8 +69,7 @@ class SearchRules:
     # of a joint's typical torque: what reaches it from the motion of others: from it on it matters how well that is
     # known, and joints are searched again with what was found in the others
     coupled: float = 0.03
-    # share that an effect must remove of what is missed of how a joint rings to be named by it; of the squared error to
-    # be doubted only where a free run does not show it
+    # share that an effect must remove of what is missed of how a joint rings to be named by it
     plainly: float = 0.24
 
 
@@ -102,7 +101,6 @@ class JudgeRules:
     repeated: float = 0.2
     # share of what was held out that may say nothing of an effect: more of it is not a few moments
     most_left_out: float = 0.2
-    many_on_a_joint: int = 3  # effects on one joint from which on the smaller ones are taken for a series of stand-ins
     # of the squared error before: a further effect that removes less may be what the first one's law gets wrong
     least_share: float = 0.04
     left_costs: float = 0.5  # share of its confidence that a name loses at most by what stays unexplained
@@ -113,9 +111,8 @@ class JudgeRules:
     # second that it changes by half as much can speak of it; of several on a joint, one that surely removes less, and
     # without which the error is lower, is taken back
     part: float = 0.2
-    # share of the draws of recordings in which an effect may do more harm than good; of the bootstraps that a rival of
-    # its class wins without which the name is no set; false-discovery rate of what the rest is said to depend on
-    # (Benjamini and Hochberg 1995)
+    # share of the bootstraps that a rival of its class wins without which the name is no set; false-discovery rate of
+    # what the rest is said to depend on (Benjamini and Hochberg 1995)
     level: float = 0.05
     stretch: float = 0.5  # intervals grow by this, times the square of what is left of what was held out over the noise
     stretch_least: float = 0.5  # the least factor on intervals

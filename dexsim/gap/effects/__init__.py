@@ -211,9 +211,6 @@ class Effect:
     rings: ClassVar[bool] = False  # may make a loop ring by itself
     leads: ClassVar[bool] = False  # acts ahead of the target, as a drive does whose commands are stamped late
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
-    slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
-    # effects that are this one with a size of nothing, whatever else is like them
-    nests: ClassVar[tuple[str, ...]] = ()
     also_sizes: ClassVar[tuple[str, ...]] = ()  # parameters by which it is there though its first size is nothing
     # its columns say nothing without one another: one that is unknown is taken as absent, and the effect looked for
     whole: ClassVar[bool] = False
@@ -293,21 +290,12 @@ class Effect:
         its model's friction included."""
         return self.words
 
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        """Return whether it is a torque that follows the pose and changes slowly along it."""
-        return False
-
     def impossible(self, values: dict[str, float], case: Case) -> str:
         """Say why it cannot be of this size; empty where it can."""
         return ""
 
     def doubts(self, case: Case, runs: Sequence[int]) -> list[str]:
         """Return reasons of its own to doubt it, from the recordings that were used."""
-        return []
-
-    def begun_from(self, columns: dict[str, float], case: Case) -> list[tuple[float, ...]]:
-        """Return where a fit of its first variant begins to be the same torque as these columns' values are; empty
-        where none is."""
         return []
 
     def excludes(self, mine: Variant, other: Effect, theirs: Variant) -> bool:

@@ -29,7 +29,6 @@ class Inertia(Effect):
     experiment = "steps and a fast chirp"
     motions = ("chirp",)
     from_poses = True
-    slows = True
     model_columns = ("armature",)
 
     def variants(self, s: Scales) -> list[Variant]:
@@ -148,9 +147,6 @@ class Payload(Effect):
             return f"carries {'more' if p['mass']['value'] > 0 else 'less'} mass than the model"
         return "hangs in another direction of gravity than the model"
 
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        return True
-
     def impossible(self, values: dict[str, float], case: Case) -> str:
         mass, carried = values.get("mass", 0.0), case.constants.carried
         return (
@@ -244,7 +240,6 @@ class JointSpring(Effect):
     experiment = "static poses over the whole range, and the drive off at each"
     classes = ("static load", "friction or pull")
     motions = ("holds",)
-    nests = ("coulomb_friction",)  # as it differs by direction: a preload without stiffness
     also_sizes = ("preload",)
     from_poses = True
     model_columns = ("spring", "spring_preload")
@@ -257,14 +252,6 @@ class JointSpring(Effect):
         preload = param("preload", "spring_preload", "set", -2.0 * s.tau, 2.0 * s.tau, 0.0, "N" if s.slide else "N.m")
         starts = ((0.1, 0.0), (0.3, 0.0), (0.3, 0.2), (0.3, -0.2), (0.8, 0.0), (0.8, 0.4), (0.8, -0.4), (1.6, 0.0))
         return [Variant((stiffness, preload), tuple((k * unit, p * s.tau) for k, p in starts))]
-
-    def begun_from(self, columns: dict[str, float], case: Case) -> list[tuple[float, ...]]:
-        if set(columns) != {"coulomb_friction", "friction_asymmetry"} or not self.variants(case.scales):
-            return []
-        # the level counts for half of it more one way and half less the other
-        pull = 0.5 * columns["friction_asymmetry"] * columns["coulomb_friction"]
-        unit, middle = case.scales.tau / case.scales.span, float(np.median(case.plant.q))
-        return [(k, pull - k * middle) for k in (0.0, 0.1 * unit)]
 
     def unseen(self, s: Scales) -> str:
         return "" if self.variants(s) else (
@@ -282,9 +269,6 @@ class JointSpring(Effect):
             ends = [-p / c for c in fit.interval["stiffness"] for p in fit.interval["preload"]]
             out["rest"] = entry(-at / k, min(ends), max(ends), fit.length)
         return out
-
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        return True
 
     def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         joint, k = spec.joint(case.joint), values["stiffness"]

@@ -25,7 +25,6 @@ class CommandDelay(Effect):
     experiment = "steps and a fast chirp"
     classes = ("late",)
     motions = ("steps", "chirp")
-    slows = True
     demo = {"delay": 0.02}
 
     def variants(self, s: Scales) -> list[Variant]:
@@ -47,7 +46,6 @@ class Lag(Effect):
     experiment = "steps and a fast chirp"
     classes = ("late",)
     motions = ("steps", "chirp")
-    slows = True
     rings = True
 
     def lacks(self, variant: Variant) -> tuple[str, str] | None:
@@ -147,9 +145,6 @@ class PositionOffset(Effect):
     def unseen(self, s: Scales) -> str:
         return "" if self.variants(s) else "gravity hardly acts on the joint, so its zero leaves no trace"
 
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        return True
-
 
 class PositionScale(Effect):
     """An encoder's scale error, or its eccentricity."""
@@ -205,9 +200,6 @@ class PositionScale(Effect):
         size = np.hypot(fit.value["ecc_sin"], fit.value["ecc_cos"])
         half = 0.5 * max(np.ptp(fit.interval["ecc_sin"]), np.ptp(fit.interval["ecc_cos"]))
         return {"eccentricity": entry(size, max(size - half, 0.0), size + half, "rad")}
-
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        return True
 
 
 class CurrentSensor(Effect):

@@ -151,9 +151,6 @@ class TorqueRipple(Effect):
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"amplitude": fit.entry("amplitude", fit.force), "per_turn": fit.entry("per_turn", "1")}
 
-    def of_pose(self, values: dict[str, float], case: Case) -> bool:
-        return 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span  # less than two periods show
-
 
 class JointCoupling(Effect):
     """A joint that is dragged along by another: a tendon or a linkage."""

@@ -30,8 +30,7 @@ from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.hypotheses import unknown
-from dexsim.gap.search.scan import share_removed
-from dexsim.gap.search.search import JointSearch, Outcome, Trial, loss_in_windows, polished, widened
+from dexsim.gap.search.search import Trial, widened
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -255,15 +254,10 @@ def _take_back(
         v = d.joints[joint]
         if not mine or joint in rings or _less(v["after"], v["before"]):
             continue
-        reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
-        elsewhere = _less(v["told_after"], v["told_before"])  # but for moments that nothing follows
-        if reason or elsewhere:
+        if _less(v["told_after"], v["told_before"]):  # but for moments that nothing follows
             for e in d.evidence:
-                if e.joint == joint and not EFFECTS[e.effect].effort_only:
-                    if reason:
-                        e.doubt(reason)
-                    elif MUTE not in e.reasons:
-                        e.hint(MUTE)
+                if e.joint == joint and not EFFECTS[e.effect].effort_only and MUTE not in e.reasons:
+                    e.hint(MUTE)
             continue
         refuted.add(joint)
         d.notes += [
@@ -391,22 +385,6 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Findi
     ]
 
 
-def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
-    """Return why findings that do not lessen the error of a free run over what was held out (after / before: `ratio`)
-    are doubted, not dropped; empty where they are refuted. One stick more or less sends a free run another way; and a
-    limit may just not have been reached there. What the recorded torque has told of a joint is known: nothing that is
-    not shown goes beyond it."""
-    if search.case.told:
-        return ""
-    before, after = (loss_in_windows(search, polished(search, t), test, span) for t in (outcome.none, outcome.best))
-    if before > SEARCH.enough**2 and after < (1 - SEARCH.plainly) * before:
-        return "what was held out is followed better from moment to moment, but not by a free run"
-    sides_with_neither = not _less(1.0, ratio) and after <= before / (1 - SEARCH.tie)
-    gain = share_removed(search, outcome.best, outcome.none)
-    plain = outcome.none.fit.loss > SEARCH.enough**2 and gain >= SEARCH.plainly
-    return "what was held out does not show it" if sides_with_neither and plain else ""
-
-
 def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> list[Finding]:
     """Return the joints' findings (the weightiest first), as sure as what they and the signals say of each other
     leaves them."""
@@ -414,8 +392,6 @@ def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> li
     mine = [by[f.joints[0], f.effect] for f in findings]
     shakes = [e for e in mine if e.joint in d.ringing and EFFECTS[e.effect].rings]  # no window keeps step with it
     confidence.share_odds([e for e in mine if e not in shakes], sum(len(x.scanned) for x in d.outcomes))
-    for joint in {e.joint for e in mine}:
-        confidence.doubt_beside_others([e for e in mine if e.joint == joint])
     coupled = {f.joints[0]: f.parameters["from_joint"]["value"] for f in findings if EFFECTS[f.effect].couples}
     signs = {j for f in channel if f.regime.startswith(SIGN) for j in f.joints}
     others = {j for f in channel if not f.regime.startswith(SIGN) for j in f.joints}

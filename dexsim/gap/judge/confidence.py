@@ -37,11 +37,9 @@ class Evidence:
     left_of_rest: float
     score: float
     members: int
-    place: int
     reasons: list[str] = field(default_factory=list)
     odds: float = 1.0
     confidence: float = 0.0
-    of_pose: bool = False  # whether it is a torque that changes slowly with the pose alone
 
     def hint(self, reason: str) -> None:
         """Makes it a hint."""
@@ -170,33 +168,6 @@ def share_odds(all_: list[Evidence], tried: int) -> None:
         e.confidence *= e.odds
         if e.odds < JUDGE.firm:
             e.reasons.append(f"of {tried} hypotheses that were tried one does as well by accident")
-
-
-def doubt_beside_others(mine: list[Evidence]) -> None:
-    """What the findings of one joint (the largest first) say of each other."""
-    slow = [e for e in mine if e.of_pose]
-    for k, e in enumerate(mine):
-        e.place = k
-        if e.of_pose and len(slow) > 1:
-            e.doubt(
-                f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on "
-                "the pose",
-            )
-        doubtful = next((x for x in mine[:k] if x.confidence < JUDGE.doubted), None)
-        if doubtful is not None:
-            e.doubt(f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
-        alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
-        if alike is not None:
-            e.doubt(
-                f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up "
-                "for what the other is off by",
-            )
-        if EFFECTS[e.effect].misreads and any(EFFECTS[x.effect].couples for x in mine):
-            e.hint(
-                "it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike"
-            )
-        if len(mine) >= JUDGE.many_on_a_joint and k > 0:
-            e.doubt(f"{len(mine)} effects on one joint: together they may stand for another")
 
 
 def of_touch(findings: list[Finding], before: float, noise: float) -> tuple[list[Finding], list[str]]:

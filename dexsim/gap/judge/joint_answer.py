@@ -24,8 +24,7 @@ from dexsim.gap.rules import BELIEF, JUDGE, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, intervals
 from dexsim.gap.search.hypotheses import JointSearch, Member, Outcome, Trial
 from dexsim.gap.search.scan import cv_loss
-from dexsim.gap.search.search import law_spread, loss_by_run, polished, widened
-from dexsim.intervals import draws
+from dexsim.gap.search.search import law_spread, polished, widened
 from dexsim.recording.mechanism import Mechanism
 
 MUTE = "moments of what was held out are followed neither with it nor without; the others alone speak for it"
@@ -180,11 +179,11 @@ class JointAnswer:
             told = held_out.gain_interval(misread, of_effort, self.t[self.sensed])
         else:
             was, left = rms(lost), rms(self.after)
-        evidence = self._judged(mm, trial, raw, was, left, gain[0])
+        evidence = self._judged(mm, raw, was, left, gain[0])
         on = held_out.telling(lost, self.after, self.t, self.case.sigma)
         if not effort_only and not on.all():  # what the other moments say of it, as a hint
             part = held_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
-            other = self._judged(mm, trial, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
+            other = self._judged(mm, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
             other.hint(MUTE)
             evidence = max(other, evidence, key=lambda e: e.confidence)
         evidence.score = self._score(trial)
@@ -213,7 +212,6 @@ class JointAnswer:
     def _judged(
         self,
         mm: Member,
-        without_it: Trial,
         raw: dict[str, float],
         was: float,
         left: float,
@@ -232,8 +230,6 @@ class JointAnswer:
             )
         elif not effort_only and surely < -SEARCH.tie:
             evidence.hint("the error on what was held out is not lower with it than without, as far as its blocks tell")
-        if not effort_only and (harmed := self._harmed(without_it)):
-            evidence.hint(harmed)
         return evidence
 
     def _score(self, without_it: Trial) -> float:
@@ -241,18 +237,6 @@ class JointAnswer:
         another: normal residuals of unknown size, alike within half a second and independent beyond."""
         lost, mine = (cv_loss(self.search, t) for t in (without_it, self.best))
         return 0.5 * len(mine) * float(np.log(lost.sum() / mine.sum()))
-
-    def _harmed(self, without_it: Trial) -> str:
-        """Return why an effect is a hint only: what it gains in some recordings it loses in others, as what differs
-        from run to run does; empty where it helps or does nothing in nearly every draw of the recordings."""
-        lost, mine = (loss_by_run(self.search, t) for t in (without_it, self.best))
-        runs = np.flatnonzero(lost > 0)
-        if len(runs) < 3:
-            return ""
-        sums = lambda *x, axis=-1: np.stack([one.sum(axis) for one in x])  # noqa: E731
-        gained, of = draws(((lost - mine)[runs], lost[runs]), sums, 0, held_out.DRAWS)
-        harms = float(np.mean(gained < -SEARCH.tie * of)) > JUDGE.level
-        return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
     def _fitted(self, mm: Member, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """Return values and intervals of one effect's parameters, of `bounds` [P, 2]."""
@@ -283,7 +267,7 @@ class JointAnswer:
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence[mm.id], earned,
             confidence.left_over(after, before, noise),
-            confidence.left_over(after, error_without, noise), 0.0, len(self.best.members), 0)
+            confidence.left_over(after, error_without, noise), 0.0, len(self.best.members))
         nothing, as_reported = (confidence.holds_nothing(params, x, case) for x in (as_fitted, reported))
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
@@ -304,7 +288,6 @@ class JointAnswer:
         elif far := confidence.beyond(params, reported, case):
             evidence.reasons.append(f"its {far.replace('_', ' ')} may be larger than what is looked for")
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
-        evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
         if unlike := confidence.not_repeated(params, self._by_fold(mm), case):
             evidence.reasons.append(unlike)

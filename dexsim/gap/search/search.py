@@ -11,13 +11,13 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.gap.effects import Variant
-from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
+from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, SIGNAL
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, huber_square, slopes_of
-from dexsim.gap.search.hypotheses import LONG, MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, named, subset
+from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, slopes_of
+from dexsim.gap.search.hypotheses import MAYBE, JointSearch, Member, Outcome, Trial, fits_beside, subset
 from dexsim.gap.search.scan import (
     BOOTSTRAPS,
     STRETCH,
@@ -105,46 +105,11 @@ def search_joint(search: JointSearch) -> Outcome:
             current = swapped(search, current, pool)
     search.tell("what is not needed")
     if not search.deadline.over():
-        for move in (dropped, approximated, refined_members, by_laws, more_general):
+        for move in (dropped, approximated, refined_members, by_laws):
             current = move(search, current)
     current, final = settled(search, current, pool)
     rivals, confidence = {e: x[0] for e, x in final.items()}, {e: x[1] for e, x in final.items()}
     return Outcome(search.case.joint, none, current, rivals, confidence, scanned)
-
-
-def more_general(search: JointSearch, current: Trial) -> Trial:
-    """Return `current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
-    unknown anyway only that it differs by direction is found, which is a spring without stiffness, and on a joint
-    that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
-    general one leaves."""
-    for member in current.members:
-        more = [e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids]
-        if not more:
-            continue
-        fitted = dict(zip([p.key for p in current.fit.params], current.fit.x, strict=True))
-        columns = {p.columns[0]: float(fitted[f"{member.id}.{p.key}"]) for p in member.variant.params}
-        columns |= {c: float(fitted[c]) for c in EFFECTS[member.id].fitted_anyway if c in fitted}
-        rest = tuple(m for m in current.members if m is not member)
-        for effect in more:
-            starts = effect.begun_from(columns, search.case)
-            if not starts or not search.asked(effect) or search.deadline.over():
-                continue
-            wider = Member(effect, effect.variants(search.case.scales)[0])
-            if len(columns) == len(member.variant.params) or any(not fits_beside(wider, m) for m in rest):
-                continue  # its level was found too
-            members = tuple(wider if m is member else m for m in current.members)
-            params = [p for m in members for p in named(m)] + [p for p in current.fit.params if p.nuisance]
-            fits = []
-            for start in starts:  # from what is known to follow, in steps of slopes of its own
-                fitted |= {p.key: x for p, x in zip(named(wider), start, strict=True)}
-                x0 = np.array([fitted[p.key] for p in params])
-                fits.append(search.fitter.given(members).fit(params, x0=x0, iterations=8))
-            new = search.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
-            mine, theirs = (cv_loss(search, t).sum() * price_factor(search, t) for t in (current, new))
-            if (1 - SEARCH.least) * theirs < mine and not search.shrunk(new):
-                search.fitted[frozenset(new.ids)] = new
-                return new
-    return current
 
 
 def drafts_of(
@@ -449,8 +414,6 @@ def overtaken(
         others, share = final[m.id]
         if others:
             rival = others[0][0]
-            if rival in EFFECTS[m.id].nests:  # it had its turn (`more_general`)
-                continue
             # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
             like = (
                 sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival))
@@ -636,23 +599,6 @@ def polished_anew(search: JointSearch, trial: Trial) -> Trial:
         if again.loss < 1.5 * trial.fit.loss and not search.shrunk(polished):
             return polished
     return trial
-
-
-def loss_by_run(search: JointSearch, trial: Trial) -> np.ndarray:
-    """Return [R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
-    a = huber_square(search.fitter.given(trial.members).evaluate(trial.fit.params, trial.fit.x), search.r.huber)
-    run, count = search.long.run[search.fitter.window], search.case.plant.runs
-    return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
-
-
-def loss_in_windows(
-    search: JointSearch, trial: Trial, runs: Sequence[int], span: dict[int, tuple[float, float]] | None
-) -> float:
-    """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
-    windows = search.case.plant.windows(LONG, runs, span=span)
-    if not len(windows.window):
-        return np.nan
-    return _loss(Fitter(search.case.plant, windows, search.r), trial)
 
 
 def widened(search: JointSearch, trial: Trial, bounds: np.ndarray) -> np.ndarray:
