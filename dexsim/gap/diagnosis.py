@@ -57,11 +57,7 @@ from dexsim.gap.touch.diagnosis import Touch
 from dexsim.recording.schema import COMMANDS, STATES
 
 
-def diagnose(
-    s: Settings,
-    say: Callable[[str], None] = print,
-    progress: Callable[..., None] | None = None,
-) -> Diagnosis:
+def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[..., None] | None = None) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
     w = Inquiry(s, say, progress, s.time_limit or TimeLimit(s.limit))
     with warnings.catch_warnings():  # a guess far off overflows, and loses: nobody need know
@@ -74,7 +70,7 @@ def _diagnosed(w: Inquiry) -> Diagnosis:
     s, progress = w.settings, w.progress
     read_files(w)
     to_runs(w)
-    touch = Touch(w.readable, w.m, w.held_names, s.seed, s.allowed, progress, w.limit)
+    touch = Touch(w.readable, w.m, {w.names[p] for p in s.held_out or []}, s.seed, s.allowed, progress, w.limit)
     touch.run()
     w.notes += touch.result.notes
     w.clock.lap("touch")
@@ -456,9 +452,7 @@ class Drives(Steps):
         unsettled = [
             k
             for k, (search, found) in enumerate(answers)
-            if found is not None
-            and search.case.joint not in self.unknown_controllers
-            and _unsettled(found)
+            if found is not None and search.case.joint not in self.unknown_controllers and _unsettled(found)
         ]
         found = [x for _, x in answers if x is not None]
         if len(unsettled) < 2 or len(found) < len(answers) or not self._time_for(
@@ -466,9 +460,7 @@ class Drives(Steps):
         ):
             return
         self._coupled_by(_moved_by(self.mj_model, [search.case.joint for search, _ in answers], found))
-        unsettled = [
-            k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), found[k])
-        ]
+        unsettled = [k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), found[k])]
         self._left = len(unsettled)
         joints = [self.cases[k].joint for k in unsettled]
         renewed = map_joints(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
@@ -616,23 +608,14 @@ class Drives(Steps):
                 w.limit.leave_out("what is written is chosen in the search's own plant")
             if cases and self.written.share < 1:
                 which = "chosen and replayed" if self.written.by_replay else "replayed"
-                w.limit.leave_out(f"what is written is {which} over {_first_part(self.written.share)} held out")
+                part = f"the first {100 * self.written.share:.0f} % of each part held out"
+                w.limit.leave_out(f"what is written is {which} over {part}")
         w.clock.lap("choice in the engine that trains")
 
     def report(self, d: Diagnosis) -> None:
         """The joints into a diagnosis: findings, verdict, what is handed on."""
         w, p = self.w, self.parts
-        into_diagnosis(
-            d,
-            w.settings,
-            self.answers,
-            p,
-            self.noise,
-            w.channel,
-            self.plains,
-            self.written,
-            self.refused,
-        )
+        into_diagnosis(d, w.settings, self.answers, p, self.noise, w.channel, self.plains, self.written, self.refused)
         if self.ranges:
             d.model_spec = w.m.spec if d.model_spec is None else d.model_spec
             w.notes += self.ranges
@@ -669,11 +652,6 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
         for e in sorted(asked or ())
         if e in left_out
     ]
-
-
-def _first_part(share: float) -> str:
-    """Return a share of each part held out, in words."""
-    return f"the first {100 * share:.0f} % of each part"
 
 
 def _evenly(runs: Sequence[Run], held: set[int], share: float) -> list[int]:

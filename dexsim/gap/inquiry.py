@@ -221,11 +221,6 @@ class Inquiry:
         """The recordings that could be read, by their runs' name."""
         return {r.path.name: r for r in self.readable}
 
-    @property
-    def held_names(self) -> set[str]:
-        """Names of the recordings that are to be held out of the fit."""
-        return {self.names[p] for p in self.settings.held_out or []}
-
     def nothing_left(self) -> bool:
         """Return whether no run is left, or none that is fitted."""
         return not self.runs or bool(self.settings.held_out and len(self.held) == len(self.runs))

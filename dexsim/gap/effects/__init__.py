@@ -175,13 +175,7 @@ def word(value: str) -> dict[str, Any]:
 
 
 def param(
-    key: str,
-    column: str | tuple[str, ...],
-    mode: str,
-    low: float,
-    high: float,
-    start: float = 0.0,
-    unit: str = "1",
+    key: str, column: str | tuple[str, ...], mode: str, low: float, high: float, start: float = 0.0, unit: str = "1"
 ) -> Param:
     """Return a `Param` of one column or several."""
     columns = (column,) if isinstance(column, str) else tuple(column)

@@ -42,9 +42,7 @@ class Inertia(Effect):
         return case.regimes["acceleration"]
 
     def said(self, finding: Finding, believed: dict[str, float]) -> str:
-        return self.words.replace(
-            "more (or less)", "more" if finding.parameters["armature"]["value"] > 0 else "less"
-        )
+        return self.words.replace("more (or less)", "more" if finding.parameters["armature"]["value"] > 0 else "less")
 
     def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         return [add_armature(spec, case.joint, values["armature"])]

@@ -183,7 +183,7 @@ def candidates(
         case, plain = a.case, by.get(a.case.joint)
         rings = _rings(a) > SEARCH.least
         trials = {"refitted": (a.none, a.before)} | ({"found": (a.best, a.after)} if a.best.members else {})
-        given = [Candidate(BELIEVED, rms(a.before) if plain is None else plain.error_before, _nothing)]
+        given = [Candidate(BELIEVED, rms(a.before) if plain is None else plain.error_before, lambda table, spec: [])]
         for name, (trial, squares) in trials.items():
             sizes = values_of(trial)
             reasons = [x.effect.impossible(sizes[x.id], case) for x in trial.members]
@@ -208,10 +208,6 @@ def candidates(
             given = [replace(c, write=told[case.joint].over(c.write)) for c in given]
         out[case.joint] = given
     return out, refused
-
-
-def _nothing(table: ServoTable, spec: mujoco.MjSpec) -> list[str]:
-    return []
 
 
 def _write(
@@ -305,12 +301,7 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
 
 
 def _judged(
-    answers: Sequence[JointAnswer],
-    kept: held_out.Split,
-    refuted: set[str],
-    seed: int,
-    quiet: bool,
-    noise: Noise,
+    answers: Sequence[JointAnswer], kept: held_out.Split, refuted: set[str], seed: int, quiet: bool, noise: Noise
 ) -> Judged:
     """Return errors over all joints on what was held out."""
     slide, how = all(x.case.constants.slide for x in answers), kept.how
@@ -344,9 +335,7 @@ def _judged(
     return Judged(position(all_of_it, how), effort, None, structured, quiet, loud, shown)
 
 
-def _loud(
-    answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise, refuted: set[str]
-) -> tuple[str, ...]:
+def _loud(answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise, refuted: set[str]) -> tuple[str, ...]:
     """Return the recordings held out, joint by joint, that are surely missed by more than their own repeats differ
     by, with what was found of the joint where it keeps that, in words."""
     said = []
@@ -378,11 +367,7 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Findi
     """Return joints without a finding of which what was held out is missed by far more than the noise, and what was
     fitted is not: what is missing (a limit, a sag) shows there alone, and what is held out must not be fitted."""
     found = {j for f in findings for j in f.joints}
-    return [
-        j
-        for j, v in joints.items()
-        if j not in found and v["before"] > JUDGE.far * v["sigma"] >= v["fitted"]
-    ]
+    return [j for j, v in joints.items() if j not in found and v["before"] > JUDGE.far * v["sigma"] >= v["fitted"]]
 
 
 def _doubts(d: Diagnosis, findings: list[Finding], channel: list[Finding]) -> list[Finding]:
@@ -421,11 +406,7 @@ def _linkages(findings: list[Finding], answers: Sequence[JointAnswer]) -> list[F
         for mm in a.outcome.best.members
         if mm.effect.couples and mm.variant.params[0].columns == ("reaction",)
     }
-    ends = {
-        (f.joints[0], f.parameters["from_joint"]["value"]): f
-        for f in findings
-        if EFFECTS[f.effect].couples
-    }
+    ends = {(f.joints[0], f.parameters["from_joint"]["value"]): f for f in findings if EFFECTS[f.effect].couples}
     out = list(findings)
     for (joint, other), f in ends.items():
         second = ends.get((other, joint))
@@ -496,9 +477,7 @@ def claim_push(d: Diagnosis, pushes: Sequence[logged_torque.Push]) -> None:
         return
     joints = {p.joint for p in pushes if not p.cut}
     kept = [
-        f
-        for f in d.findings
-        if f.effect not in EFFECTS or EFFECTS[f.effect].effort_only or not joints & set(f.joints)
+        f for f in d.findings if f.effect not in EFFECTS or EFFECTS[f.effect].effort_only or not joints & set(f.joints)
     ]
     d.notes += [
         f"{f.effect} on {', '.join(f.joints)} is not claimed: something outside moved the joint, or "
@@ -726,9 +705,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     prefix = _first_of_all([f for f in d.findings if not f.hint], bad, d)
     if data["verdict"] == "none":
         return (
-            prefix
-            + "Nothing in the catalogue is missing: the simulator follows "
-              f"{_where_judged(h)} to {before:.2g} {unit}; {limit}.{replayed}"
+            prefix + "Nothing in the catalogue is missing: the simulator follows "
+            f"{_where_judged(h)} to {before:.2g} {unit}; {limit}.{replayed}"
         )
     if data["verdict"] == "explained" and not named and bad:
         return (
@@ -750,10 +728,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
             left = f"{number(1e3 * plain)} {unit} are left by the plain model, which is handed on,"
         else:
             left = f"{number(after)} {unit} are left"
-        return (
-            prefix
-            + f"Something is missing that no effect of the catalogue explains: {left} where {limit}{depends}."
-        )
+        return prefix + f"Something is missing that no effect of the catalogue explains: {left} where {limit}{depends}."
     of = ""
     alone = {j for f in named for j in f.joints}
     # not thinned by joints that are well
@@ -861,8 +836,7 @@ def place(f: Finding, m: Mechanism | None) -> str:
         return (
             f"the {fingers}'s pad"
             if count > 12 or "taxels" not in f.parameters
-            else f"the {fingers}'s pad (taxel{'s' * (count > 1)} "
-                 f"{', '.join(t.split(':')[1] for t in f.taxels)})"
+            else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f.taxels)})"
         )
     return ", ".join(f.topics)
 

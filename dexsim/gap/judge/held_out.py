@@ -216,7 +216,6 @@ def _near(cases: Sequence[Case], names: Collection[str]) -> dict[str, np.ndarray
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------
-# Errors on what was held out of the fit, the floor, when an effect acts, the verdict.
 
 DRAWS = 400  # of a bootstrap
 
@@ -302,9 +301,7 @@ def _apart(pairs: Sequence[tuple[_Left, _Left]]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(d) ** 2) / 2.0))
 
 
-def rms_interval(
-    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0
-) -> tuple[float, float, float]:
+def rms_interval(squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0) -> tuple[float, float, float]:
     """Return (rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all
     joints."""
     sums, counts = [], []
@@ -361,11 +358,6 @@ def lowers(f: Finding) -> bool:
     return bool(h["removed_low"] >= -SEARCH.tie and h["after"] ** 2 <= (1 - JUDGE.part) * h["before"] ** 2)
 
 
-def wrong_signals(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings that a signal is not what it says, where they are more than hints."""
-    return [f for f in findings if f.wrong_signal and f.confidence >= JUDGE.firm]
-
-
 def verdict(
     findings: Sequence[Finding],
     floor: float,
@@ -388,7 +380,7 @@ def verdict(
             or before <= JUDGE.within * floor
             or (before <= JUDGE.far * floor and (before_low <= JUDGE.within * floor or not structured))
         ):
-            return "explained" if wrong_signals(findings) else "none"
+            return "explained" if any(f.wrong_signal and f.confidence >= JUDGE.firm for f in findings) else "none"
         return "unknown"
     # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
     if after <= JUDGE.within * floor:

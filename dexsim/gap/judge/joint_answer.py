@@ -210,13 +210,7 @@ class JointAnswer:
         )
 
     def _judged(
-        self,
-        mm: Member,
-        raw: dict[str, float],
-        was: float,
-        left: float,
-        surely: float,
-        before: float | None = None,
+        self, mm: Member, raw: dict[str, float], was: float, left: float, surely: float, before: float | None = None
     ) -> confidence.Evidence:
         """Return the evidence of one effect: was, left: rms error of what was held out without and with it; surely:
         share of the squared error that it removes in all but a twentieth of its draws; before: error before anything
@@ -386,9 +380,7 @@ def nuisances(joint: str, trial: Trial) -> dict[str, float]:
             for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
 
 
-def _curve(
-    case: Case, runs: Sequence[Run], rows: np.ndarray, q0: np.ndarray, q1: np.ndarray, worst: int
-) -> Curve:
+def _curve(case: Case, runs: Sequence[Run], rows: np.ndarray, q0: np.ndarray, q1: np.ndarray, worst: int) -> Curve:
     t, r = case.plant.t[rows], case.plant.run_of[rows]
     run = r[worst]
     pick = np.flatnonzero((r == run) & (np.abs(t - t[worst]) < 4.0))

@@ -185,11 +185,7 @@ class Motion:
 
 
 def build(
-    model: mujoco.MjModel,
-    runs: list[Run],
-    device: str = "cpu",
-    dt: float = 1e-3,
-    only: set[str] | None = None,
+    model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float = 1e-3, only: set[str] | None = None
 ) -> list[Case]:
     """Return one case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     voltage = runs[0].servo.drive == "voltage"
@@ -471,7 +467,7 @@ def _regimes(
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Return variables [n] of each measured sample, that a residual may depend on."""
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
-    since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _rows_by_run(run_of)])
+    since = np.concatenate([_since_reversal(t[run_of == r], v[run_of == r], small) for r in np.unique(run_of)])
     out = {
         "time since reversal": since,
         "speed": np.abs(v),
@@ -493,11 +489,6 @@ def _regimes(
         if o != j and J <= 16:
             out[f"motion of {runs[0].joints[o]}"] = np.abs(np.concatenate([r.vs[:, o] for r in runs]))
     return out
-
-
-def _rows_by_run(run_of: np.ndarray) -> list[np.ndarray]:
-    """Return rows [n] of each run, in their order."""
-    return [np.flatnonzero(run_of == r) for r in np.unique(run_of)]
 
 
 def _since_reversal(t: np.ndarray, v: np.ndarray, small: float) -> np.ndarray:

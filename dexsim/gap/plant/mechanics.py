@@ -156,20 +156,13 @@ def of_motion(
             put(j, f"tilt_{letter}_cos", c)
             put(j, f"tilt_{letter}_sin", s)
     constants = [
-        _constants(model, ids[j], bodies[j], leaves[j], bool(slide[j]), places[j], diag[:, j])
-        for j in range(J)
+        _constants(model, ids[j], bodies[j], leaves[j], bool(slide[j]), places[j], diag[:, j]) for j in range(J)
     ]
     return out, constants
 
 
 def _constants(
-    model: mujoco.MjModel,
-    joint: int,
-    body: int,
-    leaf: int,
-    slide: bool,
-    places: np.ndarray,
-    inertia: np.ndarray,
+    model: mujoco.MjModel, joint: int, body: int, leaf: int, slide: bool, places: np.ndarray, inertia: np.ndarray
 ) -> JointConstants:
     """Return what does not change along a motion. joint, body, leaf: numbers in the model; inertia [n]: along the
     motion."""

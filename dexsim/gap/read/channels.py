@@ -249,7 +249,7 @@ def _wrong(
             [STATES, COMMANDS],
         )
     far = [] if limits is None else [
-        (what, topic, _farthest(x, limits))
+        (what, topic, float(x[np.argmax(np.abs(x - np.mean(limits)))]))
         for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
         if _outside(x, limits) > max(SIGNAL.far * (limits[1] - limits[0]), 2 * np.pi)
         and not (what == "target" and _within_drive(run, j))
@@ -269,8 +269,7 @@ def _wrong(
     if lead > SIGNAL.early and not _clocked(run, j, targets):
         return _Wrong(
             "clock_skew",
-            f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
-            "different clocks",
+            f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on different clocks",
             [COMMANDS, STATES],
         )
     early = _early_edges(run, j)
@@ -383,10 +382,6 @@ def _within_drive(run: Run, j: int) -> bool:
     row = run.servo.nominal(run.joints)[j]
     asked = row[INDEX["kp"]] * (float(np.abs(run.cmd[:, j]).max()) + float(np.abs(run.q[:, j]).max()))
     return bool(0 < asked <= (1.0 if run.servo.drive == "voltage" else row[INDEX["torque_limit"]]))
-
-
-def _farthest(x: np.ndarray, limits: np.ndarray) -> float:
-    return float(x[np.argmax(np.abs(x - np.mean(limits)))])
 
 
 def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:

@@ -171,12 +171,7 @@ def _begin(name: str, t: np.ndarray, commands: np.ndarray, notes: list[str]) -> 
 
 
 def _torque(
-    recording: Recording,
-    table: ServoTable,
-    joints: tuple[str, ...],
-    t: np.ndarray,
-    column: list[int],
-    notes: list[str],
+    recording: Recording, table: ServoTable, joints: tuple[str, ...], t: np.ndarray, column: list[int], notes: list[str]
 ) -> np.ndarray | None:
     """Return [S, J] the effort in the unit of the drive's torque; None where none was recorded or it is not what it
     says."""

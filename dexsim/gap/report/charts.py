@@ -430,9 +430,7 @@ def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
     return out
 
 
-def _discs(
-    d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found: set[str], unit: str
-) -> list[str]:
+def _discs(d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found: set[str], unit: str) -> list[str]:
     """Return a disc at each joint (number -> name, error), coloured by its error of `most`, ringed and named where
     found."""
     out, labels = [], []

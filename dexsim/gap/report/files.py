@@ -180,13 +180,7 @@ class Hero(Section):
         d, h = self.d, self.held_out
         word, tone = VERDICTS[d.data["verdict"]]
         kept = h.get("how") or ", ".join(h["recordings"])
-        return {
-            "word": word,
-            "tone": tone,
-            "said": d.sentence,
-            "judged": h["before"] is not None,
-            "kept": kept,
-        }
+        return {"word": word, "tone": tone, "said": d.sentence, "judged": h["before"] is not None, "kept": kept}
 
 
 class Where(Section):
@@ -199,13 +193,7 @@ class Where(Section):
         if d.mechanism is None or not (d.joints or d.touch is not None):
             return None
         named = {j for f in d.findings for j in f.joints}
-        marked = {
-            t
-            for f in d.findings
-            if "taxels" in f.parameters
-            for t in f.taxels
-            if len(f.taxels) <= 40
-        }
+        marked = {t for f in d.findings if "taxels" in f.parameters for t in f.taxels if len(f.taxels) <= 40}
         taxels = d.touch.error if d.touch is not None else None
         before = {j: v["before"] for j, v in d.joints.items()}
         height = 400 if d.joints else 240
@@ -329,9 +317,7 @@ class Findings(Section):
     def _lost(self, f: Finding) -> dict[str, Any]:
         """Return the runner-up and why it lost, or the set that cannot be told apart."""
         rivals = [a for a in f.alternatives if a["confidence"] >= 0.005]
-        out: dict[str, Any] = dict.fromkeys(
-            ("set", "separating", "lone", "open", "rival", "then", "wins"), ""
-        )
+        out: dict[str, Any] = dict.fromkeys(("set", "separating", "lone", "open", "rival", "then", "wins"), "")
         if f.indistinguishable:
             return out | {
                 "set": " and ".join(_name(x) for x in f.indistinguishable),

@@ -34,11 +34,7 @@ RATE = 100.0  # Hz
 
 
 def plan_next(
-    d: Diagnosis,
-    s: Settings,
-    m: Mechanism,
-    searched: Sequence[SearchedJoint] = (),
-    recordings: Sequence[Any] = (),
+    d: Diagnosis, s: Settings, m: Mechanism, searched: Sequence[SearchedJoint] = (), recordings: Sequence[Any] = ()
 ) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
@@ -50,9 +46,7 @@ def plan_next(
         return
     if unsure:
         f = unsure[0]
-        rivals = list(
-            dict.fromkeys(f.indistinguishable or [f.effect, *(a["effect"] for a in f.alternatives[:1])])
-        )
+        rivals = list(dict.fromkeys(f.indistinguishable or [f.effect, *(a["effect"] for a in f.alternatives[:1])]))
         joints = f.joints
         kinds = sorted({k for e in rivals for k in EFFECTS.get(e, Effect).motions})
         head = (
@@ -86,12 +80,7 @@ def plan_next(
 
 
 def _choice(
-    d: Diagnosis,
-    s: Settings,
-    m: Mechanism,
-    searched: Sequence[SearchedJoint],
-    f: Finding,
-    rivals: list[str],
+    d: Diagnosis, s: Settings, m: Mechanism, searched: Sequence[SearchedJoint], f: Finding, rivals: list[str]
 ) -> Choice | None:
     """Return the motions on which the finding's hypotheses disagree most; None where they cannot be simulated or
     planned."""
@@ -230,5 +219,3 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
             d = d - j @ np.linalg.solve(j.T @ j + 400.0 / 12 * np.eye(j.shape[1]), j.T @ d)
         out[kind] = float(np.sqrt(np.mean(np.minimum(np.abs(d), 1e4) ** 2)))
     return out
-
-

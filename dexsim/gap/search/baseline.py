@@ -235,9 +235,7 @@ def _fits(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> list
     about = np.where(spread, 0.0, np.clip(start, low, high) * (low < 0))  # none, of what may be on both sides
     up = about + (high - about) * np.maximum(2 * share - 1, 0) ** 2 + (low - about) * np.maximum(1 - 2 * share, 0) ** 2
     one_sided = low + (high - low) * share**2
-    guesses = np.where(
-        spread, safe * (np.where(spread, high, 2.0) / safe) ** share, np.where(low < 0, up, one_sided)
-    )
+    guesses = np.where(spread, safe * (np.where(spread, high, 2.0) / safe) ** share, np.where(low < 0, up, one_sided))
     guesses = np.concatenate([start[None], guesses])
     loss = np.full(len(guesses), np.inf)
     for i in range(0, len(guesses), AT_ONCE):

@@ -21,8 +21,6 @@ from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Box, Fitted, Fitter, Residuals, disbelief, slopes_of
 
 # -- a hypothesis -----------------------------------------------------------------------------------------------------
-# A hypothesis: its effects, its fit, and what a search ends with.
-
 
 @dataclass(frozen=True)
 class Member:
@@ -94,46 +92,18 @@ def fits_beside(a: Member, b: Member) -> bool:
 
 
 # -- what is refitted with every hypothesis ---------------------------------------------------------------------------
-# What is refitted with every hypothesis: believed figures within their tolerance, stated ranges, what nobody knows.
+# believed figures within their tolerance, stated ranges, what nobody knows
 
 # figures of a drive, by column of the servo table: what is believed of them, no effect, is refitted; in this order
 USUAL = (
-    "kp",
-    "kd",
-    "torque_limit",
-    "no_load_speed",
-    "efficiency",
-    "coulomb_friction",
-    "viscous_friction",
-    "load_friction",
-    "load_friction_backdriven",
-    "lag",
-    "delay",
-    "stribeck_peak",
-    "stribeck_speed",
-    "friction_asymmetry",
-    "deadband",
-    "position_offset",
-    "position_scale",
-    "speed_lag",
-    "backlash",
-    "softness",
-    "profile_speed",
-    "profile_acceleration",
-)
+    "kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
+    "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
+    "position_offset", "position_scale", "speed_lag", "backlash", "softness", "profile_speed", "profile_acceleration",
+)  # fmt: skip
 MEASURED = (
-    "kp",
-    "kd",
-    "torque_limit",
-    "no_load_speed",
-    "coulomb_friction",
-    "viscous_friction",
-    "load_friction",
-    "load_friction_backdriven",
-    "stribeck_peak",
-    "profile_speed",
-    "profile_acceleration",
-)
+    "kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "load_friction",
+    "load_friction_backdriven", "stribeck_peak", "profile_speed", "profile_acceleration",
+)  # fmt: skip
 """Columns whose believed figures are off by a few percent; those of others are what they are."""
 
 

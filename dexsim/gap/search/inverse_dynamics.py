@@ -371,11 +371,7 @@ def _not_weighed(d: Columns) -> list[str]:
 
 
 def _name(
-    own: Columns,
-    other: Columns,
-    mine: dict[str, np.ndarray],
-    theirs: dict[str, np.ndarray],
-    rng: np.random.Generator,
+    own: Columns, other: Columns, mine: dict[str, np.ndarray], theirs: dict[str, np.ndarray], rng: np.random.Generator
 ) -> tuple[list[Named], np.ndarray, dict[str, str]]:
     """Return further effects in the order in which they help on quarters left out, the coefficients with the
     catalogue's, and effects that would have helped but cannot be what they are called, each with the reason."""

@@ -275,12 +275,7 @@ def unknown_controllers(given: Sequence[IdentifiedJoint], stages: Sequence[Stage
 
 
 def _alike(
-    case: Case,
-    search: JointSearch,
-    trial: Trial,
-    ours: dict[str, float],
-    test: Sequence[int],
-    span_test: Spans | None,
+    case: Case, search: JointSearch, trial: Trial, ours: dict[str, float], test: Sequence[int], span_test: Spans | None
 ) -> bool:
     """Return whether what was held out is followed as well with the torque's figures as with those that the closed loop
     was refitted to."""
@@ -500,7 +495,9 @@ def _of_joint(
     on = quiet[block]
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
     quiet_torque = float(np.var(torque[on]))
-    fits = noise**2 < TORQUE.much * quiet_torque and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
+    fits = noise**2 < TORQUE.much * quiet_torque and not unphysical(
+        replace(pieces[mine[0]], names=tuple(names), X=A[on], u=u[on])  # the same with other rows
+    )
     least = max(TORQUE.far * noise, np.sqrt((1 - TORQUE.fit) * np.mean(torque**2)))
     residual = [
         _beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)
@@ -566,11 +563,6 @@ def _slow(residual: np.ndarray, block: np.ndarray) -> bool:
     count = np.maximum(np.bincount(block), 1)
     means = np.bincount(block, residual) / count
     return float(np.sum(count * means**2)) > TORQUE.slow * float(np.sum(residual**2))
-
-
-def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Columns:
-    """Return other rows in the place of a piece's, for the look whether their figures can be."""
-    return replace(of, names=tuple(names), X=A, u=u)
 
 
 def _trimmed(

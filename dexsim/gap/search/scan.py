@@ -113,9 +113,7 @@ def refolded(search: JointSearch, trial: Trial) -> Trial:
         part = Fitter(search.case.plant, subset(search.long, on), search.r, search.deadline.passed)
         rows = on[whole.window]
         known = {key: v[rows] for key, v in slopes_of(f).items()}
-        x = part.given(trial.members).fit(
-            f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False
-        ).x
+        x = part.given(trial.members).fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
         a = huber_square(whole.evaluate(f.params, x), search.r.huber)
         out += np.bincount(search.blocks[~rows], a[~rows], len(out))
         parts.append(x)
@@ -145,7 +143,8 @@ def earns_in_windows(search: JointSearch, new: Trial, old: Trial, further: bool)
         if old.members or gain < 2 * SEARCH.least
         else (SEARCH.rare if gain < 4 * SEARCH.least else 2 * SEARCH.rare) * SEARCH.chance
     )
-    return bool(np.quantile(bootstrap_sums(search, a - b), chance) > 0)
+    sums = (a - b)[intervals.stretches(len(a), STRETCH, search.rng, BOOTSTRAPS)].sum(1)
+    return bool(np.quantile(sums, chance) > 0)
 
 
 def earns_run_free(search: JointSearch, new: Trial, old: Trial) -> bool:
@@ -188,11 +187,6 @@ def free_run_errors(search: JointSearch, trial: Trial) -> np.ndarray:
         out.append(float(np.abs(judge.residuals(params, x[None])[0]).mean()))
     search.run_free[id(trial)] = trial, np.array(out)
     return search.run_free[id(trial)][1]
-
-
-def bootstrap_sums(search: JointSearch, x: np.ndarray) -> np.ndarray:
-    """Sums of a block bootstrap of x [B]: 2-s stretches of neighbouring half-second blocks."""
-    return x[intervals.stretches(len(x), STRETCH, search.rng, BOOTSTRAPS)].sum(1)
 
 
 def share_removed(search: JointSearch, new: Trial, old: Trial) -> float:
@@ -248,7 +242,7 @@ def scan_catalogue(search: JointSearch, current: Trial) -> list[Scanned]:
     x = current.fit.x
     raw, s = fitter.init_directions(params, x)
     r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
-    guesses, owners = guesses_of(search, current, expand_one(case, params, x))
+    guesses, owners = guesses_of(search, current, expand(case.plant, params, x[None])[0])
     rows, dots, squares, cross = [], [], [], []
     box = Box(params)
     J = here.jacobian * box.span if params else np.zeros((len(r0), 0))
@@ -358,9 +352,7 @@ def saved_by(
         c[:-1] = np.clip((d_r + (z * d_J).sum(1)) / d_d, 0.0, 2.0)[:-1]
         if np.array_equal(c, before[0]) and np.array_equal(z, before[1]):
             break  # no sweep moves them any more
-    left = (
-        total - 2 * c * d_r + c * c * d_d - 2 * c * (z * d_J).sum(1) - 2 * z @ b + np.einsum("hi,ij,hj->h", z, A, z)
-    )
+    left = total - 2 * c * d_r + c * c * d_d - 2 * c * (z * d_J).sum(1) - 2 * z @ b + np.einsum("hi,ij,hj->h", z, A, z)
     saved = (left[-1] - left[:-1]) / max(left[-1], 1e-30)
     best: dict[str, tuple] = {}
     for gain, (member, start) in sorted(zip(saved.tolist(), owners, strict=True), key=lambda o: -o[0]):
@@ -380,9 +372,7 @@ def narrowed(search: JointSearch, effect: Effect, variant: Variant) -> Variant |
     return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)
 
 
-def shortlisted(
-    scan: list[Scanned], size: int, loss: float, members: Sequence[Member]
-) -> list[Scanned]:
+def shortlisted(scan: list[Scanned], size: int, loss: float, members: Sequence[Member]) -> list[Scanned]:
     """Return the best variants of the best effects, every kind of those that ask for it, and what the first is
     confused with."""
     seen: dict[str, int] = {}
@@ -437,11 +427,6 @@ def _projected(J: np.ndarray, gram: np.ndarray, y: np.ndarray) -> np.ndarray:
         return y.copy()
     taken = _times(J, np.linalg.solve(gram, _times(J.T, y)[..., None])[..., 0])
     return np.subtract(y, taken, out=taken)
-
-
-def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
-    """Return [R, C] plant parameters at one guess."""
-    return expand(case.plant, params, x[None])[0]
 
 
 def legal(g: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from dexsim import intervals
 from dexsim.gap.effects import Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX, Param
+from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, SIGNAL
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Box, Fitted, Fitter, Residuals, slopes_of
@@ -25,7 +25,6 @@ from dexsim.gap.search.scan import (
     cross_validated,
     cv_loss,
     earns,
-    expand_one,
     narrowed,
     price_factor,
     priced_loss,
@@ -113,10 +112,7 @@ def search_joint(search: JointSearch) -> Outcome:
 
 
 def drafts_of(
-    search: JointSearch,
-    listed: Sequence[tuple[float, float, Member, np.ndarray]],
-    current: Trial,
-    pool: Pool,
+    search: JointSearch, listed: Sequence[tuple[float, float, Member, np.ndarray]], current: Trial, pool: Pool
 ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
     """Return the hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted
     on short windows: those that follow best, the best first.
@@ -202,9 +198,7 @@ def best_of(search: JointSearch, trials: Sequence[Trial], current: Trial) -> Tri
     return best
 
 
-def settled(
-    search: JointSearch, current: Trial, pool: Pool
-) -> tuple[Trial, Rivals]:
+def settled(search: JointSearch, current: Trial, pool: Pool) -> tuple[Trial, Rivals]:
     """Return (the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
     final = rivals_of(search, current, pool)
     for _ in range(len(current.members)):
@@ -228,7 +222,7 @@ def begun_again(search: JointSearch, current: Trial, trials: list[Trial]) -> Tri
     ahead = [t for t in trials if t.fit.loss < (1 - SEARCH.tie) * current.fit.loss]
     for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
         own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
-        at = expand_one(search.case, trial.fit.params, trial.fit.x)[0][columns]
+        at = expand(search.case.plant, trial.fit.params, trial.fit.x[None])[0, 0, columns]
         x0 = [
             own.get(p.key, p.start)
             if not p.nuisance
@@ -271,11 +265,6 @@ def best_pair(search: JointSearch, current: Trial, listed: Sequence[Scanned]) ->
     if best is not None and earns(search, best, current):
         return best
     return None
-
-
-def short_loss(search: JointSearch, trial: Trial) -> float:
-    """Mean Huber square over short windows."""
-    return _loss(search.scan_fitter, trial)
 
 
 def swapped(search: JointSearch, current: Trial, pool: Pool) -> Trial:
@@ -404,9 +393,7 @@ def laws_of(search: JointSearch, member: Member) -> list[Variant]:
     return [v for v in laws if v.label != member.variant.label]
 
 
-def overtaken(
-    search: JointSearch, current: Trial, final: Rivals
-) -> Trial | None:
+def overtaken(search: JointSearch, current: Trial, final: Rivals) -> Trial | None:
     """Return the hypothesis in which a rival stands in the place of the member that it beats in most bootstraps;
     None where each holds its own."""
     ahead = []
@@ -428,13 +415,11 @@ def overtaken(
     return None
 
 
-def rivals_of(
-    search: JointSearch, current: Trial, pool: Pool
-) -> Rivals:
+def rivals_of(search: JointSearch, current: Trial, pool: Pool) -> Rivals:
     """For each member: what else in its place would do (its share of bootstraps), and its confidence."""
     out = {}
     mine = cv_loss(search, current)
-    short = short_loss(search, current)
+    short = _loss(search.scan_fitter, current)
     for i, member in enumerate(current.members):
         rest, kept = current.but(i)
         without = search.fit(rest, kept, current, quick=True) if rest else None

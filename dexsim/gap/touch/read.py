@@ -375,9 +375,7 @@ def _poses(
     return rot, pos
 
 
-def _posture(
-    r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray
-) -> tuple[list[int], np.ndarray]:
+def _posture(r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray) -> tuple[list[int], np.ndarray]:
     """Return (addresses in qpos, values [G, n]) of the joints that were read."""
     p = r.states.position
     address, values = [], []

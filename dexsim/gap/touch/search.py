@@ -120,10 +120,7 @@ class PadFit:
         least = max(JUDGE.far * self.noise, 2 * BELIEF.zero * step)  # the reading's own zero, and its neighbours'
         pressed = p.max(0) > least
         # the object may touch beside where the joints say: neighbours on both sides must feel it
-        near = [
-            sum(z[:, b].max() > least for b in beside) >= min(3, len(beside))
-            for beside in self.runs[0].beside
-        ]
+        near = [sum(z[:, b].max() > least for b in beside) >= min(3, len(beside)) for beside in self.runs[0].beside]
         pressed &= np.array(near)
         stuck = still & (z[0] > BELIEF.zero * step)
         return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
