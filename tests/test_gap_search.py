@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.optimize import lsq_linear
 
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
@@ -21,7 +20,7 @@ from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.free_run import free_run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Box, Fitted, Fitter
-from dexsim.gap.search.scan import cross_validated, free_run_errors, refolded, saved_by, scan_catalogue
+from dexsim.gap.search.scan import cross_validated, free_run_errors, refolded, scan_catalogue
 from dexsim.gap.search.search import JointSearch, Member, search_joint, settle_found, subset
 from tests.test_gap import model, plant_run
 
@@ -60,37 +59,6 @@ def test_conditions_left_out_are_run_free_with_fits_of_their_own():
     assert before.shape == after.shape == (3,) and free_run_errors(s, trial) is after
     # what limits the torque is the same in each condition, whichever is left out
     assert after.mean() < 0.5 * before.mean() and after.mean() < 3.0
-
-
-def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
-    """What a guess saves is the bounded least squares of residuals and beliefs with it and without it."""
-    rng = np.random.default_rng(3)
-    n, P, H = 200, 5, 3
-    params = [
-        Param(f"p{i}", ("kp",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025 if i < 3 else 0.0) for i in range(P)
-    ]
-    span, x = 0.1, np.array([1.05, 0.96, 1.0, 0.95, 1.02])  # the first and the fourth stand at their bounds
-    J, d = rng.standard_normal((n, P)), rng.standard_normal((H, n))
-    d[0] += 2 * J[:, 0]  # does what the first belief does
-    r = 0.8 * d[0] - 0.6 * J[:, 0] + 0.3 * rng.standard_normal(n)
-    weight = np.array([30.0 / 0.025**2 * span**2] * 3 + [0.0] * 2)
-    owners = [(SimpleNamespace(id=str(i)), np.zeros(1)) for i in range(H)]
-    got = {m.id: g for g, m, _ in saved_by(owners, d @ r, (d * d).sum(1), d @ J, J, r, params, x)}
-    off = (x - 1.0) / span
-
-    def least(column: np.ndarray | None) -> float:
-        # r - c d + J z, and the beliefs' own residuals
-        A = np.vstack([J, np.diag(np.sqrt(weight))])
-        b = np.r_[-r, -np.sqrt(weight) * off]
-        low, high = (0.95 - x) / span, (1.05 - x) / span + 1e-12
-        if column is not None:
-            A = np.column_stack([A, np.r_[-column, np.zeros(P)]])
-            low, high = np.r_[low, 0.0], np.r_[high, 2.0]
-        return 2 * lsq_linear(A, b, (low, high), tol=1e-14).cost
-
-    for i in range(H):
-        assert got[str(i)] == pytest.approx(1 - least(d[i]) / least(None), abs=1e-6)
-    assert max(got, key=got.get) == "0"
 
 
 def test_what_only_the_recording_held_out_shows_is_said():

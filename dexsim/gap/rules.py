@@ -35,9 +35,6 @@ class SearchRules:
     # of the loss: nearer than this, fits without each condition decide; of the squared error on what was held out:
     # nearer than this it speaks neither for an effect nor against it
     tie: float = 0.02
-    # share of the squared error where it was fitted that an effect must remove where that is within the noise without
-    # it
-    clear: float = 0.11
     # relative, of a loss: finer than this nothing is to be trusted. A rival as much worse than the best counts for a
     # third of it in one draw, and laws of one effect that come within twice as much may each be the true one; a
     # parameter costs as much, and an effect must promise as much in the scan; of its misfit without any effect a signal

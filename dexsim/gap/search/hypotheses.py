@@ -302,7 +302,6 @@ class JointSearch:
         self.none_loss = np.zeros(0)
         self.fitted: dict[frozenset[str], Trial] = {}
         self.first_laws: dict[tuple[str, str], Variant] = {}
-        self.saved: list[tuple[float, Member, np.ndarray]] = []
         self.other_start: dict[str, np.ndarray] = {}
         self.by_law: dict[str, list[Trial]] = {}
         # made once: by the trial's id, which is kept so that it stays its own, its polished fit and errors of free runs

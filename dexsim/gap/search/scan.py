@@ -14,7 +14,7 @@ from dexsim import intervals
 from dexsim.gap.effects import Effect, Variant
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
+from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, at_bound, expand
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Box, Fitter, Residuals, disbelief, huber_square, robust, slopes_of
 from dexsim.gap.search.hypotheses import JointSearch, Member, Trial, complexity_price, fits_beside, subset
@@ -189,14 +189,6 @@ def free_run_errors(search: JointSearch, trial: Trial) -> np.ndarray:
     return search.run_free[id(trial)][1]
 
 
-def share_removed(search: JointSearch, new: Trial, old: Trial) -> float:
-    """Share of the squared error that `new` removes, with what the beliefs give for it: on conditions left out or
-    where it was fitted, whichever is less."""
-    left = float(cv_loss(search, new).sum() / cv_loss(search, old).sum())
-    return 1 - max(left, search.objective(new) / search.objective(old))
-
-
-SWEEPS = 60  # over the beliefs, by which the scan moves them
 PROJECTED = 16  # guesses of the scan that are projected in one call: they stay in a core's cache
 
 
@@ -243,14 +235,13 @@ def scan_catalogue(search: JointSearch, current: Trial) -> list[Scanned]:
     raw, s = fitter.init_directions(params, x)
     r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
     guesses, owners = guesses_of(search, current, expand(case.plant, params, x[None])[0])
-    rows, dots, squares, cross = [], [], [], []
+    rows = []
     box = Box(params)
     J = here.jacobian * box.span if params else np.zeros((len(r0), 0))
     k = search.r.huber
     weight = np.minimum(1.0, k / np.maximum(np.abs(r0), 1e-9)) if k > 0 else np.ones_like(r0)
     sw = np.sqrt(weight)
     Jw, rw = J * sw[:, None], r0 * sw
-    all_J = Jw
     # nuisances absorb what they may: a prior of a quarter of their span
     low, high = box.low, box.high
     inside = (x > low + 0.02 * (high - low)) & (x < high - 0.02 * (high - low)) if params else np.zeros(0, bool)
@@ -268,11 +259,10 @@ def scan_catalogue(search: JointSearch, current: Trial) -> list[Scanned]:
         changes = np.subtract(r0, q, out=q)
         changes *= sw
         for b in range(0, len(changes), PROJECTED):
-            raw_d = changes[b : b + PROJECTED]
-            d = project(raw_d)
+            d = project(changes[b : b + PROJECTED])
             dd = _dots(d, d)
             on = np.isfinite(dd) & ~(dd < 1e-6 * total * 1e-3 + 1e-12)
-            raw_d, d, dd = (raw_d, d, dd) if on.all() else (raw_d[on], d[on], dd[on])
+            d, dd = (d, dd) if on.all() else (d[on], dd[on])
             d *= clean
             part = fitter.by_window(d)
             dot = part.sum(1)
@@ -281,11 +271,6 @@ def scan_catalogue(search: JointSearch, current: Trial) -> list[Scanned]:
             chance = np.maximum(_times(flips, part), 0.0) ** 2 / dd[:, None] / total
             null = np.maximum(null, chance.max(0, initial=0.0))
             rows += [(float(g), *owners[a + b + i]) for g, i in zip(gain, np.flatnonzero(on), strict=True)]
-            dots.append(_dots(raw_d, np.broadcast_to(rw, raw_d.shape)))
-            squares.append(_dots(raw_d, raw_d))
-            cross.append(_times(all_J.T, raw_d))
-    sums = [np.concatenate(parts) if parts else np.zeros(0) for parts in (dots, squares, cross)]
-    search.saved = saved_by([(m, st) for _, m, st in rows], sums[0], sums[1], sums[2], all_J, rw, params, x)
     best: dict[tuple, tuple] = {}
     search.other_start = {}
     for gain, member, start in sorted(rows, key=lambda r: -r[0]):
@@ -308,56 +293,6 @@ def drags_of(search: JointSearch, current: Trial, case: Case) -> dict[str, tuple
     for gain, price, member, _ in scan_catalogue(asked, current):
         out.setdefault(member.variant.note["from_joint"], (gain, price))
     return out
-
-
-def saved_by(
-    owners: list[tuple[Member, np.ndarray]],
-    dots: np.ndarray,
-    squares: np.ndarray,
-    cross: np.ndarray,
-    J: np.ndarray,
-    r: np.ndarray,
-    params: list[Param],
-    x: np.ndarray,
-) -> list[tuple[float, Member, np.ndarray]]:
-    """Return what each guess of the scan would save where beliefs, moved out to follow the data, may go back:
-    [(share of the squared error with what beliefs gave for it, member, start)] by member, the best first.
-
-    owners [H]: (member, start); dots, squares [H]: of the residuals' change d by the guess with the residuals and
-    itself; cross [H, P]: J' d. Least squares over the guess's size (0 to 2) and every belief inside its bounds, by
-    coordinates."""
-    if not owners:
-        return []
-    P = len(params)
-    box = Box(params)
-    span, believed = box.span, box.prior * box.span**2
-    low, high, off = (box.low - x) / span, (box.high - x) / span, (x - box.centre) / span
-    A = J.T @ J + np.diag(believed + 1e-9 * max(float(r @ r), 1e-12))
-    b = -(J.T @ r) - believed * off  # of the beliefs' moves z: A z = b + c * cross
-    total = float(r @ r) + float(believed @ off**2)
-    H = len(owners)
-    z, c = np.zeros((H + 1, P)), np.zeros(H + 1)  # the last: without any guess
-    d_r, d_d, d_J = np.r_[dots, 0.0], np.r_[squares, 1.0], np.vstack([cross, np.zeros((1, P))])
-    columns = np.ascontiguousarray(d_J.T)
-    for _ in range(SWEEPS):
-        before = c.copy(), z.copy()
-        for i in range(P):
-            push = c * columns[i]
-            push += b[i]
-            push -= z @ A[:, i]
-            push += A[i, i] * z[:, i]
-            push /= A[i, i]
-            np.maximum(push, low[i], out=push)
-            np.minimum(push, high[i], out=z[:, i])
-        c[:-1] = np.clip((d_r + (z * d_J).sum(1)) / d_d, 0.0, 2.0)[:-1]
-        if np.array_equal(c, before[0]) and np.array_equal(z, before[1]):
-            break  # no sweep moves them any more
-    left = total - 2 * c * d_r + c * c * d_d - 2 * c * (z * d_J).sum(1) - 2 * z @ b + np.einsum("hi,ij,hj->h", z, A, z)
-    saved = (left[-1] - left[:-1]) / max(left[-1], 1e-30)
-    best: dict[str, tuple] = {}
-    for gain, (member, start) in sorted(zip(saved.tolist(), owners, strict=True), key=lambda o: -o[0]):
-        best.setdefault(member.id, (gain, member, start))
-    return sorted(best.values(), key=lambda o: -o[0])
 
 
 def narrowed(search: JointSearch, effect: Effect, variant: Variant) -> Variant | None:
@@ -394,19 +329,6 @@ def shortlisted(scan: list[Scanned], size: int, loss: float, members: Sequence[M
             seen[m.id] = seen.get(m.id, 0) + 1
             out.append(row)
     return out
-
-
-def with_hinted(search: JointSearch, listed: list[Scanned], members: Sequence[Member], least: float) -> list[Scanned]:
-    """Return the list, and up to four more that, by the scan, save at least `least` of the squared error with what
-    the beliefs give for it: where those moved out to follow the data, what is left shows little, and the right
-    effect lets them go back."""
-    known = {row[2].id for row in listed}
-    more = [
-        row
-        for row in search.saved
-        if row[0] >= least and row[1].id not in known and all(fits_beside(row[1], m) for m in members)
-    ]
-    return listed + [(gain, 1.0, member, start) for gain, member, start in more[:4]]
 
 
 def _times(A: np.ndarray, x: np.ndarray) -> np.ndarray:

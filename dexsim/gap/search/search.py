@@ -30,9 +30,7 @@ from dexsim.gap.search.scan import (
     priced_loss,
     refolded,
     scan_catalogue,
-    share_removed,
     shortlisted,
-    with_hinted,
 )
 
 Pool = dict[str, tuple[Member, np.ndarray, float]]
@@ -57,8 +55,7 @@ def search_joint(search: JointSearch) -> Outcome:
     pool: Pool = {}
     for _ in range(SEARCH.most):
         loss = cv_loss(search, current).sum() / per
-        enough = loss < SEARCH.enough**2
-        if (enough and current.members) or search.deadline.over():
+        if loss < SEARCH.enough**2 or search.deadline.over():
             break
         search.tell(f"effect {len(current.members) + 1}, all of the catalogue")
         scan = scan_catalogue(search, current)
@@ -67,8 +64,6 @@ def search_joint(search: JointSearch) -> Outcome:
         if not scan:
             break
         listed = shortlisted(scan, LISTED, loss, current.members)
-        if loss < SEARCH.unsettled:
-            listed = with_hinted(search, [] if enough else listed, current.members, SEARCH.apart)
         if not listed:
             break
         drafts = drafts_of(search, listed, current, pool)
@@ -90,11 +85,9 @@ def search_joint(search: JointSearch) -> Outcome:
             ):  # the fit without it had stopped short: what is missing is looked for anew
                 continue
             search.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
-        if enough and share_removed(search, best, current) < SEARCH.clear:
-            break
         if not earns(search, best, current):
             # a pair may be there where neither of its halves is seen alone
-            best = current if enough or search.deadline.over() else best_pair(search, current, listed[:3]) or current
+            best = current if search.deadline.over() else best_pair(search, current, listed[:3]) or current
             if best is current:
                 break
         current = best
