@@ -94,14 +94,15 @@ def test_physics_and_drives_are_its_own(env):
 
 def test_touch_is_its_own(env):
     """Every imperfection that the world names is what its taxels have, in each task, and differs from what training
-    believes."""
+    believes, but for counts and other fingers, which a rotation's training knows."""
     own = yaml.safe_load((CONFIGS / "reality" / "bench.yaml").read_text())["tactile"]
     assert {"threshold", "noise", "gain_spread", "dead", "delay", "hysteresis", "stiffness_scale"} <= set(own)
     for task in ("rotate", "grasp"):
         believed = start.for_train([f"task={task}", "device=cpu"], CONFIGS).cfg["tactile"]
         there = world(f"task={task}")["tactile"]
         for name, value in own.items():
-            assert there[name] == value != believed[name], (task, name)
+            assert there[name] == value, (task, name)
+            assert value != believed[name] or (task == "rotate" and name in ("feel_others", "lsb")), (task, name)
     for name, value in own.items():
         c = env.touch.cfg
         assert (c.range(name) == (value, value)) if name in COLUMNS else (getattr(c, name) == value), name

@@ -129,6 +129,7 @@ def test_ablations(overrides, size):
 def test_actor_slices_hold_what_they_say():
     """With noise off, each slice of the actor equals its definition."""
     env = make(
+        "tactile=default",
         "task.sensors.joint_noise=0",
         "task.sensors.tip_noise=0",
         "task.sensors.imu_noise=0",
