@@ -81,6 +81,34 @@ def test_a_link_that_meets_a_wall_in_a_replay_is_stopped_as_in_play():
     assert np.abs(q[:2000, 0] - stopped).max() < 1e-9 and np.array_equal(beside, alone)
 
 
+@pytest.mark.parametrize("far", [0.5, 1.6])
+def test_fingers_that_rest_are_left_out_of_a_replay_until_something_touches(far, monkeypatch):
+    """The hand's middle finger moves, its others are told nothing; bent by 1.6 rad it meets what is fixed."""
+    m, t, k = mechanism(), np.arange(0.0, 1.5, 0.01), 6
+    assert m.joints[k] == "mid_joint1"
+    targets = np.full((len(t), len(m.joints)), np.nan)
+    targets[:, k] = far * np.sin(np.pi * t / 1.5)
+    rest = np.zeros(len(m.joints))
+    w = World(m.table.nominal(m.joints), m.table, np.array([0, 0, -9.81]), 1.5, rest, rest, rest, t, targets)
+    if far > 1:
+        palm = m.spec.body("right_hand_mid_link1").parent
+        model = m.spec.compile()
+        data, tip = mujoco.MjData(model), model.body("right_hand_mid_link2").id
+        data.qpos[k] = 0.6 * far
+        mujoco.mj_forward(model, data)
+        at = data.xmat[palm.id].reshape(3, 3).T @ (data.xipos[tip] - data.xpos[palm.id])
+        palm.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.004, 0, 0], pos=at)
+    sizes, engine = [], full_model.make_engine
+    made = lambda spec, *a, **o: sizes.append(spec.compile().nv) or engine(spec, *a, **o)  # noqa: E731
+    monkeypatch.setattr(full_model, "make_engine", made)
+    light = free_runs(m.spec, m.joints, [w], engine="mujoco")[0]
+    monkeypatch.setattr(full_model, "_moving", lambda model, joints, worlds: [])
+    whole = free_runs(m.spec, m.joints, [w], engine="mujoco")[0]
+    assert sizes == ([2, 12] if far < 1 else [2, 12, 12])
+    assert np.abs(light - whole)[:, k].max() < 1e-9 and np.ptp(whole[:, k]) > 0.3
+    assert np.abs(light - whole).max() < 0.02  # they rest, but for what gravity bends
+
+
 def test_of_what_is_replayed_whole_only_what_is_far_behind_on_every_joint_is_left_out():
     kinds = [dict.fromkeys("ab", k) for k in ("found", "refitted", "believed", "plain")]
     noise = {"a": 1.0, "b": 0.01}

@@ -25,7 +25,7 @@ import torch
 from dexsim.actuator.columns import COLUMNS, DELAYS
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
-from dexsim.actuator.table import ServoTable
+from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.read import Run
@@ -349,8 +349,8 @@ def free_runs(
 
     def part(k: int) -> Callable[[], list]:
         together, mine = parts[k]
-        given = [worlds[i] for i in mine]
-        return _batch(spec, joints, given, together, device, timestep, engine, partial(tell, k))
+        how = device, timestep, engine, partial(tell, k)
+        return _without_resting(together[0].spec or spec, joints, [worlds[i] for i in mine], together, how)
 
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     sizes = [max(worlds[i].duration for i in mine) * (STEPPED + len(mine)) for _, mine in parts]
@@ -359,6 +359,69 @@ def free_runs(
             for i, q in zip(mine, moved, strict=True):
                 out[i] = q
     return out
+
+
+def _without_resting(
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    worlds: Sequence[World],
+    group: Sequence[World],
+    how: tuple[str, float, str, Callable[[float], None]],
+) -> Callable[[], list]:
+    """Return what moves worlds (`_batch`) by C MuJoCo: without the fingers that rest, from a posture that nothing tells
+    of, and that nothing ties to the others. With them where something touches."""
+    whole = lambda: _batch(spec, joints, worlds, group, *how)  # noqa: E731
+    keep = _moving(spec.compile(), joints, group) if how[2] == "mujoco" else []
+    if len(keep) in (0, len(joints)):
+        return whole()
+    names, light, table = [joints[j] for j in keep], spec.copy(), worlds[0].table
+    for thing in (*(light.joint(j) for j in joints if j not in names), *light.keys):
+        light.delete(thing)
+    by_joint = ((n, getattr(table, n)) for n in ("entries", "current_per_torque", "loop_encoder", "position_encoder"))
+    own: dict[str, Any] = {n: {j: x[j] for j in (*names, ALL) if j in x} for n, x in by_joint if isinstance(x, dict)}
+    table = replace(table, fitted=None, **own)
+    part = lambda x: None if x is None else (x[0], x[1][:, keep])  # noqa: E731
+    of = lambda w: replace(  # noqa: E731
+        w, table=table, rows=w.rows[keep], q=w.q[keep], v=w.v[keep], target=w.target[keep],
+        targets=w.targets[:, keep], enabled=part(w.enabled), warmth=part(w.warmth),
+        home=None if w.home is None else w.home[keep], setpoint=None if w.setpoint is None else w.setpoint[keep],
+        figures=None if w.figures is None else w.figures[:, keep],
+    )  # fmt: skip
+    shape = light.compile()
+    for geom in light.geoms:  # what does not touch is no part of what moves, but for its inertia
+        geom.contype = geom.conaffinity = 0
+    light.compiler.discardvisual = light.compiler.fusestatic = True
+    run = _batch(light, names, [*map(of, worlds)], [*map(of, group)], *how, shape=shape)
+
+    def moved() -> list:
+        found = run()
+        if not found:
+            return whole()()
+        out = [np.tile(w.q, (len(q), 1)) for w, q in zip(worlds, found, strict=True)]
+        for x, q in zip(out, found, strict=True):
+            x[:, keep] = q
+        return out
+
+    return moved
+
+
+def _moving(model: mujoco.MjModel, joints: Sequence[str], worlds: Sequence[World]) -> list[int]:
+    """Return numbers of the joints but for those of trees of bodies that rest in all worlds; all, where one may act on
+    another otherwise than by touch."""
+    rows = np.stack([w.rows for w in worlds])
+    column = lambda name: rows[:, :, SERVO_INDEX[name]]  # noqa: E731
+    if model.neq or model.ntendon or model.nu or model.nsensor or column("sag").any() or column("coupling").any():
+        return list(range(len(joints)))
+    at, dofs = ([int(getattr(model.joint(j), x)[0]) for j in joints] for x in ("qposadr", "dofadr"))
+    rest = column("position_scale") * model.qpos0[at] + column("position_offset")
+    told: np.ndarray = np.logical_or.reduce(column("kp") <= 0)
+    for w, q in zip(worlds, rest, strict=True):
+        told |= np.isfinite(w.targets).any(0) | (w.q != q) | (w.target != q) | (w.v != 0)
+        told |= [w.led is not None and j in w.led.joints for j in joints]
+        told |= np.zeros(len(joints), bool) if w.enabled is None else (w.enabled[1] < 1).any(0)
+    tree = model.dof_treeid
+    busy = {int(tree[d]) for d in range(model.nv) if d not in dofs or told[dofs.index(d)]}
+    return [j for j, d in enumerate(dofs) if int(tree[d]) in busy]
 
 
 def _batch(
@@ -370,16 +433,18 @@ def _batch(
     timestep: float,
     kind: str,
     tell: Callable[[float], None],
+    shape: mujoco.MjModel | None = None,
 ) -> Callable[[], list]:
-    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done."""
-    spec = (worlds[0].spec or spec).copy()
+    """Return what moves these of a group's worlds: as they do in a batch of all of it. tell: how much of it is done;
+    shape: the model with what may touch, where `spec` is without; nothing is returned where it does."""
+    spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     led = worlds[0].led.joints if worlds[0].led is not None else []
     for joint in led:
         spec.joint(joint).armature = HEAVY
     N = len(worlds)
-    solid = spec.compile()
+    solid = shape or spec.compile()
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in group])
@@ -427,9 +492,9 @@ def _batch(
     path = _path(engine, servo, worlds, led, timestep * np.arange(steps)) if led else lambda k: None
 
     def moved() -> list:
-        q = _stepped(engine, servo, changes, seen, path, tell, solid).cpu().numpy().astype(float)
+        q = _stepped(engine, servo, changes, seen, path, tell, solid, shape is not None)
         tell(1.0)
-        return [q[:, i] for i in range(N)]
+        return [] if q is None else [*np.moveaxis(q.cpu().numpy().astype(float), 1, 0)]
 
     return moved
 
@@ -483,9 +548,10 @@ def _stepped(
     lead: Callable[[int], None],
     tell: Callable[[float], None],
     solid: mujoco.MjModel,
-) -> torch.Tensor:
+    alone: bool,
+) -> torch.Tensor | None:
     """Return the positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise;
-    lead: of `_path`; tell: how much of it is done; solid: the model.
+    lead: of `_path`; tell: how much of it is done; solid: the model; alone: None where something touches.
 
     C MuJoCo takes two thirds of the time without contacts. They are simulated from where something first touches in a
     world: the batch goes back to the look before, so that it moves as with contacts from the begin."""
@@ -512,11 +578,15 @@ def _stepped(
             k += 1
 
         met = np.array([_touching(solid, data, q) for q in at])
+        if alone and met.any():
+            return None
         engine.contacts(met)
         while k < steps:
             before, first = [x.copy() for x in memory], k
             engine.step(min(LOOK, steps - k), before_each)
             new = [i for i in np.flatnonzero(~met) if _touching(solid, data, at[i])]
+            if new and alone:
+                return None
             if new:
                 met[new], k = True, first
                 engine.contacts(met)
@@ -672,7 +742,9 @@ def write_best(
         first = replayed(choices, HEAT)
         late = behind(choices, first, noise)
         ahead = [k for k in range(len(choices)) if k not in late]
-        out = dict(zip(ahead, replayed([choices[k] for k in ahead]), strict=True))
+        # beside them what is likely to be chosen, which is asked for next: together they take less time than in turn
+        likely = {j: choose({c[j]: x[j] for c, x in zip(choices, first, strict=True)}, noise[j]) for j in by}
+        out = dict(zip(ahead, replayed([*(choices[k] for k in ahead), likely]), strict=False))
         for k in late:
             lead = {j: min(ahead, key=lambda i: first[i][j]) for j in by}  # noqa: B023
             out[k] = {j: first[k][j] * out[i][j] / max(first[i][j], 1e-12) for j, i in lead.items()}
