@@ -158,7 +158,9 @@ def test_values_without_names_are_said_and_found_where_another_joint_follows_the
     assert {f.joint for f in found} == {"b", "c"} and all(f.severity == "error" for f in found)
     assert all(f.text.endswith("meta.joint_names=a,c,b") for f in found)
     assert main([str(made)]) == 1 and "meta.joint_names=a,c,b out=" in capsys.readouterr().out  # what to run next
-    right = read(made, meta={"joint_names": "a,c,b"})
+    a_models_order = read(made, joints=("c", "b", "a")).findings  # the values' own is what is said
+    assert all(f.text.endswith("meta.joint_names=a,c,b") for f in a_models_order if f.kind == "joint_order")
+    right = read(made, meta={"joint_names": "[a,c,b]"})
     assert not [f for f in right.findings if f.kind == "joint_order" or f.severity == "warning" and "order" in f.text]
     k = right.joints.index("c")
     assert np.allclose(right.commands.value[:, k], follow(right.commands.t, 2, 0.0), atol=1e-6)

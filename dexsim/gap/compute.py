@@ -186,7 +186,7 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[str], None]]
     def one(k: int) -> T:
         def tell(stage: str) -> None:
             with lock:
-                if progress:
+                if progress and done[0] < len(names):  # a search is asked again when what it found is judged
                     progress(done[0], len(names), names[k], stage)
 
         tell("")

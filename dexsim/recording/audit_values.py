@@ -91,11 +91,11 @@ def order(r: Recording) -> Iterator[Finding]:
     wrong = [j for j in wrong if sum(whose[i] == whose[j] for i in moving) == 1]
     if len(wrong) < 2:
         return
-    nameless = any(f.kind == "joint_names" and f.topic == COMMANDS and "carry no" in f.text for f in r.findings)
-    names = list(r.joints)  # in the order of the values
-    for j in wrong:
-        names[whose[j]] = r.joints[j]
-    exchanged = {whose[j] for j in wrong} == set(wrong)
+    nameless = next((f.text for f in r.findings if f.topic == COMMANDS and "carry no joint names" in f.text), "")
+    taken = nameless.partition("in the order ")[2].partition(";")[0].split(", ")  # not a model's, which `joints` have
+    instead = {r.joints[whose[j]]: r.joints[j] for j in wrong}
+    names = [instead.get(name, name) for name in taken]
+    exchanged = {*instead} == {*instead.values()} <= {*taken}  # not where they are renamed
     for j in wrong:
         k = whose[j]
         right = ",".join(names) if exchanged else f"... with {r.joints[j]} where {r.joints[k]} is now"

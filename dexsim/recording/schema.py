@@ -361,5 +361,6 @@ def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray
 
 
 def joint_names(text: str) -> tuple[str, ...]:
-    """Return the comma-separated list of `joint_names`."""
-    return tuple(name for name in text.replace(",", " ").split())
+    """Return the comma-separated list of `joint_names`, with or without the brackets of other lists."""
+    text = text.strip()
+    return tuple((text[1:-1] if text[:1] + text[-1:] == "[]" else text).replace(",", " ").split())
