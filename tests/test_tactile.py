@@ -605,6 +605,7 @@ def test_bad_settings_are_one_clear_line(tmp_path):
         ({**SPRING, "stiffness": {"linear": {"thumb": 1e8}}}, "no value [N/m^3] for pads of kind 'finger'"),
         ({**SPRING, "noise": [0.2, 0.1]}, "must rise from low to high"),
         ({**SPRING, "delay": -0.1}, "tactile.delay=-0.1"),
+        ({**SPRING, "feel_others": True}, "no tip surfaces"),
         ({**SPRING, "rubber": {"c20": 1.0}}, "tactile.rubber.c20"),
     ):
         with pytest.raises(UserError, match=".") as e:

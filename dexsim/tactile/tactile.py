@@ -7,7 +7,6 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Protocol
 
-import msgspec
 import numpy as np
 import torch
 import warp as wp
@@ -88,8 +87,8 @@ class Tactile:
             links = list(zip(layout.bodies, tips, strict=True))
         near = links if cfg.others and links is not None and f > 1 else []
         others = bool(near)
-        if cfg.feel_others and not others:  # one pad, or a hand without surfaces of its tips: nothing there to feel
-            self.cfg = cfg = msgspec.structs.replace(cfg, feel_others=False)
+        if cfg.feel_others and not others:
+            raise UserError("tactile.feel_others=true: this hand gives no tip surfaces to feel")
         solver = cfg.sum == "solver"
         columns = np.full((f, o), -1, dtype=np.int32)
         if solver:

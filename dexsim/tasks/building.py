@@ -222,7 +222,7 @@ class Built(VecEnv):
             hand_layout(self.hand) or tip_layout(self.hand),
             ShapeSet([*touched, *(p.touch for p in self.furniture.parts)], device),
             [OBJECT, *bodies] if bodies else OBJECT,
-            cfg["tactile"],
+            cfg["tactile"] if self.hand.touches and len(pairs) > 1 else cfg["tactile"] | {"feel_others": False},
             pairs=pairs,
             tips=tip_skins(self.hand) if self.hand.touches else None,
             links=link_skins(self.hand) if skin else None,
