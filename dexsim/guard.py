@@ -27,8 +27,8 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Generator
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,6 +40,8 @@ SECONDS, BYTES = 4.0, 1 << 30
 """Processor time and memory of a call."""
 SECONDS_A_MIB, TIMES_SIZE = 3.0, 16
 """What is added for a file's size: s a MiB, and bytes a byte."""
+TURN = 0.2
+"""s after which a reader that says nothing is looked at."""
 WAITING_S = 1.5
 """s without any processor time, asleep, after which a reader is taken to wait for a pipe or a device."""
 LOCKED = "waits without end for another thread of its reader"
@@ -64,6 +66,19 @@ def call(
     """Return `function(*args)`, worked out in a process with limits. what: the file and its kind, for messages; size:
     bytes of the file, with which the limits grow; patience: multiplies the processor time, where more than reading is
     done; wanted: false leaves the answer there (None). Raises UserError."""
+    work = turns(function, *args, what=what, size=size, patience=patience, wanted=wanted)
+    try:
+        while True:
+            wait([next(work)], TURN)
+    except StopIteration as end:
+        return end.value
+
+
+def turns(
+    function: Callable[..., T], *args: Any, what: str, size: int = 0, patience: float = 1.0, wanted: bool = True
+) -> Generator[Any, None, T]:
+    """Work out what `call` does, turn by turn, so that a thread may wait for several at a time: yields what the next
+    turn, at most `TURN` later, waits for; closed, it ends its process."""
     if inside:
         return function(*args)
     times = typed.number(TRUSTED, os.environ.get(TRUSTED, "1"), 1.0, 1e6)
@@ -80,8 +95,8 @@ def call(
             except (pickle.PicklingError, AttributeError, TypeError):  # a new process cannot be given this reader
                 break
             send.close()
-            answer = _answer(receive, child.pid or 0, 10 * seconds)
-            child.join(1.0)
+            answer = yield from _answer(receive, child.pid or 0, 10 * seconds)
+            yield child.sentinel
         finally:
             receive.close()
             if child.pid is not None:
@@ -105,11 +120,12 @@ def call(
     raise UserError(f"{what}: breaks the library that reads it ({how}, with at most {most / 2**30:.3g} GiB of memory)")
 
 
-def _answer(receive: Connection, pid: int, wall: float) -> Any:
-    """Return the child's answer in a tuple, its error, what it waits for in words, or "" where it ended without."""
+def _answer(receive: Connection, pid: int, wall: float) -> Generator[Any, None, Any]:
+    """Return, after some turns, the child's answer in a tuple, its error, what it waits for in words, or "" where it
+    ended without."""
     begun = moved = time.monotonic()
     used = -1
-    while not receive.poll(0.2):
+    while not receive.poll():
         now = time.monotonic()
         asleep, spent = system.at_work(pid)
         if spent != used or not asleep:
@@ -118,6 +134,7 @@ def _answer(receive: Connection, pid: int, wall: float) -> Any:
             return LOCKED if threading.active_count() > 1 else WAITS
         if now - begun > wall:
             return f"takes more than {wall:.0f} s to read"
+        yield receive
     try:
         arrays = [bytearray(size) for size in pickle.loads(receive.recv_bytes())]
         answer = receive.recv_bytes()

@@ -119,6 +119,7 @@ def test_of_what_is_replayed_whole_only_what_is_far_behind_on_every_joint_is_lef
     assert full_model.behind(kinds, missed, noise) == {1, 2}
 
 
+@pytest.mark.limits
 def test_on_several_cores_worlds_move_as_on_one(monkeypatch):
     """In processes of their own, to the last bit; a process that breaks is made up for."""
     table = ServoTable.from_dict({"joints": {"*": SERVO | {"delay": 0.013}}})
@@ -127,15 +128,15 @@ def test_on_several_cores_worlds_move_as_on_one(monkeypatch):
     for w, armature in zip(worlds, (1.0, 2.0, 2.0, 1.0), strict=True):
         w.spec = m.spec.copy()
         w.spec.joint("joint").armature *= armature
-    forked, real = [], guard.call
+    forked, real = [], guard.turns
 
-    def call(work, **rest):
+    def turns(work, **rest):
         forked.append(work)
         if len(forked) % 3 == 0:
             raise UserError("broken")
-        return real(work, **rest)
+        return (yield from real(work, **rest))
 
-    monkeypatch.setattr(guard, "call", call)
+    monkeypatch.setattr(guard, "turns", turns)
     moved = []
     for cores in ("1", "2", "16"):
         monkeypatch.setenv("OMP_NUM_THREADS", cores)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dexsim import guard
 from dexsim.gap import compute
 from dexsim.gap.command import Progress
 from dexsim.gap.finding import Finding
@@ -162,6 +163,7 @@ def test_progress_of_a_search_is_told_in_counts(capsys, monkeypatch):
     assert capsys.readouterr().out.strip() == "searching wrist (3/5): effect 1, 0 s so far, at most 50 s left of all"
 
 
+@pytest.mark.limits
 def test_replays_tell_the_time_left(capsys, monkeypatch):
     """Three works, two at a time: what is told is right within a third.
 
@@ -170,6 +172,7 @@ def test_replays_tell_the_time_left(capsys, monkeypatch):
     assert compute.so_far(size, seen, 2) == (0.5, pytest.approx(10.0))
     assert compute.so_far(size, seen, 1)[1] == pytest.approx(20.0) and compute.so_far(size, 0 * seen, 2) == (0.0, None)
     monkeypatch.setattr(compute, "LONG", 0.1)
+    monkeypatch.setattr(guard, "WAITING_S", 10.0)  # the works sleep
     monkeypatch.setattr(Progress, "EVERY", 0.0)
 
     def work(k):

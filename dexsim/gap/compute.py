@@ -8,11 +8,12 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
-from typing import TypeVar
+from multiprocessing import connection
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -110,15 +111,24 @@ def forked(count: int, prepared: Callable[[int], Callable[[], T]], at_once: int)
     works = [prepared(k) for k in range(count)]
     if min(at_once, count) <= 1 or system.start_method() != "fork":
         return [work() for work in works]
-
-    def one(work: Callable[[], T]) -> T:
-        try:
-            return guard.call(work, what="a fork", size=ENDLESS)
-        except UserError:  # its own, or the system has no process or memory for it
-            return work()
-
-    with ThreadPoolExecutor(at_once) as pool:
-        return list(pool.map(one, works))
+    out, running, rest = dict[int, T](), dict[int, Generator[Any, None, T]](), list(range(count))[::-1]
+    while rest or running:
+        while rest and len(running) < at_once:
+            k = rest.pop()
+            running[k] = guard.turns(works[k], what="a fork", size=ENDLESS)
+        awaited = []
+        for k, turns in [*running.items()]:  # by this thread: of forks that threads begin at once some crash, with CUDA
+            try:
+                awaited.append(next(turns))
+                continue
+            except StopIteration as end:
+                out[k] = end.value
+            except (UserError, OSError):  # its own, or the system has no process or memory for it
+                pass
+            del running[k]
+        if awaited and (len(awaited) == at_once or not rest):
+            connection.wait(awaited, guard.TURN)
+    return [out[k] if k in out else work() for k, work in enumerate(works)]
 
 
 @contextmanager
