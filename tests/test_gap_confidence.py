@@ -112,12 +112,12 @@ def test_touch_is_doubted_alike():
 
 
 def test_weigh_takes_every_doubt_into_account():
-    assert confidence.weigh(evidence(), 10.0, 1.0, 10.0, 1.0) == 0.99
-    assert confidence.weigh(evidence(reasons=["x"]), 10.0, 1.0, 10.0, 1.0) == DOUBTED
-    assert confidence.weigh(evidence(), 10.0, 7.0, 10.0, 1.0) == pytest.approx(0.5)  # half of the square stays
+    weighed = lambda **changes: confidence.weigh(evidence(**changes))  # noqa: E731
+    assert weighed() == 0.99 and weighed(reasons=["x"]) == DOUBTED and weighed(earned=0.3) == pytest.approx(0.3)
+    assert weighed(left=confidence.left_over(7.0, 10.0, 1.0)) == pytest.approx(0.5)  # half of the square stays
     # next to nothing of what the first one left
-    assert confidence.weigh(evidence(members=2), 20.0, 4.0, 4.5, 1.0) < 0.6
-    assert confidence.weigh(evidence(earned=0.3), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)
+    rest = {of: confidence.left_over(4.0, before, 1.0) for of, before in (("left", 20.0), ("left_of_rest", 4.5))}
+    assert weighed(members=2, **rest) < 0.6
 
 
 def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():

@@ -176,7 +176,7 @@ def doubtful(**changes):
 
 
 def test_one_reason_against_a_name_makes_it_doubted():
-    assert 0.6 < confidence.weigh(doubtful(reasons=["x"]), 10.0, 1.0, 10.0, 1.0) < 0.8
+    assert 0.6 < confidence.weigh(doubtful(reasons=["x"])) < 0.8
 
 
 def test_nothing_is_explained_by_doubtful_names_alone():
@@ -191,7 +191,7 @@ def test_what_is_not_sure_is_handed_on_with_what_was_believed():
 
 
 def test_what_removes_nothing_keeps_nothing():
-    weighed = [confidence.weigh(doubtful(earned=x), 10.0, 1.0, 10.0, 1.0) for x in (0.0, 0.5)]
+    weighed = [confidence.weigh(doubtful(earned=x)) for x in (0.0, 0.5)]
     assert weighed[0] == 0.0 and weighed[1] == pytest.approx(0.5, abs=0.01)
 
 
@@ -206,7 +206,7 @@ def test_what_is_small_beside_another_effect_is_doubted():
 
 
 def test_what_stays_unexplained_costs_confidence():
-    keeps = lambda share: confidence.trusted(100.0, np.sqrt(share) * 100.0, 0.0)  # noqa: E731
+    keeps = lambda share: confidence.kept_of(confidence.left_over(np.sqrt(share), 1.0, 0.0))  # noqa: E731
     assert keeps(0.0) == 1.0 and keeps(0.15) == pytest.approx(0.75) and keeps(0.25) > 0.5 and keeps(0.35) == 0.5
 
 
@@ -378,7 +378,7 @@ def test_a_small_change_of_temperature_tells_nothing():
 
 
 def test_no_name_is_certain():
-    assert 0.97 < confidence.weigh(doubtful(), 10.0, 0.0, 10.0, 1.0) < 1.0
+    assert 0.97 < confidence.weigh(doubtful()) < 1.0
 
 
 def test_a_size_that_reaches_its_end_is_doubted():

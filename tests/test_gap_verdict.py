@@ -153,6 +153,16 @@ def test_no_verdict_by_a_whisper(before, after, confidence, word):
 
 
 @pytest.mark.parametrize(
+    ("before", "step", "confidence", "word"),
+    [(2.0, 1.7, 0.4, "unknown"), (2.0, 1.8, 0.4, "none"), (2.0, 1.8, 0.6, "unknown"), (5.1, 9.0, 0.4, "unknown")],
+)
+def test_what_is_left_within_a_step_of_the_encoder_is_no_verdict(before, step, confidence, word):
+    """Unless it has a name, or is far beyond the floor."""
+    found = held_out.settle([finding_of("backlash", confidence, after=1.9, removed_low=-0.5)])
+    assert held_out.verdict(found, 1.0, before, 0.9 * before, before, True, step=step) == word
+
+
+@pytest.mark.parametrize(
     ("before", "confidence", "word"), [(1.2, 0.9, "explained"), (1.2, 0.4, "none"), (4.0, 0.9, "unknown")]
 )
 def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):

@@ -117,7 +117,8 @@ class Judged:
     structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its
     own floor without any; loud: recordings that are surely missed by more than their own repeats differ by; shown:
     the error of their motion away from what no fitted recording visits, and whether each joint is followed to its
-    floor there (None: all of it was fitted somewhere, or most of it nowhere)."""
+    floor there (None: all of it was fitted somewhere, or most of it nowhere); step: that of the encoders [rad or m],
+    root mean square over joints; 0 where a joint is missed by `JUDGE.far` x its own floor."""
 
     position: dict[str, Any]
     effort: dict[str, Any] | None = None
@@ -126,6 +127,7 @@ class Judged:
     quiet: bool = False
     loud: tuple[str, ...] = ()
     shown: tuple[dict[str, Any], bool] | None = None
+    step: float = 0.0
 
 
 @dataclass

@@ -320,19 +320,17 @@ def _judged(
         floors = [JUDGE.within * noise.joints[x.case.joint] for x in answers]
         still = all(rms(x.before[k]) <= f for x, k, f in zip(answers, on, floors, strict=True))
         shown = position(on, f"{how}; without the regimes that are not judged"), still
-    parts = [
-        [x for x in xs if x is not None]
-        for xs in ([x.effort_before for x in answers], [x.effort_after for x in answers])
-    ]
-    effort = None
-    if parts[0] and parts[1]:
-        eb, ea = (float(np.sqrt(np.concatenate(xs).mean())) for xs in parts)
+    both, effort = ((x.effort_before, x.effort_after) for x in answers), None
+    if sensed := [(b, a) for b, a in both if b is not None and a is not None]:
+        eb, ea = (rms(np.concatenate(xs)) for xs in zip(*sensed, strict=True))
         effort = _error("effort_rmse_Nm", (eb, eb, eb), (ea, ea, ea), names, how)
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
     loud = _loud(answers, kept, noise, refuted)
-    return Judged(position(all_of_it, how), effort, None, structured, quiet, loud, shown)
+    far = any(rms(x.before) > JUDGE.far * noise.joints[x.case.joint] for x in answers)
+    step = 0.0 if far else rms(np.square([x.case.quantum for x in answers]))
+    return Judged(position(all_of_it, how), effort, None, structured, quiet, loud, shown, step)
 
 
 def _loud(answers: Sequence[JointAnswer], kept: held_out.Split, noise: Noise, refuted: set[str]) -> tuple[str, ...]:
@@ -357,10 +355,9 @@ def _error(
     name: str, before: Sequence[float | None], after: Sequence[float | None], recordings: Sequence[str], how: str
 ) -> dict[str, Any]:
     """Return an entry of `held_out`. before, after: value, low and high."""
-    keys = ("before", "before_low", "before_high", "after", "after_low", "after_high")
-    values = dict(zip(keys, [*before, *after], strict=True))
-    order = ("before", "after", "before_low", "before_high", "after_low", "after_high")
-    return {"recordings": list(recordings), "error": name} | {k: values[k] for k in order} | {"how": how}
+    errors = {"before": before[0], "after": after[0], "before_low": before[1], "before_high": before[2]}
+    return {"recordings": list(recordings), "error": name} | errors | {
+        "after_low": after[1], "after_high": after[2], "how": how}  # fmt: skip
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[Finding]) -> list[str]:
@@ -561,13 +558,14 @@ def _of_joints(findings: Sequence[Finding], by: Judged, floor: float) -> tuple[s
         if any(map(held_out.lowers, named)):
             return "explained", by.effort
     p, of_motion = by.position, [f for f in findings if not _by_torque(f)]
-    rest, loud = by.structured, bool(by.loud)
-    word = held_out.verdict(of_motion, floor, p["before"], p["before_low"], p["after"], rest, by.quiet, loud)
+    word_of = lambda e, quiet: held_out.verdict(  # noqa: E731
+        of_motion, floor, e["before"], e["before_low"], e["after"], by.structured, quiet, bool(by.loud), by.step
+    )
+    word = word_of(p, by.quiet)
     if word == "unknown" and by.shown is not None:  # what no fitted recording shows cannot be known: it is not judged
-        q, quiet = by.shown
-        told = held_out.verdict(of_motion, floor, q["before"], q["before_low"], q["after"], rest, quiet, loud)
+        told = word_of(*by.shown)
         if told != "unknown":
-            word, p = told, q
+            word, p = told, by.shown[0]
     return word, p
 
 
@@ -698,6 +696,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     engine = "replayed in the engine that trains"
     replayed = f" The files as written, {engine}, leave {number(after)} {unit}." if written else ""
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
+    if limit and d.judged is not None and d.judged.step and data["verdict"] == "none":
+        limit += f", a step of the encoders {1e3 * d.judged.step:.2g}"
     if limit and d.judged is not None and d.judged.loud and after < 1e3 * (floor or 0.0):  # that of all motions
         limit = "repeats of the same motion differ by less"
     named = [f for f in d.findings if modelled(f) and not f.hint]

@@ -116,15 +116,10 @@ def left_over(after: float, before: float, noise: float) -> float:
     return max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
 
 
-def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: it loses
+def kept_of(left: float) -> float:
+    """Share of its confidence that a name keeps when the share `left` of the squared error stays unexplained: it loses
     `JUDGE.left_costs` where that is `JUDGE.removed` or more, evenly less below. What follows only half of a gap may be
     another effect that looks like it."""
-    return kept_of(left_over(after, before, noise))
-
-
-def kept_of(left: float) -> float:
-    """Return the same of the share `left` that stays unexplained."""
     return 1.0 - JUDGE.left_costs * min(left / JUDGE.removed, 1.0)
 
 
@@ -150,12 +145,12 @@ def unresolved(without: float, after: float, quantum: float) -> str:
     )
 
 
-def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
+def weigh(e: Evidence) -> float:
     """Return the confidence of one finding by itself: its share, what it earned, what stays unexplained, and its
     reasons."""
-    c = e.share * e.earned * trusted(before, after, noise)
+    c = e.share * e.earned * kept_of(e.left)
     if e.members > 1:  # of what the others leave it has to explain most
-        c *= trusted(without, after, noise)
+        c *= kept_of(e.left_of_rest)
     return float(min(c, JUDGE.surest, JUDGE.doubted if e.reasons else 1.0))
 
 

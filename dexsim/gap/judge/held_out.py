@@ -367,19 +367,19 @@ def verdict(
     structured: bool,
     quiet: bool = False,
     loud: bool = False,
+    step: float = 0.0,
 ) -> str:
     """Return the one word. findings: after `settle`; floor, before, after: of the error on what was held out;
     before_low: of its 90 % interval; structured: whether what is left without any effect has structure; quiet: whether
     every joint is followed to its own floor; loud: whether some recording is surely missed by more than its own repeats
-    differ by. Where the rest is followed to the floor a wrong signal is the answer: something was amiss, and it has a
-    name. Names of which none surely lowers the error explain nothing."""
+    differ by; step: that of the encoders. Where the rest is followed to the floor a wrong signal is the answer:
+    something was amiss, and it has a name. Names of which none surely lowers the error explain nothing. What has no
+    name and moves the joints by less than their encoders' step is a size, no verdict."""
     named = firm(findings)
     if not any(map(lowers, named)):
-        if not loud and (
-            quiet
-            or before <= JUDGE.within * floor
-            or (before <= JUDGE.far * floor and (before_low <= JUDGE.within * floor or not structured))
-        ):
+        blurred = not named and before**2 - floor**2 < step**2
+        borne = before_low <= JUDGE.within * floor or not structured or blurred
+        if not loud and (quiet or before <= JUDGE.within * floor or (before <= JUDGE.far * floor and borne)):
             return "explained" if any(f.wrong_signal and f.confidence >= JUDGE.firm for f in findings) else "none"
         return "unknown"
     # where every name is doubtful and none stands for a set, an error that is gone is not yet explained

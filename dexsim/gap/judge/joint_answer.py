@@ -282,7 +282,7 @@ class JointAnswer:
         elif far := confidence.beyond(params, reported, case):
             evidence.reasons.append(f"its {far.replace('_', ' ')} may be larger than what is looked for")
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
-        evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
+        evidence.confidence = confidence.weigh(evidence)
         if unlike := confidence.not_repeated(params, self._by_fold(mm), case):
             evidence.reasons.append(unlike)
         if (nothing and as_reported) or small or blurred or stopped or unlike:
