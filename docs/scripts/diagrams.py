@@ -1,11 +1,15 @@
-"""Draws the block diagrams of the concept pages as SVG: python docs/scripts/diagrams.py [out=docs/media]."""
+"""Draws the block diagrams of the concept pages, and how often names of a diagnosis are true, as SVG: python
+docs/scripts/diagrams.py [out=docs/media]."""
 
 from __future__ import annotations
 
 import html
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from dexsim.intervals import share
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDE, TALL, GAP = 150, 58, 34  # pixels: of a box, and between boxes
@@ -123,10 +127,57 @@ def assumptions() -> str:
     return svg(boxes, [("read", "model"), ("measured", "servo"), ("ours", "ranges")], "Where the figures come from")
 
 
+BINS = "names of each tenth of confidence that are true"
+SIDE, LEFT = 300, 46  # pixels: of the diagram, and from the edge to its axis
+
+
+def calibration(given: str) -> str:
+    """Return the reliability diagram: the share of names that are true, with its 90 % interval, by confidence. given:
+    "true/named" of each tenth, separated by commas."""
+    at = lambda x: LEFT + SIDE * x  # noqa: E731
+    up = lambda y: 14 + SIDE * (1 - y)  # noqa: E731
+    text = lambda x, y, words, more="": (  # noqa: E731
+        f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="middle" style="{STYLE};font-size:11px"{more}>{words}</text>'
+    )
+    width, height = LEFT + SIDE + 20, SIDE + 62
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">',
+        "<title>Names by their confidence, and how many of them are true</title>",
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+        f'<path d="M{at(0)},{up(1)} V{up(0)} H{at(1)}" fill="none" stroke="{INK}"/>',
+        f'<path d="M{at(0)},{up(0)} L{at(1)},{up(1)}" stroke="{INK}" stroke-dasharray="4 4" stroke-width="0.8"/>',
+        text(at(0.5), height - 6, "confidence of a name"),
+        text(12, up(0.5), "share that is true", f' transform="rotate(-90 12 {up(0.5):.0f})"'),
+    ]
+    for x in (0.0, 0.5, 1.0):
+        out += [text(at(x), up(0) + 30, f"{x:g}"), text(at(0) - 14, up(x) + 4, f"{x:g}")]
+    for i, pair in enumerate(given.split(", ")):
+        hits, count = map(int, pair.split("/"))
+        out.append(text(at(i / 10 + 0.05), up(0) + 14, str(count), ' fill-opacity="0.6"'))
+        if not count:
+            continue
+        low, high = share(hits, count, 0.9)
+        middle = at(i / 10 + 0.05)
+        out.append(
+            f'<rect x="{middle - 11:.1f}" y="{up(hits / count):.1f}" width="22" height="{SIDE * hits / count:.1f}" '
+            f'fill="{FILL}" stroke="{LINE}"/>'
+            f'<path d="M{middle:.1f},{up(low):.1f} V{up(high):.1f}" stroke="{INK}" stroke-width="1.5"/>'
+        )
+    return "\n".join([*out, "</svg>"]) + "\n"
+
+
+def measured(name: str) -> str:
+    """Return the value of a figure of the results' concealed cases."""
+    data = json.loads((ROOT / "docs" / "results" / "data" / "concealed.json").read_text(encoding="utf-8"))
+    return next(f["value"] for m in data["measurements"] for f in m["figures"] if f["name"] == name)
+
+
 def main(argv: Sequence[str]) -> int:
     """Write the diagrams; return the exit status."""
     out = Path(argv[0].removeprefix("out=")) if argv else ROOT / "docs" / "media"
-    for name, text in (("servo", servo()), ("task", task()), ("reality", reality()), ("assumptions", assumptions())):
+    drawn = (("servo", servo()), ("task", task()), ("reality", reality()), ("assumptions", assumptions()),
+             ("calibration", calibration(measured(BINS))))  # fmt: skip
+    for name, text in drawn:
         (out / f"{name}.svg").write_text(text, encoding="utf-8")
     return 0
 
