@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+AT_ONCE = 512  # rows that are made in one call: what is made in between stays in a core's cache
+
 
 def on_lines(at: np.ndarray, known: np.ndarray, x: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """Return [n, E] columns x [m, E], finite and known at times [m] that grow, at other times [n]: on straight lines
-    between, held at the ends: the numbers of `np.interp` of each column; out [n, E]: where to."""
+    """Return [n, E] columns x [m, E], finite and known at times [m] that grow, at other times [n] that grow: on
+    straight lines between, held at the ends: the numbers of `np.interp` of each column; out [n, E]: where to."""
     out = np.empty((len(at), x.shape[1])) if out is None else out
-    with np.errstate(divide="ignore", invalid="ignore"):  # between equal times, which no time lies between
-        slope = np.vstack([np.diff(x, axis=0) / np.diff(known)[:, None], np.zeros((1, x.shape[1]))])
     k = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(known) - 1)
-    np.multiply(slope[k], np.maximum(at - known[k], 0.0)[:, None], out=out)
-    out += x[k]
+    past, span = np.maximum(at - known[k], 0.0)[:, None], np.r_[np.diff(known), 1.0][:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # between equal times, which no time lies between
+        for a in range(0, len(at), AT_ONCE):
+            rows = slice(a, a + AT_ONCE)
+            some = slice(k[rows][0], k[rows][-1] + 1)
+            near = x[some.start : some.stop + 1]
+            slope = np.zeros((some.stop - some.start, x.shape[1]))  # none after the last
+            np.divide(near[1:] - near[:-1], span[some][: len(near) - 1], out=slope[: len(near) - 1])
+            here = k[rows] - some.start
+            np.multiply(slope[here], past[rows], out=out[rows])
+            out[rows] += near[here]
     return out
