@@ -153,7 +153,6 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     series, plant = plant.series.copy(), copy.copy(plant)
     series[:, ~series.any(0)] = 0.1 * rng.normal(size=(len(series), 1))  # of joints that pull, of what hangs on it
     plant.set_series(series)
-    monkeypatch.setattr(plants, "MANY", 0)
     servo = {c.name: c for c in COLUMNS}
     for k in kernel.USUAL:
         name, value = NAMES[k], many[:, :, k]

@@ -34,7 +34,6 @@ CHUNK = 16  # of them that are copied in one call, and forgotten when all are
 FEW = 16
 # guesses that simulate as fast alone as in a vector, and whether this machine has vectors of some width
 FILLED, SIDE_BY_SIDE = 3, platform.machine() in ("x86_64", "AMD64")
-MANY = 200  # guesses of a joint that take as long alone as Warp to write a kernel (0.5 s in each process)
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
 _VERSIONS = itertools.count()  # of plants: what one simulated is not what another would
@@ -197,7 +196,6 @@ class JointPlant:
         self._grid, self._cmds = [0], [0]
         self._rows = [0]
         self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
-        self._more = 0  # guesses with `kernel.MORE` columns so far
 
     def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
             cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None,
@@ -488,9 +486,6 @@ class JointPlant:
                 two = (rows[:, PLAY] > 0).any(1) == (columns == pk.TWO)
                 some = np.flatnonzero(left & two & (rows[:, rest] == pk.ABSENT[rest]).all(1))
                 some = some[: len(some) - len(some) % pk.LANES * (len(some) % pk.LANES < FILLED)]
-                self._more += len(some) * (columns == pk.MORE)
-                if columns == pk.MORE and self._more < MANY:
-                    continue
                 left[some] = False
                 out.append((some, columns))
         return [(x, columns) for x, columns in (*out, (np.flatnonzero(left), ())) if len(x)]

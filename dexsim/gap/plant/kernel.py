@@ -152,6 +152,7 @@ class Guess:  # the columns of one guess that every step asks for
     scale: f64
     offset: f64
     dt: f64  # of a sub-step
+    rate: f64  # of them [1/s]
     age: f64
     ki: f64
     beyond: bool  # the controller has more terms than the PD
@@ -243,8 +244,8 @@ class Pair:  # rotor and link in one step of the grid, where they are two bodies
     damping: f64  # of the spring
     rotor_rate: f64  # inertia over a sub-step
     link_rate: f64
-    on_rotor: f64  # speed that the motor's torque gives the rotor in a sub-step,
-    on_both: f64  # and both
+    moves_rotor: f64  # speed that a torque gives the rotor in a sub-step,
+    moves_both: f64  # and both
 
 
 @wp.struct
@@ -274,6 +275,7 @@ def guess(c: Recorded, of: Any, dt: f64):
     p.dt = dt / f64(ONE_BODY_STEPS)
     if p.two:
         p.dt = dt / f64(TWO_BODY_STEPS)
+    p.rate = f64(1.0) / p.dt
     p.staged = of[P_STAGES] > f64(1.5)
     p.lag = lag_share(of[P_LAG] / of[P_STAGES], p.dt)
     p.viscous = of[P_VISC]
@@ -305,8 +307,9 @@ def guess(c: Recorded, of: Any, dt: f64):
     p.base_damping = c.consts[C_DAMPING]
     p.motor_share = of[P_MOTORSHARE]
     # what an encoder that misreads has shown lies within the range: no stop is where the joint was recorded to be
-    p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) / p.scale)
-    p.high = wp.max(c.consts[C_HIGH], (c.consts[C_HIGH] - p.offset) / p.scale)
+    per = f64(1.0) / p.scale
+    p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) * per)
+    p.high = wp.max(c.consts[C_HIGH], (c.consts[C_HIGH] - p.offset) * per)
     p.stop = c.consts[C_STIFF]
     return p
 
@@ -451,10 +454,10 @@ def pair_now(of: Any, p: Guess, n: Now):
             b.stiff = p.stop
             b.hardening = f64(0.0)
         b.damping = transmission_damping(of[P_REBOUND], b.stiff, b.rotor, b.link, n.inertia)
-        b.rotor_rate = b.rotor / p.dt
-        b.link_rate = b.link / p.dt
-        b.on_rotor = n.efficiency * p.dt / b.rotor
-        b.on_both = n.efficiency * p.dt / n.inertia
+        b.rotor_rate = b.rotor * p.rate
+        b.link_rate = b.link * p.rate
+        b.moves_rotor = p.dt / b.rotor
+        b.moves_both = p.dt / n.inertia
     return b
 
 
@@ -487,9 +490,9 @@ def doubled(c: f64, s: f64):
 
 
 @wp.func
-def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep: f64, gain: f64, drift: f64, n: Now):
+def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep: f64, line: f64, gain: f64, drift: f64):
     """What a torque drive gives of u = (now, end, slope). At its limit the torque keeps to the limit for the whole
-    step, unless the step's end is within the limits; gain, drift: the change of speed in this step is gain * torque +
+    step, unless the step's end is within the limits; line: torque lost per speed; gain, drift: the change of speed in this step is gain * torque +
     drift."""
     t = Torque()
     t.now = wp.clamp(u[0], -lower, upper)
@@ -503,10 +506,10 @@ def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep:
         if end * wp.sign(u[1]) >= limit:
             t.on_loop = f64(0.0)
             if u[1] * v_lim > f64(0.0) and limit > f64(0.0):
-                t.on_drive = n.tau0 / (n.no_load * n.supply)
+                t.on_drive = line
             elif u[1] * v_lim < f64(0.0) and limit > f64(0.0):
                 # it grows as the speed falls, exponentially: taken at the step's start it would come late
-                t.on_drive = -wp.min(steep * n.tau0 / (n.no_load * n.supply), f64(0.5) / wp.max(gain, f64(1.0e-12)))
+                t.on_drive = -wp.min(steep * line, f64(0.5) / wp.max(gain, f64(1.0e-12)))
         else:
             t.on_loop = u[2] * limit / wp.abs(u[1])
     return t
@@ -566,30 +569,36 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, give: f64
     begun = x.v
     damping = n.efficiency * t.on_loop + n.efficiency * t.on_drive
     level += p.base_friction
-    a = n.inertia / (theta * dt) + damping + visc + stop_d
-    free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + grease * n.carried) / a
+    share = f64(1.0) / theta
+    mass = n.inertia * p.rate * share
+    a = mass + damping + visc + stop_d
+    slower = f64(1.0) / a
+    free = (mass * x.v + applied + damping * x.v - load + grease * n.carried) * slower
     free -= n.carried  # dry friction acts where the motor turns
+    turn = f64(0.0)  # of the friction, taken up by a speed in the step
+    if give > f64(0.0):
+        turn = dt / give
     if n.held:
         if give > f64(0.0):
-            x.taken = preslide(x.taken, (x.v - n.carried) * dt / give)
+            x.taken = preslide(x.taken, (x.v - n.carried) * turn)
     else:
         went = n.carried  # speed in the middle of the step, or at its end
         if give > f64(0.0):
-            free = preslide_speed(free, a, level, x.taken, give / dt)
+            free = preslide_speed(free, a, level, x.taken, give * p.rate)
             went = free + n.carried
-            x.taken = preslide(x.taken, free * dt / give)
+            x.taken = preslide(x.taken, free * turn)
             x.q += dt * (free + n.carried)
-            x.v = x.v + (free + n.carried - x.v) / theta
+            x.v = x.v + (free + n.carried - x.v) * share
             if (x.v - n.carried) * free < f64(0.0):
                 x.v = n.carried
         elif wp.abs(free) * a <= level:
             x.q += dt * n.carried
             x.v = n.carried
         else:
-            free -= wp.sign(free) * level / a
+            free -= wp.sign(free) * level * slower
             went = free + n.carried
             x.q += dt * went
-            ahead = x.v + (free + n.carried - x.v) / theta
+            ahead = x.v + (free + n.carried - x.v) * share
             if (ahead - n.carried) * free < f64(0.0):  # friction stops the joint within the step
                 ahead = n.carried
             x.v = ahead
@@ -714,18 +723,18 @@ def substep(of: Any, x: State, p: Guess, n: Now, b: Pair):
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)
-    body = n.inertia
-    gain = b.on_both
+    moves = b.moves_both  # speed that a torque gives in the step
     if p.two:
         if wp.abs(x.qm - x.q) < p.gap2:
-            body = b.rotor
-            gain = b.on_rotor
+            moves = b.moves_rotor
     else:
         stiffness = n.efficiency * (p.kd + p.kp * dt)
         if p.voltage:
             stiffness = n.efficiency * n.tau0 * (n.supply * (p.kd + p.kp * dt) + f64(1.0) / n.no_load)
-        theta = wp.clamp(half + half * ((stiffness + visc) * dt / n.inertia - f64(0.6)), half, f64(1.0))
-        gain = n.efficiency * (theta * dt) / n.inertia
+        moves = dt / n.inertia
+        theta = wp.clamp(half + half * ((stiffness + visc) * moves - f64(0.6)), half, f64(1.0))
+        moves = theta * moves
+    gain = n.efficiency * moves
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
@@ -737,8 +746,11 @@ def substep(of: Any, x: State, p: Guess, n: Now, b: Pair):
     left = f64(1.0)  # of what the drive gives, where its supply sags
     if n.weak != zero or p.weak_own != zero:
         left = sagged_torque(n.weak, p.weak_own, x.last)
+    per = f64(1.0) / (n.no_load * n.supply)
     if not p.voltage:
-        speed = wp.abs(v_lim) / (n.no_load * n.supply * left)
+        speed = wp.abs(v_lim) * per
+        if left != f64(1.0):
+            speed = speed / left
         limits = torque_limits(n.tau0 * left, speed, v_lim, p.steep)
     asked = wp.vec3d(left * u[0], left * u[1], left * u[2])
     if p.beyond:
@@ -749,12 +761,12 @@ def substep(of: Any, x: State, p: Guess, n: Now, b: Pair):
         x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
         x.since = dt
         asked = other_terms(u, n.feed, x.integral, p.ki, rate, shows, step)
-    drift = -load * step / body
+    drift = -load * moves
     t = Torque()
     if p.voltage:
         t = drive_voltage(asked, v_drive, gain, drift, n)
     else:
-        t = drive_torque(asked, v_lim, speed, limits[0], limits[1], p.steep, gain, drift, n)
+        t = drive_torque(asked, v_lim, speed, limits[0], limits[1], p.steep, n.tau0 * per, gain, drift)
     x.older = zero
     if t.on_loop != zero:
         x.older = p.kp * p.age * shows * v_l
@@ -887,16 +899,18 @@ def finite(x: State):
     return x
 
 
+def compiled() -> str:
+    """Return flags of the compiler on a CPU: scalars packed into vectors cost a twentieth more time than they save."""
+    given = wp.config.cpu_compiler_flags
+    return f"{'-march=native' if given is None else given} -fno-slp-vectorize"
+
+
 @cache
 def plant_kernel() -> wp.Kernel:
     """Return the kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and
     guess; dt: step of the grid [s]."""
 
-    # scalars packed into vectors on a CPU cost a twentieth more time than they save
-    given = wp.config.cpu_compiler_flags
-    unpacked = f"{'-march=native' if given is None else given} -fno-slp-vectorize"
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": unpacked})
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiled()})
     def plant(first_window: int, first: int, dt: f64, c: Recorded):
         ww, hh = wp.tid()  # guesses of one window side by side: what was recorded in it stays in the cache
         w = first_window + ww
@@ -1003,12 +1017,14 @@ COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
 def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
     torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `MORE` or `TWO`). Rows of params:
-    as many as threads have."""
+    as many as threads have.
+
+    No `wp.static` here is of a loop's variable: each process would write out the kernel anew to find it in the cache."""
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
+    absent, places = wp.constant(Row(*ABSENT)), wp.constant(wp.types.vector(length=len(usual), dtype=int)(*usual))
     two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
     substeps = TWO_BODY_STEPS if two else ONE_BODY_STEPS
-    given = wp.config.cpu_compiler_flags
-    flags = f"{'-march=native' if given is None else given} -fno-slp-vectorize -mprefer-vector-width=512"
+    flags = f"{compiled()} -mprefer-vector-width=512"
 
     @wp.kernel(module="unique", enable_backward=False,
                module_options={"cpu_compiler_flags": flags, "max_unroll": COLUMNS})  # fmt: skip
@@ -1043,7 +1059,7 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
         while l < LANES:
             of = c.params[h0 + l]
             for m in range(wp.static(count)):
-                columns[wp.static(LANES * m) + l] = of[wp.static(usual[m])]
+                columns[LANES * m + l] = of[places[m]]
             p = guess(c, of, dt)
             x = begun(c, of, wp.min(h0 + l, c.inits.shape[0] - 1), w, g0, warm, p)
             qs[l] = x.q
@@ -1112,12 +1128,9 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                 l = int(0)
                 # becomes vectors while no call, no loop and no struct of another loop is in it
                 while l < LANES:
-                    row = Row()
-                    for m in range(COLUMNS):
-                        if wp.static(m not in usual):
-                            row[m] = wp.static(f64(ABSENT[m]))
+                    row = Row(absent)
                     for m in range(wp.static(count)):
-                        row[wp.static(usual[m])] = columns[wp.static(LANES * m) + l]
+                        row[places[m]] = columns[LANES * m + l]
                     fixed = guess(c, row, dt)
                     fixed.two = wp.static(two)
                     fixed.voltage = False
