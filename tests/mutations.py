@@ -283,7 +283,7 @@ MUTATIONS = (
     Mutation(
         "the model's stops stand where a misread joint was recorded to be",
         "dexsim/gap/plant/kernel.py",
-        "p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) / p.scale)",
+        "p.low = wp.min(c.consts[C_LOW], (c.consts[C_LOW] - p.offset) * per)",
         "p.low = c.consts[C_LOW]",
         "tests/test_gap_ends.py::test_no_end_is_where_a_joint_was_recorded_to_be",
     ),
