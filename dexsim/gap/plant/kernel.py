@@ -1019,7 +1019,7 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `MORE` or `TWO`). Rows of params:
     as many as threads have.
 
-    No `wp.static` here is of a loop's variable: each process would write out the kernel anew to find it in the cache."""
+    No `wp.static` here is of a loop's variable: each process would write the kernel out anew, cached or not."""
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
     absent, places = wp.constant(Row(*ABSENT)), wp.constant(wp.types.vector(length=len(usual), dtype=int)(*usual))
     two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
