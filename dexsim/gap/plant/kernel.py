@@ -492,8 +492,8 @@ def doubled(c: f64, s: f64):
 @wp.func
 def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep: f64, line: f64, gain: f64, drift: f64):
     """What a torque drive gives of u = (now, end, slope). At its limit the torque keeps to the limit for the whole
-    step, unless the step's end is within the limits; line: torque lost per speed; gain, drift: the change of speed in this step is gain * torque +
-    drift."""
+    step, unless the step's end is within the limits; line: torque lost per speed; gain, drift: the change of speed in
+    this step is gain * torque + drift."""
     t = Torque()
     t.now = wp.clamp(u[0], -lower, upper)
     t.end = wp.clamp(u[1], -lower, upper)
