@@ -129,6 +129,7 @@ def test_notes_that_recordings_share_are_said_once():
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     from dexsim.gap.inquiry import Diagnosis, empty
     from dexsim.gap.judge.conclude import sentence
+    from dexsim.gap.judge.confidence import Evidence
     from dexsim.gap.report.files import Findings, render
 
     def found(effect: str, confidence: float, key: str) -> Finding:
@@ -139,7 +140,11 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     data = empty("partly_explained")
     data["held_out"] |= {"before": 0.02, "after": 0.01}
     d = Diagnosis(data, "", [], [found("command_delay", 0.9, "delay"), found("lag", 0.3, "time_constant")])
+    d.evidence = [Evidence("command_delay", "knee", 0.97, 1.0, 0.15, 0.0, 9.0, 1, ["x"])]
+    d.findings[0] = replace(d.findings[0], alternatives=[{"effect": "stribeck_friction", "confidence": 0.03}])
     html = render(Findings(d))
+    why = "Why 90 %: of the redraws command delay wins 97 %, stribeck friction wins 3 %; times 1.00"
+    assert why in html and "0.75 for what stays" in html and "less for doubts" in html
     missing, hints = html.split("<h2>Hints</h2>")
     assert "delay" in missing and "lag" not in missing.lower().replace("lagg", "") and "lag" in hints.lower()
     said = sentence(data, d, 0.001)

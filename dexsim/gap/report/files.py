@@ -23,6 +23,7 @@ from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.finding import Finding, gathered
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.judge.conclude import place, spoken, unit_of, words_of
+from dexsim.gap.judge.confidence import kept_of
 from dexsim.gap.judge.full_model import ORDER
 from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
 from dexsim.gap.report import charts
@@ -294,7 +295,23 @@ class Findings(Section):
             "before": number(1e3 * h["before"]) if h else "",
             "after": number(1e3 * h["after"]) if h else "",
             "unit": unit,
+            "why": self._why(f),
         } | self._lost(f)
+
+    def _why(self, f: Finding) -> str:
+        """Return the hypotheses with their shares of the redraws, and what else makes the confidence; empty where it
+        was not searched."""
+        e = next((e for e in self.d.evidence if e.effect == f.effect and e.joint in f.joints), None)
+        if e is None or not f.held_out:
+            return ""
+        row = {f.effect: e.share} | {a["effect"]: a["confidence"] for a in f.alternatives}
+        wins = ", ".join(f"{_name(n)} wins {100 * x:.0f} %" for n, x in row.items())
+        kept = kept_of(e.left) * (kept_of(e.left_of_rest) if e.members > 1 else 1.0)
+        return (
+            f"Why {100 * f.confidence:.0f} %: of the redraws {wins}; times {e.earned:.2f} for the error that it "
+            f"removes, {kept:.2f} for what stays, {e.odds:.2f} for its odds among all that was tried"
+            f"{'; less for doubts, in the notes' * bool(e.reasons)}."
+        )
 
     def _metric(self, f: Finding) -> str:
         """Return the metric of a finding's held-out error."""
@@ -315,25 +332,10 @@ class Findings(Section):
         return Markup(charts.strips(rows)) if rows else None
 
     def _lost(self, f: Finding) -> dict[str, Any]:
-        """Return the runner-up and why it lost, or the set that cannot be told apart."""
-        rivals = [a for a in f.alternatives if a["confidence"] >= 0.005]
-        out: dict[str, Any] = dict.fromkeys(("set", "separating", "lone", "open", "rival", "then", "wins"), "")
-        if f.indistinguishable:
-            return out | {
-                "set": " and ".join(_name(x) for x in f.indistinguishable),
-                "separating": f.separating_experiment,
-            }
-        if not f.held_out:  # found before any fit: a signal, or a push from outside
-            return out
-        if not rivals:
-            return out | {"lone": True}
-        first, *rest = rivals
-        return out | {
-            "rival": _name(first["effect"]),
-            "wins": f"{100 * first['confidence']:.0f}",
-            "open": first["confidence"] > f.confidence,
-            "then": ", ".join(_name(a["effect"]) for a in rest),
-        }
+        """Return the set that cannot be told apart, or what would do as well in its place."""
+        alike, rival = " and ".join(_name(x) for x in f.indistinguishable), next(iter(f.alternatives), None)
+        better = rival if rival and f.held_out and not alike and rival["confidence"] > f.confidence else None
+        return {"set": alike, "separating": f.separating_experiment, "open": _name(better["effect"]) if better else ""}
 
     def _nearest(self) -> list[dict[str, str]]:
         """Return the effects that a search priced highest and did not find."""
