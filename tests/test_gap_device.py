@@ -162,6 +162,7 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     many[10:20, :, INDEX["backlash"]] = 0.02
     many[14:20, :, INDEX["softness"]] = 0.05
     many[14:20, :, INDEX["rebound"]] = 0.1
+    many[12, :, INDEX["linkage"]] = 0.1
     many[7, :, INDEX["torque_ripple"]] = 0.1
     pulled = ("linkage", "reaction", "own_payload", "com_out", "com_across", "coupling_from")
     for k, name in enumerate(pulled, 21):

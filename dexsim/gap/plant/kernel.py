@@ -1006,7 +1006,7 @@ USUAL = tuple(
 MORE = USUAL + tuple(  # by another joint, or by what hangs on it
     INDEX[n] for n in ("linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across")
 )
-TWO = USUAL + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
+TWO = MORE + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
 Lanes = wp.types.vector(length=LANES, dtype=f64)
 Row = wp.types.vector(length=len(NEUTRAL), dtype=f64)
 ABSENT = np.where(np.isfinite(NEUTRAL), NEUTRAL, 1e9)  # as a plant has columns of what is not there
