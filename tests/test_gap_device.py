@@ -147,9 +147,10 @@ def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
 
 
 def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
-    """All columns that such guesses may have, drawn at random; some have a play, one a ripple and is not of them."""
+    """All columns that such guesses may have, drawn at random; some have a play, one a ripple
+    beside a bias and is not of them."""
     plant, params, _ = guesses
-    rng, many = np.random.default_rng(3), np.repeat(params[:1], 27, 0)
+    rng, many = np.random.default_rng(3), np.repeat(params[:1], 31, 0)
     series, plant = plant.series.copy(), copy.copy(plant)
     series[:, ~series.any(0)] = 0.1 * rng.normal(size=(len(series), 1))  # of joints that pull, of what hangs on it
     plant.set_series(series)
@@ -157,7 +158,7 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     for k in kernel.USUAL:
         name, value = NAMES[k], many[:, :, k]
         away = 0.02 if name not in servo else min(servo[name].usual, servo[name].high - servo[name].neutral)
-        shift = rng.uniform(0, 1, (27, 1)) * (0.5 * value if value.any() else away)
+        shift = rng.uniform(0, 1, (31, 1)) * (0.5 * value if value.any() else away)
         many[:, :, k] = value + (shift if np.isfinite(shift).all() and (value < 1e8).all() else 0.0)
     many[10:20, :, INDEX["backlash"]] = 0.02
     many[14:20, :, INDEX["softness"]] = 0.05
@@ -167,10 +168,14 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     pulled = ("linkage", "reaction", "own_payload", "com_out", "com_across", "coupling_from")
     for k, name in enumerate(pulled, 21):
         many[21 : k + 1, :, INDEX[name]] = 2.0 if name == "coupling_from" else 0.1
-    inits = 0.01 * rng.normal(size=(27, 2))
+    called = {"stribeck_peak": 0.1, "torque_ripple": 0.1, "lag_stages": 2.0, "thinning_friction": 0.1}
+    many[27:, :, INDEX["bias"]], many[27:, :, INDEX["ripple_per_turn"]] = 0.0, 9.0
+    for k, (name, value) in enumerate(called.items(), 28):
+        many[27:k, :, INDEX[name]] = value
+    inits = 0.01 * rng.normal(size=(31, 2))
     vectors = {columns: which.tolist() for which, columns in plant._side_by_side(many[:, 0], 0)}
     assert vectors[kernel.TWO] == [*range(10, 18)] and vectors[kernel.USUAL] == [*range(7), 8]
-    assert vectors[kernel.MORE] == [9, *range(20, 27)]
+    assert vectors[kernel.MORE] == [9, *range(20, 27)] and vectors[kernel.CALLED] == [*range(27, 31)]
     for length in (1.0, None):
         at_once = plant.simulate(many, plant.windows(length), inits)
         with monkeypatch.context() as m:

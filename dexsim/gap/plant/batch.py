@@ -481,7 +481,7 @@ class JointPlant:
         vector of them is filled; the others, with none."""
         left, out = np.ones(len(rows), bool), []
         if SIDE_BY_SIDE and not (self.voltage or "motor" in (self.loop, self.position) or open_stage or brought()):
-            for columns in (pk.USUAL, pk.MORE, pk.TWO):
+            for columns in (pk.USUAL, pk.MORE, pk.TWO, pk.CALLED):
                 rest = np.setdiff1d(np.arange(rows.shape[1]), columns)
                 two = (rows[:, PLAY] > 0).any(1) == (columns == pk.TWO)
                 some = np.flatnonzero(left & two & (rows[:, rest] == pk.ABSENT[rest]).all(1))

@@ -21,10 +21,13 @@ import warp as wp
 from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.columns import MEMORY
 from dexsim.actuator.laws import (
+    COULOMB,
     LEAST_ROTOR,
+    RIPPLE,
     SETPOINT,
     SETPOINT_NEW,
     SETPOINT_SPEED,
+    STRIBECK_PEAK,
     arrived,
     command_delay,
     difference,
@@ -1007,6 +1010,13 @@ MORE = USUAL + tuple(  # by another joint, or by what hangs on it
     INDEX[n] for n in ("linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across")
 )
 TWO = MORE + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
+# what calls exp() or sin(), which would keep the others from being vectors: worked out before, as friction and bias
+CALLED = tuple(k for k in MORE if k != P_BIAS) + tuple(
+    INDEX[n] for n in (
+        "stribeck_peak", "stribeck_speed", "torque_ripple", "ripple_per_turn", "ripple_phase", "lag_stages",
+        "sag_torque", "sag_own", "sag", "coupling", "thinning_friction", "thinning_speed",
+    )
+)  # fmt: skip
 Lanes = wp.types.vector(length=LANES, dtype=f64)
 Row = wp.types.vector(length=len(NEUTRAL), dtype=f64)
 ABSENT = np.where(np.isfinite(NEUTRAL), NEUTRAL, 1e9)  # as a plant has columns of what is not there
@@ -1016,8 +1026,8 @@ COLUMNS, FILTERED, P_DELAY = len(NEUTRAL), MEMORY["filtered"], INDEX["delay"]
 @cache
 def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     """Return the kernel of guesses side by side, one thread `LANES` of them and a window: what `plant_kernel` does of a
-    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `MORE` or `TWO`). Rows of params:
-    as many as threads have.
+    torque drive whose loop reads the joint, as far as these columns say (`USUAL`, `MORE`, `TWO` or `CALLED`). Rows of
+    params: as many as threads have.
 
     No `wp.static` here is of a loop's variable: each process would write the kernel out anew, cached or not."""
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
@@ -1045,6 +1055,9 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
         qms = Lanes()
         vms = Lanes()
         lasts = Lanes()
+        stages = Lanes()
+        levels = Lanes()
+        pushes = Lanes()
         olders = Lanes()
         heards = Lanes()
         takens = Lanes()
@@ -1126,11 +1139,27 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
             part = int(0)
             while part < wp.static(substeps):
                 l = int(0)
+                while l < wp.static(LANES if usual == CALLED else 0):
+                    of = c.params[h0 + l]
+                    carried = of[P_LINKAGE] * c.series[g, XDV + int(of[P_FROM])]
+                    v = vs[l] - carried
+                    x = State()
+                    fades, kept = dry(of, qs[l], v, f64(0.0), f64(0.0), False, f64(1.0), x.memory, False, dt)
+                    wave, kept = parasitic(of, qs[l], v, x.memory, False, dt)
+                    levels[l] = fades[0] + fades[1]
+                    pushes[l] = wave[0]
+                    l += 1
+                l = int(0)
                 # becomes vectors while no call, no loop and no struct of another loop is in it
                 while l < LANES:
                     row = Row(absent)
                     for m in range(wp.static(count)):
                         row[places[m]] = columns[LANES * m + l]
+                    if wp.static(usual == CALLED):
+                        row[COULOMB] = levels[l]
+                        row[STRIBECK_PEAK] = f64(0.0)
+                        row[P_BIAS] = pushes[l]
+                        row[RIPPLE] = f64(0.0)
                     fixed = guess(c, row, dt)
                     fixed.two = wp.static(two)
                     fixed.voltage = False
@@ -1142,6 +1171,7 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                     one.qm = qms[l]
                     one.vm = vms[l]
                     one.last = lasts[l]
+                    one.stage = stages[l]
                     one.memory[FILTERED] = heards[l]
                     one.taken = takens[l]
                     one.fresh = fresh[l]
@@ -1157,6 +1187,7 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                     qms[l] = one.qm
                     vms[l] = one.vm
                     lasts[l] = one.last
+                    stages[l] = one.stage
                     olders[l] = one.older
                     heards[l] = one.memory[FILTERED]
                     takens[l] = one.taken
