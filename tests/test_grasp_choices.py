@@ -51,6 +51,26 @@ def test_the_thumb_has_a_command_of_its_own():
     env.close()
 
 
+def test_late_in_a_training_forces_are_paid_more_sharply():
+    env = grasp_env(*FEW, "task.late.from=0.6")
+    steps(env, 30)
+    before = {name: value.clone() for name, value in env.rewards().items()}
+    env.trained(0.59)
+    assert all(torch.equal(value, before[name]) for name, value in env.rewards().items())
+    env.trained(0.6)
+    now = env.rewards()
+    assert float(before["worst"].abs().max()) > 0 and torch.allclose(now["worst"], 2 * before["worst"])
+    assert env._shape().force_sigma == pytest.approx(0.06) and torch.equal(now["grip"], before["grip"])
+    assert env.cfg["task"]["reward"]["force_sigma"] == 0.15  # a resume begins with what was said
+    env.close()
+
+
+@pytest.mark.parametrize("setting", ["task.late.from=1.2", "task.late.rewards.worst=.nan"])
+def test_what_cannot_be_late_is_refused(setting):
+    with pytest.raises(UserError, match=setting.split("=")[0]):
+        grasp_env(*FEW, setting)
+
+
 def test_without_one_it_is_paid_for_a_band():
     env = grasp_env(*FEW)
     steps(env, 1)

@@ -35,7 +35,8 @@ class Runner(OnPolicyRunner):
 
     Args:
         env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``;
-        for a resume that is the unbroken run, also ``keep_worlds``, ``load_worlds`` (see :mod:`dexsim.tasks.worlds`).
+        for a resume that is the unbroken run, also ``keep_worlds``, ``load_worlds`` (see :mod:`dexsim.tasks.worlds`);
+        where it changes with the share of a training that is over, ``trained``.
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
         ranks: the processes that learn together, already joined; one alone where not given.
@@ -136,7 +137,9 @@ class Runner(OnPolicyRunner):
             self.alg.broadcast_parameters()
         # The environment may hand out the same buffers at every step; PPO stores them only after the next one.
         obs = self.env.get_observations().clone()
+        trained = getattr(self.env, "trained", lambda share: None)
         while self.iteration < iterations:
+            trained(self.iteration / iterations)
             if self.is_distributed and self.ranks.any(stop()):
                 return False
             start = time.perf_counter()

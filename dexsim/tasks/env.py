@@ -52,6 +52,7 @@ class HandEnv(Kept):
 
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
         super().__init__(cfg, n_worlds, device, seed, engine)
+        self._late = dict((self.task.get("late") or {}).items())  # what of the rewards changes late in a training
         self._check_rewards()
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
@@ -63,14 +64,17 @@ class HandEnv(Kept):
     def _check_rewards(self) -> None:
         """Raise UserError for a weight of a reward that the task does not know, or that is no number."""
         known, file = self.reward_words(), type(self).__module__
-        for name, weight in self.task["rewards"].items():
+        if self._late and not 0 <= self._late["from"] <= 1:
+            raise UserError(f"task.late.from={self._late['from']}: must lie in [0, 1], a share of a training; 1: never")
+        weights = [("rewards", *item) for item in self.task["rewards"].items()]
+        for where, name, weight in weights + [("late.rewards", *x) for x in self._late.get("rewards", {}).items()]:
             if name not in known:
                 raise UserError(
-                    f"task.rewards.{name}={weight}: the task {self.task['name']} has no reward of this name, or no"
+                    f"task.{where}.{name}={weight}: the task {self.task['name']} has no reward of this name, or no"
                     f" words for it in `reward_words` of its file; it has {', '.join(sorted(known))} ({file})"
                 )
             if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
-                raise UserError(f"task.rewards.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
+                raise UserError(f"task.{where}.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
 
     @classmethod
     def prepare(cls, cfg: dict, **given: Any) -> None:
@@ -263,6 +267,14 @@ class HandEnv(Kept):
                 part()
             self._recorded[name] = graph
         graph.replay()
+
+    def trained(self, share: float) -> None:
+        """Learn that this share of a training is over: `task.late` may change shapes and weights of rewards."""
+        if self._late and share >= self._late["from"]:
+            for part in ("reward", "rewards"):
+                self.task[part].update(self._late[part])
+            self._late = {}
+            self.forget_recorded()
 
     def forget_recorded(self) -> None:
         """Record the step anew: what a recording holds beside tensors of the environment has changed."""
