@@ -96,7 +96,7 @@ def turns(
                 break
             send.close()
             answer = yield from _answer(receive, child.pid or 0, 10 * seconds)
-            yield child.sentinel
+            child.join(1.0)  # it has nothing left to do; its sentinel tells a moment before it can be waited for
         finally:
             receive.close()
             if child.pid is not None:
