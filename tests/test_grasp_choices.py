@@ -65,7 +65,10 @@ def test_late_in_a_training_forces_are_paid_more_sharply():
     env.close()
 
 
-@pytest.mark.parametrize("setting", ["task.late.from=1.2", "task.late.rewards.worst=.nan"])
+@pytest.mark.parametrize(
+    "setting",
+    ["task.late.from=1.2", "task.late.from=null", "task.late.reward.force_sigma=null", "task.late.rewards.worst=.nan"],
+)
 def test_what_cannot_be_late_is_refused(setting):
     with pytest.raises(UserError, match=setting.split("=")[0]):
         grasp_env(*FEW, setting)

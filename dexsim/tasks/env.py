@@ -18,6 +18,7 @@ import torch
 import warp as wp
 from tensordict import TensorDict
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.sim.warmup import compile_side_by_side
 from dexsim.tasks import state_kernels
@@ -64,8 +65,10 @@ class HandEnv(Kept):
     def _check_rewards(self) -> None:
         """Raise UserError for a weight of a reward that the task does not know, or that is no number."""
         known, file = self.reward_words(), type(self).__module__
-        if self._late and not 0 <= self._late["from"] <= 1:
-            raise UserError(f"task.late.from={self._late['from']}: must lie in [0, 1], a share of a training; 1: never")
+        if self._late:
+            typed.number("task.late.from", self._late["from"], 0.0, 1.0)
+        for name, value in self._late.get("reward", {}).items():
+            typed.number(f"task.late.reward.{name}", value, 0.0)
         weights = [("rewards", *item) for item in self.task["rewards"].items()]
         for where, name, weight in weights + [("late.rewards", *x) for x in self._late.get("rewards", {}).items()]:
             if name not in known:
