@@ -67,10 +67,14 @@ def test_late_in_a_training_forces_are_paid_more_sharply():
 
 @pytest.mark.parametrize(
     "setting",
-    ["task.late.from=1.2", "task.late.from=null", "task.late.reward.force_sigma=null", "task.late.rewards.worst=.nan"],
-)
-def test_what_cannot_be_late_is_refused(setting):
-    with pytest.raises(UserError, match=setting.split("=")[0]):
+    [
+        "task.late.from=1.2", "task.late.from=null", "task.late.rewards.worst=.nan", "task.late.reward.force_sigma=0",
+        "task.reward.force_sigma=null", "task.reward.force_sigma=0", "task.reward.torque_sigma=0",
+        "task.reward.reach_length=0", "task.reward.contact_threshold=.nan", "task.reward.centre_y=.inf",
+    ],
+)  # fmt: skip
+def test_a_reward_of_no_use_is_refused_with_its_range(setting):
+    with pytest.raises(UserError, match=f"{setting.split('=')[0]}=.*must"):
         grasp_env(*FEW, setting)
 
 

@@ -444,6 +444,7 @@ def test_proprioception_remembers():
     (["task.observe.orientation=euler"], "task.observe.orientation"), (["task.goal.axis=[0,0,0]"], "task.goal.axis"),
     (["task.perception=camera"], "task.perception"), (["randomize.object.size=[0.1,0.12]"], "randomize.object.size"),
     (["task.initial.poses=nowhere.npz"], "nowhere.npz"), (["task.reward.delta_rot=2.0"], "task.reward.delta_rot"),
+    (["task.reward.epsilon=0"], "task.reward.epsilon"), (["task.reward.spin_max=null"], "task.reward.spin_max"),
     (["randomize=default"], "is missing"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(overrides, word):

@@ -12,7 +12,7 @@ import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import warp as wp
@@ -42,7 +42,7 @@ class HandEnv(Kept):
     """
 
     # what `Task` has: named ends, bool [N]; named rewards, weighted [N]; words of each reward; scalars for the log;
-    # tables of the first screen
+    # tables of the first screen; bounds of figures of rewards' shapes
     setup: Callable[[], None]
     before_physics: Callable[[], None]
     terminated: Callable[[], dict[str, torch.Tensor]]
@@ -50,6 +50,7 @@ class HandEnv(Kept):
     reward_words: Callable[[], dict[str, str]]
     metrics: Callable[[], dict[str, torch.Tensor]]
     describe: Callable[[], dict[str, Any]]
+    shapes: ClassVar[Mapping[str, tuple[float, float]]]
 
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
         super().__init__(cfg, n_worlds, device, seed, engine)
@@ -63,12 +64,15 @@ class HandEnv(Kept):
         self._check_widths()
 
     def _check_rewards(self) -> None:
-        """Raise UserError for a weight of a reward that the task does not know, or that is no number."""
+        """Raise UserError for a weight of a reward that the task does not know or that is no number, and for a figure
+        of a reward's shape outside `shapes`."""
         known, file = self.reward_words(), type(self).__module__
         if self._late:
             typed.number("task.late.from", self._late["from"], 0.0, 1.0)
-        for name, value in self._late.get("reward", {}).items():
-            typed.number(f"task.late.reward.{name}", value, 0.0)
+        for where, group in (("reward", self.task.get("reward", {})), ("late.reward", self._late.get("reward", {}))):
+            for name, (low, high) in self.shapes.items():
+                if name in group:
+                    typed.number(f"task.{where}.{name}", dict.get(group, name), low, high)  # not watched: checks only
         weights = [("rewards", *item) for item in self.task["rewards"].items()]
         for where, name, weight in weights + [("late.rewards", *x) for x in self._late.get("rewards", {}).items()]:
             if name not in known:

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from dexsim import typed
 from dexsim.errors import UserError
 from dexsim.tactile.clearance import Clearance
 from dexsim.tasks import base_path, grasp_rewards, observations
@@ -34,6 +35,9 @@ class GraspEnv(Launches):
     evaluation = "dexsim.tasks.grasp_eval"
     choices = {"critic": ("paper", "privileged"), "observe.touch": (True, False)}
     ranges = {"object.scale": (0.3, 3.0), "servo.delay": (-0.5, 0.5), "push.weights": (0.0, 20.0)}
+    shapes = {"contact_threshold": (0.0, 100.0), "force_sigma": (1e-3, 10.0), "force_low": (0.0, 10.0),
+              "force_high": (0.0, 10.0), "torque_sigma": (1e-3, 10.0), "torque_low": (0.0, 10.0),
+              "torque_high": (0.0, 10.0), "reach_length": (1e-4, 1.0)}  # fmt: skip
 
     # -- setting up
     @classmethod
@@ -78,7 +82,8 @@ class GraspEnv(Launches):
         where, xy, beside = self.places, t["initial"]["object_xy"], t["reward"]["centre_y"]
         self.centre0 = torch.tensor(where.catch[:2].tolist() if xy is None else xy, device=dev)
         self.reach = torch.tensor(where.middle.tolist(), device=dev)  # the middle of the grasp
-        self.beside = float(where.beside[1]) if beside is None else beside
+        beside = float(where.beside[1]) if beside is None else beside
+        self.beside = typed.number("task.reward.centre_y", beside, -1.0, 1.0)
         h = 0.5**0.5  # rotations that bring the body's x, y or z axis to palm y
         to_y = torch.tensor([[h, 0.0, 0.0, h], [1.0, 0.0, 0.0, 0.0], [h, -h, 0.0, 0.0]], device=dev)
         self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.objects.scene.variants], device=dev)]

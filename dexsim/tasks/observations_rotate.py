@@ -14,6 +14,12 @@ import torch
 from dexsim import rotation
 from dexsim.errors import UserError
 
+SHAPES = {
+    "epsilon": (1e-6, 1e3), "alpha": (0.0, 1e6), "delta_dist": (0.0, 10.0), "delta_rot": (0.0, math.pi),
+    "delta_pos": (0.0, 10.0), "spin_max": (0.0, 1e3),
+}  # fmt: skip
+"""In what figures of the rewards' shapes must lie."""
+
 
 def sent(
     action: torch.Tensor, target: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, what: str
@@ -89,8 +95,6 @@ def check(t: Mapping[str, Any]) -> None:
         raise UserError(f"task.goal.axis={goal['axis']}: must be three numbers, not all 0")
     if not 0 < abs(goal["angle"]) < 180:
         raise UserError(f"task.goal.angle={goal['angle']}: must lie in (0, 180) degrees, or be its negative")
-    if not r["epsilon"] > 0:
-        raise UserError(f"task.reward.epsilon={r['epsilon']}: must be above 0")
     if not 0 < r["delta_rot"] < math.radians(abs(goal["angle"])):
         raise UserError(
             f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "

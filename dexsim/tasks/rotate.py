@@ -27,12 +27,12 @@ class RotateEnv(Trials, Held, ImuInside, TipMotion):
     """Turn a cube on the palm about one axis, 90 degrees at a time.
 
     goal [N, 4]: orientation to reach (object to palm); home [N, 3]: where the cube lay when the episode began, m;
-    successes [N]: goals reached in this episode.
-    """
+    successes [N]: goals reached in this episode."""
 
     holds = "palm", (0.045, 0.06)
     choices = {"perception": ("imu", "proprioception"), "critic": ("paper", "privileged", "placed"),
                "observe.orientation": ("6d", "quaternion", "none")}  # fmt: skip
+    shapes = shared.SHAPES
 
     goal, home = memory(4, reset=False), memory(3, reset=False)
     successes, since = memory(dtype=torch.long), memory(dtype=torch.long)  # since: control steps, since the last one

@@ -71,6 +71,8 @@ class Task(HandEnv):
         "object.scale": (0.05, 20.0), "contact.stiffness": (100.0, 1e5), "contact.damping_ratio": (0.0, 3.0),
     }  # fmt: skip
     """In what a range of `randomize` must lie; a subclass adds its own to those of its bases."""
+    shapes: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """In what a figure of `task.reward` must lie."""
     settings: ClassVar[Mapping[str, Any]] = {}
     weights: ClassVar[Mapping[str, float]] = {}
     randomize: ClassVar[Mapping[str, Any]] = {}
