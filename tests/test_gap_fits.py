@@ -56,9 +56,10 @@ def test_no_effect_is_begun_again_from_where_an_effect_ended():
     assert begun_again(s, short, [worse]) is short
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.008])
+@pytest.mark.parametrize("tilt", [0.0, 0.008, 0.1])
 def test_gravitys_direction_is_let_go_where_a_fit_without_it_ends(tilt):
-    """Where it is off it is found, by as much; else the fit is that without it."""
+    """Where it is off it is found, by as much; else, or where far more is missing than it may be off by, the fit is
+    that without it."""
     run = plant_run("a", 0, 5.0, {"tilt_y": tilt, "*kp": 0.97}, 1)
     s = JointSearch(build(model(), [run])[0], [0], None, [0])
     params = s.all_nuisances
@@ -66,10 +67,10 @@ def test_gravitys_direction_is_let_go_where_a_fit_without_it_ends(tilt):
     assert late == ["tilt_y"]  # about the hinge: about another axis it gives the joint no torque
     sets = params, [p for p in params if not p.late]
     with_it, without = (Trial((), s.fitter.fit(p, iterations=8, lazy=True)) for p in sets)
-    if tilt:
+    if tilt == 0.008:
         assert s.objective(with_it) < 0.8 * s.objective(without)
         assert with_it.fit.value("tilt_y") == pytest.approx(tilt, abs=2e-3)
-    else:  # it earns nothing: the same fit
+    else:
         assert with_it.fit.params == without.fit.params
         np.testing.assert_allclose(with_it.fit.x, without.fit.x, rtol=1e-6, atol=1e-9)
 

@@ -30,7 +30,8 @@ class SearchRules:
     imitates: float = 0.08
     bounded: float = 1.5  # x its loss: what a hypothesis counts for whose size stopped at the end of what is physical
     enough: float = 1.08  # x the noise: an error within it needs no effect
-    # x the noise: where a further effect leaves more, whole recordings run free may speak for it, too
+    # x the noise: where a further effect leaves more, whole recordings run free may speak for it, too, and gravity's
+    # direction is believed
     astray: float = 10.0
     # of the loss: nearer than this, fits without each condition decide; of the squared error on what was held out:
     # nearer than this it speaks neither for an effect nor against it

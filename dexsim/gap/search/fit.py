@@ -336,7 +336,8 @@ class Fitter:
         follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only
         where they lead no further: a third of the simulations; and what is `late` is held, and let go for one more
         step where the others end, if exact. That lowers the loss by `SEARCH.apart` for each, or they are left out of
-        the fit: it never ends higher than one without them. exact: end with slopes that were simulated at the end.
+        the fit: it never ends higher than one without them. Where the others miss by more than `SEARCH.astray` x the
+        noise, too: what is missing would be laid on them. exact: end with slopes that were simulated at the end.
         hopeless: what leaves more than this after `LOOK` steps ends there."""
         box = Box(params)
         low, high, span, centre, believed = box.low, box.high, box.span, box.centre, box.prior
@@ -363,7 +364,7 @@ class Fitter:
                 jac[:, anew] = columns / (delta / span)[anew]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             done |= it >= iterations or (it >= LOOK and loss > hopeless)
-            if done and held.any() and exact and not self.passed():
+            if done and held.any() and exact and loss <= SEARCH.astray**2 and not self.passed():
                 jac[:, held] = self._slopes(params, x, delta, np.flatnonzero(held))[1] / (delta / span)[held]
                 least = max(SEARCH.apart * int((held & (x == centre)).sum()), 1e-6)
                 held, let_go, done, iterations, damping = np.zeros(P, bool), True, False, it + 1, 1e-2
@@ -417,7 +418,7 @@ class Fitter:
         if exact and known.any() and not self.passed():
             res, jac, s = self._slopes(params, x, delta, np.arange(P))
             jac = jac / (delta / span)
-        keep = [i for i, p in enumerate(params) if not (let_go and p.late and x[i] == centre[i])]
+        keep = [i for i, p in enumerate(params) if not (lazy and exact and p.late and x[i] == centre[i])]
         return Fitted(
             [params[i] for i in keep],
             x[keep],
