@@ -112,7 +112,8 @@ class JudgeRules:
     # share of the bootstraps that a rival of its class wins without which the name is no set; false-discovery rate of
     # what the rest is said to depend on (Benjamini and Hochberg 1995)
     level: float = 0.05
-    stretch: float = 0.5  # intervals grow by this, times the square of what is left of what was held out over the noise
+    # intervals grow by this, times the square of what is left over the noise, of what was fitted or held out
+    stretch: float = 0.5
     stretch_least: float = 0.5  # the least factor on intervals
     stretch_most: float = 4.0  # the largest factor on intervals
     settled: float = 3.0  # x the noise: a motion on which two hypotheses differ by as much settles between them alone

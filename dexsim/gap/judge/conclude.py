@@ -525,7 +525,8 @@ def _decided(d: Diagnosis) -> Verdict:
         if joints == "unusable" or (felt_alone and felt.before is not None):
             error = _error_of_touch(felt)
     of_touch = sorted(of_touch, key=lambda f: -f.confidence)
-    findings = tuple(sorted([*mine, *of_touch], key=lambda f: f.hint))
+    # hints come last, the surest first: what they remove decides nothing
+    findings = tuple(sorted([*mine, *of_touch], key=lambda f: (f.hint, -f.confidence * f.hint)))
     left = None if error is None else _left_of_gap(d, error)
     return Verdict(word, findings, error, left, tuple(depends))
 

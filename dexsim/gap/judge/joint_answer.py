@@ -54,10 +54,8 @@ class JointAnswer:
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
         self.widest = widened(search, self.best, intervals(self.best.fit, search.blocks, huber=search.r.huber))
-        told, laws = (
-            stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0),
-            law_spread(search, self.best),
-        )
+        left = max(rms(self.after) / case.sigma, self.best.fit.loss**0.5) if len(rows) else 0.0
+        told, laws = stretched(self.widest, self.best.fit, left), law_spread(search, self.best)
         self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
         self._trials: dict[str, tuple[Trial, np.ndarray, np.ndarray]] = {}  # of `_without`
@@ -345,9 +343,9 @@ class JointAnswer:
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
-    """Return intervals [P, 2] about a fit, by how well it follows what was held out (left: x the noise): what follows
-    to the noise is known better than by all that might be off in it, what does not only looks like it and is something
-    else. The law is from concealed cases (docs/concepts/gap.md)."""
+    """Return intervals [P, 2] about a fit, by how well it follows what was recorded, fitted or held out, whichever is
+    followed worse (left: x the noise): what follows to the noise is known better than by all that might be off in it,
+    what does not only looks like it and is something else. The law is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:
         return bounds
     low, high = Box(fit.params).low[:, None], Box(fit.params).high[:, None]

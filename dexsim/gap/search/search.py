@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy import stats
 
 from dexsim import intervals
 from dexsim.gap.effects import Variant
@@ -594,7 +595,8 @@ def widened(search: JointSearch, trial: Trial, bounds: np.ndarray) -> np.ndarray
     folds = np.array([g for g in trial.folds if len(g) == P])
     if len(folds) >= 2:
         n = len(folds)
-        square += 1.645**2 * (n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0)
+        # Student's: three conditions tell how far fits differ only roughly
+        square += stats.t.ppf(0.95, n - 1) ** 2 * (n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0)
     mine = np.array([not p.nuisance for p in f.params])
     J = f.jacobian * span
     A = J.T @ J
