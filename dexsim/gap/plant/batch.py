@@ -222,7 +222,7 @@ class JointPlant:
         self.t, self.q = np.concatenate(self._t), np.concatenate(self._q)
         self.torque = np.concatenate(self._torque)
         self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
-        self.series = np.empty((self._grid[-1], len(SERIES)))  # long recordings of many joints are gigabytes: one copy
+        self.series = _columns(self._grid[-1])  # long recordings of many joints are gigabytes: one copy
         for run in range(len(self._t)):
             self._fill(run)
         self._added = []
@@ -260,14 +260,13 @@ class JointPlant:
         out.dt, out._d, out._version = self.dt / times, {}, next(_VERSIONS)
         sizes = [(b - a - 1) * times + 1 for a, b in zip(self._grid[:-1], self._grid[1:], strict=True)]
         out._grid = [0, *(int(end) for end in np.cumsum(sizes))]
-        out.series = np.empty((out._grid[-1], len(SERIES)))
-        for run in range(len(sizes)):
-            coarse, fine = self.series[self.grid(run)], out.series[out.grid(run)]
-            fine[::times] = coarse
-            for k in range(1, times):
-                between = fine[k::times]
-                np.multiply(coarse[:-1], 1 - k / times, out=between)
-                between += k / times * coarse[1:]
+        out.series = _columns(out._grid[-1])
+        for column in np.flatnonzero(self.series.any(0)):
+            for run in range(len(sizes)):
+                coarse, fine = self.series[self.grid(run), column], out.series[out.grid(run), column]
+                fine[::times] = coarse
+                for k in range(1, times):
+                    fine[k::times] = (1 - k / times) * coarse[:-1] + k / times * coarse[1:]
         return out
 
     def grid(self, run: int) -> slice:
@@ -452,10 +451,11 @@ class JointPlant:
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
-            self._d[device] = [
+            columns, *sent = (
                 _up(x, device=device, copy=False)
-                for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))
-            ]
+                for x in (self.series.T, np.concatenate(self._cmd_t), np.concatenate(self._cmd))
+            )
+            self._d[device] = [columns.transpose((1, 0)), *sent]
         key = (group, device)
         if key not in windows.device:
             pick = np.flatnonzero(np.isin(windows.run, group))
@@ -507,6 +507,12 @@ class JointPlant:
     def base(self) -> np.ndarray:
         """Return [R, C] nominal parameters by run."""
         return np.stack(self.nominal)
+
+
+def _columns(rows: int) -> np.ndarray:
+    """Return zeros [rows, E] for series, each column of which lies together: those of effects that are nowhere, most of
+    them, then take neither time nor memory."""
+    return np.zeros((len(SERIES), rows)).T
 
 
 def _of(inits: np.ndarray, windows: np.ndarray) -> np.ndarray:

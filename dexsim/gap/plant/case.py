@@ -520,7 +520,7 @@ def dragged_by(case: Case, others: Sequence[Case]) -> Case:
     """Return the case with other joints, at most `DRAGGERS` of the same recordings, in the place of the last of those
     that may drag it."""
     first = DRAGGERS - len(others)
-    plant, regimes, series = copy.copy(case.plant), dict(case.regimes), case.plant.series.copy()
+    plant, regimes, series = copy.copy(case.plant), dict(case.regimes), np.copy(case.plant.series)
     for n, other in enumerate(others, first):
         for run in range(plant.runs):
             here, there = plant.grid(run), other.plant.series[plant.grid(run)]

@@ -120,7 +120,7 @@ def of_motion(
     rest = total - diag * a + bias - passive
     mass = model.body_subtreemass[bodies]
     slide = np.array([int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for i in ids])
-    out = np.zeros((J, n, len(SERIES)))
+    out = np.zeros((J, len(SERIES), n)).transpose(0, 2, 1)  # columns lie together, as in `JointPlant.series`
 
     def put(j: int, name: str, x: np.ndarray | float) -> None:
         out[j, :, SERIES_INDEX[name]] = x
