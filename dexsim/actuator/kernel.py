@@ -198,8 +198,10 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "load", "shape")
     )
     extended = bool(features & EXTENDED)
-    # of the state, those that some law of this kernel keeps
+    # of the state, those that some law of this kernel keeps; a `wp.static` of a loop's variable would have each process
+    # write the kernel out anew, cached or not
     remembered = [MEMORY[name] for c in COLUMNS if c.feature in features for name in c.remembers]
+    places = wp.constant(wp.types.vector(length=len(remembered) + 1, dtype=int)(*remembered, 0))
     Drives, vec3, Memory = drives(real), wp.types.vector(length=3, dtype=real), wp.types.vector(len(MEMORY), real)
     encoder, late = encoder_error(features), command_delay(features)
     hears, lost, motor = heard_speed(features), lost_error(features), warm_motor(features)
@@ -545,7 +547,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         last = d.state[w, j, MOTOR]
         memory = Memory()
         for k in range(wp.static(len(remembered))):
-            memory[wp.static(remembered[k])] = d.state[w, j, x0 + wp.static(remembered[k])]
+            memory[places[k]] = d.state[w, j, x0 + places[k]]
         r = locate(dt, x0, fresh, d, w, j)
         m, after_motor = remaining(dt, fresh, last, memory, d, w, j)
         s, heard = sense(dt, fresh, r, after_motor, d, w, j)
@@ -576,7 +578,7 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         # Dry friction: an interval of torques [-level (1 + a/2), +level (1 - a/2)], as a symmetric one and a constant.
         f, carry = resist(dt, x0, fresh, last, r, m.friction, added, d, w, j)
         for k in range(wp.static(len(remembered))):
-            d.state[w, j, x0 + wp.static(remembered[k])] = carry[wp.static(remembered[k])]
+            d.state[w, j, x0 + places[k]] = carry[places[k]]
         if wp.static(play):
             d.state[w, j, x0 + LINE_A] = real(0.0)
             d.state[w, j, x0 + LINE_B] = real(1.0)

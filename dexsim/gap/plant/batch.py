@@ -266,7 +266,9 @@ class JointPlant:
                 coarse, fine = self.series[self.grid(run), column], out.series[out.grid(run), column]
                 fine[::times] = coarse
                 for k in range(1, times):
-                    fine[k::times] = (1 - k / times) * coarse[:-1] + k / times * coarse[1:]
+                    between = fine[k::times]
+                    np.multiply(coarse[:-1], 1 - k / times, out=between)
+                    between += k / times * coarse[1:]
         return out
 
     def grid(self, run: int) -> slice:
