@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import mujoco.batch
@@ -95,28 +95,29 @@ def of_motion(
     leaves = np.array([leaf_of(model, b) for b in bodies])
     places = _places(model, mujoco.MjData(model), ids, leaves)
     ties = Couplings(model, joints)
+    # a hand's every frame along a recording is memory that takes longer to come by than to be worked out
+    of = {name: slice(None) for name in ("M", "qfrc_bias", "qfrc_spring")} | {"xaxis": ids, "xanchor": ids}
+    of |= {"subtree_com": bodies} | ({"xipos": np.r_[leaves, bodies], "xmat": leaves} if added else {})
     if ties.tied:  # what follows moves along: inertia and forces as the drives feel them
         every = np.tile(model.qpos0, (n, 1))
         every[:, qadr] = q
         every, moves = ties.dragged(every)
         across = moves.transpose(0, 2, 1)  # [n, J, nv]
         speed = (moves @ v[:, :, None])[:, :, 0]
-        seen = _evaluated(model, np.arange(model.nq), np.arange(model.nv), every, speed)
+        seen = _evaluated(model, np.arange(model.nq), np.arange(model.nv), every, speed, of)
         full = across @ _full(model, seen["M"]) @ moves
         total, diag = (full @ a[:, :, None])[:, :, 0], full[:, np.arange(J), np.arange(J)]
         drag = model.dof_damping * speed + model.dof_frictionloss * np.sign(speed)
         drag[:, dadr] = 0.0  # a driven joint's own is no load
         bias, passive = ((across @ x[:, :, None])[:, :, 0] for x in (seen["qfrc_bias"] + drag, seen["qfrc_spring"]))
     else:
-        seen = _evaluated(model, qadr, dadr, q, v)
+        seen = _evaluated(model, qadr, dadr, q, v, of)
         full = _full(model, seen["M"])
         acc = np.zeros((n, model.nv, 1))
         acc[:, dadr, 0] = a
         total, diag = (full @ acc)[:, dadr, 0], full[:, dadr, dadr]
         bias, passive = seen["qfrc_bias"][:, dadr], seen["qfrc_spring"][:, dadr]
-    axis, anchor = seen["xaxis"][:, ids], seen["xanchor"][:, ids]
-    com, point, own = seen["subtree_com"][:, bodies], seen["xipos"][:, leaves], seen["xipos"][:, bodies]
-    turn = seen["xmat"][:, leaves].reshape(n, J, 3, 3)
+    axis, anchor, com = seen["xaxis"], seen["xanchor"], seen["subtree_com"]
     rest = total - diag * a + bias - passive
     mass = model.body_subtreemass[bodies]
     slide = np.array([int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for i in ids])
@@ -132,9 +133,11 @@ def of_motion(
         put(j, "rest", rest[:, j])
         put(j, "supply", 1.0)
         put(j, "enabled", 1.0)
-        loads = (("load", 1.0, point[:, j]), *([("own", 1.0, own[:, j])] if leaves[j] != bodies[j] else []))
-        loads = loads if added else ()
-        for prefix, m, where in (("gravity", mass[j], com[:, j]), *loads):
+        loads = [("gravity", mass[j], com[:, j])]
+        if added:
+            point, own = seen["xipos"][:, j], seen["xipos"][:, J + j]
+            loads += [("load", 1.0, point), *([("own", 1.0, own)] if leaves[j] != bodies[j] else [])]
+        for prefix, m, where in loads:
             c, s, square = _turned(axis[:, j], where - anchor[:, j], m, gravity, slide[j])
             put(j, f"{prefix}_cos", c)
             put(j, f"{prefix}_sin", s)
@@ -142,9 +145,9 @@ def of_motion(
                 put(j, f"{prefix}_inertia", square)
         if not added:
             continue
-        lever = cross(axis[:, j], point[:, j] - anchor[:, j])
+        lever, turn = cross(axis[:, j], point - anchor[:, j]), seen["xmat"][:, j].reshape(n, 3, 3)
         for name, way in zip(("out", "across"), places[j], strict=True):
-            arm = turn[:, j] @ way
+            arm = turn @ way
             if not slide[j]:
                 c, s, _ = _turned(axis[:, j], arm, 1.0, gravity, False)
                 put(j, f"com_{name}_cos", c)
@@ -185,11 +188,10 @@ def _constants(
 
 
 def _evaluated(
-    model: mujoco.MjModel, qadr: np.ndarray, dadr: np.ndarray, q: np.ndarray, v: np.ndarray
+    model: mujoco.MjModel, qadr: np.ndarray, dadr: np.ndarray, q: np.ndarray, v: np.ndarray, of: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """Return what MuJoCo makes of positions and speeds [n, J] of some joints, the others at rest: its fields [n, ...]
-    by name, contacts, constraints and gravity (which comes in by columns of its own) left out."""
-    names = ("M", "qfrc_bias", "qfrc_spring", "xaxis", "xanchor", "subtree_com", "xipos", "xmat")
+    by name, rows `of` each, contacts, constraints and gravity (which comes in by columns of its own) left out."""
     model, n = copy.copy(model), len(q)
     bit = mujoco.mjtDisableBit
     for flag in (bit.mjDSBL_CONTACT, bit.mjDSBL_CONSTRAINT, bit.mjDSBL_SENSOR):
@@ -197,15 +199,15 @@ def _evaluated(
     model.opt.gravity[:] = 0.0
     batch = mujoco.batch.Batch(model, min(n, CHUNK), 1)
     qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
-    fields = {name: batch.bind(name) for name in names}
-    out = {name: np.empty((n, *x.shape[1:])) for name, x in fields.items()}
+    fields = {name: batch.bind(name) for name in of}
+    out = {name: np.empty((n, *x[0, of[name]].shape)) for name, x in fields.items()}
     for first in range(0, n, len(qpos)):
         part = slice(first, min(first + len(qpos), n))
         count = part.stop - first
         qpos[:count, qadr], qvel[:count, dadr] = q[part], v[part]
         batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         for name, x in fields.items():
-            out[name][part] = x[:count]
+            out[name][part] = x[:count, of[name]]
     return out
 
 
