@@ -395,11 +395,20 @@ def test_a_reset_forgets_the_corners_of_its_worlds_only(grasping):
     assert bool((after[1] == -1).all()) and torch.equal(after[0], simplex[0])
 
 
-def test_all_kernels_of_a_step_are_listed_for_compiling_together(grasping):
+def test_kernels_of_a_step_are_listed_and_compiled_alone_with_the_same_bits(grasping):
     e = grasping[0].engine
-    e._one_step()
-    used = {kernel.module for kernel, _ in _launched(e._one_step)}
-    assert used and used <= {module for module, _ in warmup.listed(e._one_step)}
+    state = e.t.qpos.clone(), e.t.qvel.clone()
+
+    def stepped() -> torch.Tensor:
+        e.set_state(torch.ones(9, dtype=torch.bool), *state)
+        e._one_step()
+        return torch.cat([e.t.qpos, e.t.qvel, e.t.pair_normal], dim=1)
+
+    before = stepped().clone()
+    alone = {module for module, _ in warmup.listed(e._one_step)}
+    assert {kernel.module for kernel, _ in _launched(e._one_step)} <= alone
+    assert torch.equal(stepped(), before) and bool((before[:, -len(e.pairs) :] > 0).any())
+    assert all(len(module.kernels) == 1 for module in alone if module.name.startswith("mujoco_warp."))
     assert warmup.compile_side_by_side(e._one_step, "cpu") == 0
 
 

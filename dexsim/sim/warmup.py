@@ -7,7 +7,6 @@ then all their modules are compiled on as many threads as there are cores, then 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,8 @@ from typing import Any
 
 import warp as wp
 from warp._src import context
+
+from dexsim.system import cores
 
 
 def compile_side_by_side(program: Callable[[], None], device: str) -> int:
@@ -25,7 +26,7 @@ def compile_side_by_side(program: Callable[[], None], device: str) -> int:
         return 0
     with wp.ScopedDevice(where):
         modules = listed(program)
-        with ThreadPoolExecutor(max_workers=max(1, min(len(modules), os.cpu_count() or 1))) as pool:
+        with ThreadPoolExecutor(max_workers=min(len(modules), cores()) or 1) as pool:
             for done in [pool.submit(module.load, device, block_dim=block_dim) for module, block_dim in modules]:
                 done.result()
     return len(modules)
@@ -33,22 +34,31 @@ def compile_side_by_side(program: Callable[[], None], device: str) -> int:
 
 def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
     """Return (module, threads a block) of each kernel that `program` launches, in order, none twice."""
-    found: dict[tuple[int, int], tuple[Any, int]] = {}
-    with _instead_of_launching(
-        lambda module, block_dim: found.setdefault((id(module), block_dim), (module, block_dim))
-    ):
+    found: dict[tuple[Any, int], None] = {}
+    with _instead_of_launching(lambda kernel, block_dim: found.setdefault((_own_module(kernel), block_dim))):
         program()
-    return list(found.values())
+    return list(found)
+
+
+def _own_module(kernel: wp.Kernel) -> Any:
+    """Return the module that a kernel is compiled in. Of MuJoCo-Warp's modules a model launches a part: each of their
+    kernels gets one of its own, to the same machine code."""
+    shared = kernel.module
+    if shared.name.startswith("mujoco_warp.") and len(shared.kernels) > 1:
+        kernel.module = context.Module(f"{shared.name}.{kernel.key}")
+        kernel.module.options |= shared.options
+        kernel.module.register_kernel(kernel)
+    return kernel.module
 
 
 @contextmanager
-def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
+def _instead_of_launching(keep: Callable[[wp.Kernel, int], object]) -> Iterator[None]:
     def launch(
         kernel: wp.Kernel, dim: int | Sequence[int], *args: Any, block_dim: int | None = None, **kwargs: Any
     ) -> None:
         # an empty launch compiles nothing; which types a generic kernel has, only a launch finds out
         if math.prod(dim if isinstance(dim, (tuple, list)) else (dim,)) and not kernel.is_generic:
-            keep(kernel.module, int(block_dim or 256))
+            keep(kernel, int(block_dim or 256))
 
     def once(condition: wp.array, while_body: Callable[..., None], **kwargs: Any) -> None:
         while_body(**kwargs)
