@@ -34,7 +34,7 @@ def moved(inertia: float, columns: dict[str, float], targets: np.ndarray, dt: fl
     for name, value in columns.items():
         row[INDEX[name]] = value
     early = np.r_[-2.0, t], np.r_[0.0, targets]
-    plant.add("run", row, np.array([0.0, steps * dt]), series, *early, t, np.zeros(steps), None, {})
+    plant.add(row, np.array([0.0, steps * dt]), series, *early, t, np.zeros(steps), None, {})
     plant.finish()
     q, torque = plant.simulate(plant.base()[None], plant.windows(None))
     return np.stack([q[0], torque[0]], 1)

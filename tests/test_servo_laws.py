@@ -63,7 +63,7 @@ def plant_motion(columns: dict, times, targets, seconds: float, v0=0.0, dt=0.001
     row = nominal_row(ServoTable.from_dict({"joints": {"joint": columns}}).nominal(["joint"])[0], 0.0)
     early = [-2.0, *times], [0.0, *targets]
     plant.add(
-        "run", row, np.array([0.0, seconds]), series, *(np.array(x, float) for x in early), t, np.zeros(steps), None, {}
+        row, np.array([0.0, seconds]), series, *(np.array(x, float) for x in early), t, np.zeros(steps), None, {}
     )
     plant.finish()
     q, torque = plant.simulate(plant.base()[None], plant.windows(None), np.array([[0.0, v0]]))

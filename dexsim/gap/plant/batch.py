@@ -197,7 +197,7 @@ class JointPlant:
         self._rows = [0]
         self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
 
-    def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
+    def add(self, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
             cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None,
             exact: dict[str, np.ndarray], read: np.ndarray | None = None) -> None:
         """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]; read [S]:
@@ -226,15 +226,14 @@ class JointPlant:
         for run in range(len(self._t)):
             self._fill(run)
         self._added = []
-        self._consts = np.zeros(pk.CONSTS)
         c = self.constants
         kp = max(
             float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])),
             1e-9,
         )
         stiff = 30.0 * kp + c.inertia * (2 * np.pi * 40.0) ** 2
-        self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
-                           c.low, c.high, stiff, c.slide, 0)
+        self._consts = np.array([self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
+                                 c.low, c.high, stiff, c.slide], float)  # fmt: skip
         self._d: dict[Any, Any] = {}
         self._version = next(_VERSIONS)
 
@@ -350,8 +349,9 @@ class JointPlant:
             np.array(run_of, int),
         )
 
-    def simulate(self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None,
-                 open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(
+        self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
 
         params [H, R, C]: plant parameters by run; inits [H, 2], or [H, W, 2] by window: added to the initial position
@@ -359,15 +359,13 @@ class JointPlant:
         """
         inits = np.zeros((len(params), 1, 2)) if inits is None else np.asarray(inits, float).reshape(len(params), -1, 2)
         # what an answer depends on beside the windows and what does not change of a plant
-        common = f"{self._version} {open_stage}".encode()
+        common = str(self._version).encode()
         told = params[:, np.unique(windows.run)]
         keys = [common + p.tobytes() + i.tobytes() for p, i in zip(told, inits, strict=True)]
-        return windows.known.answers(
-            keys, lambda which: self._simulated(params[which], windows, inits[which], open_stage)
-        )
+        return windows.known.answers(keys, lambda which: self._simulated(params[which], windows, inits[which]))
 
     def _simulated(
-        self, params: np.ndarray, windows: Windows, inits: np.ndarray, open_stage: int
+        self, params: np.ndarray, windows: Windows, inits: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """`simulate`, whatever is known; inits [H, 1 or W, 2]."""
         H, n = len(params), windows.n
@@ -377,19 +375,17 @@ class JointPlant:
         for r in np.unique(windows.run):
             groups.setdefault(params[:, r].tobytes(), []).append(int(r))
         begins = [self._setpoints(params[:, group[0]], windows, group) for group in groups.values()]
-        consts = self._consts.copy()
-        consts[pk.C_OPEN] = open_stage
         if self._on_cpu(H * len(windows.window)):
             for group, begin in zip(groups.values(), begins, strict=True):
                 pick, keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 rows, moves = params[:, group[0]], _of(inits, pick)
-                for which, columns in self._side_by_side(rows, open_stage):
+                for which, columns in self._side_by_side(rows):
                     kernel, lanes = (pk.lanes_kernel(columns), pk.LANES) if columns else (pk.plant_kernel(), 1)
                     alone = len(groups) == 1 and len(which) == H  # nothing to put together
                     size = (len(which), len(windows.sample_row[keep]))
                     oq, ot = (x if alone else np.empty(size) for x in (q, torque))
                     padded = np.r_[which, np.repeat(which[-1:], -len(which) % lanes)]
-                    guesses = (_up(rows[padded]), *(_up(x[which]) for x in (moves, begin)), _up(consts))
+                    guesses = (_up(rows[padded]), *(_up(x[which]) for x in (moves, begin)), _up(self._consts))
                     given = recorded(*guesses, *rest, *(_up(x, copy=False) for x in (oq, ot)))
                     self._split(len(padded) // lanes, steps, given, kernel)
                     if not alone:
@@ -402,7 +398,7 @@ class JointPlant:
                 host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
                 inputs = [self._inputs(windows, tuple(group), self.device) for group in groups.values()]
                 told = [params[:, group[0]] for group in groups.values()]
-                constants, *sent = mine.up([consts, *told, *(_of(inits, pick) for pick, *_ in inputs), *begins])
+                constants, *sent = mine.up([self._consts, *told, *(_of(inits, pick) for pick, *_ in inputs), *begins])
                 at, parts = 0, []
                 of_guesses = (sent[k * len(told) : (k + 1) * len(told)] for k in range(3))
                 for guess, moves, begin, (_, keep, steps, rest) in zip(*of_guesses, inputs, strict=True):
@@ -478,11 +474,11 @@ class JointPlant:
         pick, keep, steps, arrays = windows.device[key]
         return pick, keep, steps, [*self._d[device], *arrays]
 
-    def _side_by_side(self, rows: np.ndarray, open_stage: int) -> list[tuple[np.ndarray, tuple[int, ...]]]:
+    def _side_by_side(self, rows: np.ndarray) -> list[tuple[np.ndarray, tuple[int, ...]]]:
         """Return which guesses, of rows [H, C], have which columns only (`kernel.lanes_kernel`), as far as most of a
         vector of them is filled; the others, with none."""
         left, out = np.ones(len(rows), bool), []
-        if SIDE_BY_SIDE and not (self.voltage or "motor" in (self.loop, self.position) or open_stage or brought()):
+        if SIDE_BY_SIDE and not (self.voltage or "motor" in (self.loop, self.position) or brought()):
             for columns in (pk.USUAL, pk.MORE, pk.TWO, pk.CALLED):
                 rest = np.setdiff1d(np.arange(rows.shape[1]), columns)
                 two = (rows[:, PLAY] > 0).any(1) == (columns == pk.TWO)

@@ -241,7 +241,6 @@ def moved(
                 _linked(mech[i][0], mech[i][1][j], mech[i][1][o], n, constants[o].armature)
             effort = None if run.torque is None else run.torque[:, j]
             out.add(
-                run.name,
                 nominal_row(believed[i], rotor),
                 mech[i][0],
                 mech[i][1][j],
@@ -279,10 +278,6 @@ def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
         exact["enabled"] = (run.enabled[:, j] > 0.5).astype(float)
     if run.temperature is not None:
         exact["warmth"] = run.temperature[:, j] - REFERENCE
-    if run.duty is not None:
-        exact["drive"] = run.duty[:, j]
-    elif run.torque is not None:
-        exact["drive"] = np.nan_to_num(run.torque[:, j])
     return exact
 
 

@@ -115,7 +115,6 @@ SERIES: tuple[str, ...] = (
     "others_torque",  # sum of the other joints' |motor torque|, N.m
     "warmth",  # temperature above the reference, degC
     "enabled",
-    "drive",  # recorded motor torque (or duty) where a stage is tested with its recorded input
     # what the added mass's place adds: per kg.m, inertia linear in the place
     "com_out_cos", "com_out_sin", "com_out_inertia",
     "com_across_cos", "com_across_sin", "com_across_inertia",

@@ -61,12 +61,11 @@ FIGURES = (
 
 @dataclass(frozen=True)
 class Precision:
-    """How well a figure could be told: steps (of `Figure.step`) of one standard deviation; alone: with all others
-    known; beside: the figure that it can only be told together with, if any."""
+    """How well a figure could be told: steps (of `Figure.step`) of one standard deviation; beside: the figure that
+    it can only be told together with, if any."""
 
     figure: Figure
     steps: float
-    alone: float
     beside: Figure | None
 
     @property
@@ -120,7 +119,7 @@ def informed(case: Case, floor: float = 0.0) -> list[Precision]:
         alone = float(1 / np.sqrt(information[k, k] + 1 / DOUBT**2))
         other = int(np.argmax(alike[k]))
         beside = used[other] if size[k] >= 1.0 > alone and alike[k, other] > ALIKE else None
-        out.append(Precision(figure, float(size[k]), alone, beside))
+        out.append(Precision(figure, float(size[k]), beside))
     return out
 
 

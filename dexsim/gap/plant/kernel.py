@@ -33,7 +33,6 @@ from dexsim.actuator.laws import (
     difference,
     dragged_target,
     dry_friction,
-    duty_torque,
     encoder_error,
     encoder_line,
     feed_forward,
@@ -76,8 +75,7 @@ ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in 
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
-C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
-CONSTS = 10  # of them
+C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE = range(9)
 P_KP, P_KD, P_LAG, P_SUPPLY, P_VISC = (INDEX[n] for n in ("kp", "kd", "lag", "supply", "viscous_friction"))
 P_THINS, P_THINSPEED = INDEX["thinning_friction"], INDEX["thinning_speed"]
 P_LOADOUT = INDEX["load_friction_external"]  # the first of `FEATURES["load"]`, which stand in a row
@@ -95,9 +93,7 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
     X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
 )
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
-XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (
-    X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive")
-)
+XSUP, XOTH, XWARM, XDRAG, XON = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled"))
 P_OWN = INDEX["own_payload"]
 P_GEARLOAD, P_GEARBACK, P_GEARPOWER, P_GEARUNIT = (
     INDEX[f"gear_load_{n}"] for n in ("friction", "friction_backdriven", "power", "unit")
@@ -189,7 +185,6 @@ class Guess:  # the columns of one guess that every step asks for
     voltage: bool
     loop_motor: bool
     slide: bool
-    open_: f64
     base_friction: f64
     base_damping: f64
     motor_share: f64  # of both, where rotor and link are two bodies
@@ -233,7 +228,6 @@ class Now:  # what holds in one step of the grid
     gravity_cos: f64
     gravity_sin: f64
     q: f64  # measured
-    drive: f64  # recorded input of the stage after the drive
     enabled: bool
     held: bool  # the recorded motion is held on the joint
 
@@ -305,7 +299,6 @@ def guess(c: Recorded, of: Any, dt: f64):
     p.voltage = c.consts[C_VOLTAGE] > f64(0.0)
     p.loop_motor = c.consts[C_LOOP_MOTOR] > f64(0.0)
     p.slide = c.consts[C_SLIDE] >= f64(0.5)
-    p.open_ = c.consts[C_OPEN]
     p.base_friction = c.consts[C_FRICTION]
     p.base_damping = c.consts[C_DAMPING]
     p.motor_share = of[P_MOTORSHARE]
@@ -406,8 +399,6 @@ def drive_now(c: Recorded, of: Any, g: int, dt: f64, x: State, p: Guess, n: Now)
     supply, kept = leaves(of, supply, c.series[g, XOTH], kept, fresh, dt)
     n.supply = supply
     n.weak = of[P_WEAK] * c.series[g, XOTH]
-    if p.open_ > f64(0.0):
-        n.drive = c.series[g, XDRIVE]
     n.enabled = c.series[g, XON] >= f64(0.5)
     return n, kept
 
@@ -537,21 +528,10 @@ def drive_voltage(u: wp.vec3d, v: f64, gain: f64, drift: f64, n: Now):
 
 
 @wp.func
-def opened(t: Torque, v: f64, p: Guess, n: Now):
-    """The torque where a stage is tested with its recorded input, or the drive is off; a light rotor's slope is
-    bounded."""
+def driven(t: Torque, p: Guess, n: Now):
+    """The torque, none where the drive is off; a light rotor's slope is bounded."""
     if p.two:  # its steps are short, and a light rotor's would not stand it
         t.on_drive = wp.max(t.on_drive, f64(0.0))
-    if p.open_ > f64(0.0):  # the stage after the drive, with its recorded input
-        t.now = n.drive
-        t.end = t.now
-        t.on_loop = f64(0.0)
-        t.on_drive = f64(0.0)
-        if p.open_ > f64(1.5):  # that input is the duty
-            line = n.tau0 / n.no_load
-            t.now = duty_torque(n.drive, n.tau0, n.supply, line, v)
-            t.end = t.now
-            t.on_drive = line
     if not n.enabled:
         t.now = f64(0.0)
         t.end = f64(0.0)
@@ -775,7 +755,7 @@ def substep(of: Any, x: State, p: Guess, n: Now, b: Pair):
         x.older = p.kp * p.age * shows * v_l
         if p.voltage:
             x.older = n.tau0 * n.supply * x.older
-    t = opened(t, v_drive, p, n)
+    t = driven(t, p, n)
     if not n.enabled:
         x.integral = zero
     if x.fresh == f64(1.0):
@@ -1164,7 +1144,6 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                     fixed.two = wp.static(two)
                     fixed.voltage = False
                     fixed.loop_motor = False
-                    fixed.open_ = f64(0.0)
                     one = State()
                     one.q = qs[l]
                     one.v = vs[l]

@@ -3,8 +3,9 @@ plain arrays, in the order of the joints that are diagnosed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +24,8 @@ class Run:
     """One recording, J joints; times in s from the recording's first sample, positions in rad (m for a slide).
 
     cmd_t [K], cmd [K, J]: targets, held until the next; t [S], q [S, J]: measured positions. Optional, None where not
-    logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or the plain current in A
-    where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V. gravity: the world's, m/s2, [3].
+    logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m; duty, temperature, enabled [S,
+    J]; supply [S] V. gravity: the world's, m/s2, [3].
     servo: the table believed for this recording; counted: the mechanism's joints, by whose number its `coupling_from`
     counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of
     them. breaks: stretches [s] over which its clock cannot be trusted. read [S, J]: where a position was read; between
@@ -41,13 +42,10 @@ class Run:
     gravity: np.ndarray
     v: np.ndarray | None = None
     torque: np.ndarray | None = None
-    torque_unit: str = "N.m"
     duty: np.ndarray | None = None
     temperature: np.ndarray | None = None
     enabled: np.ndarray | None = None
     supply: np.ndarray | None = None
-    tactile: np.ndarray | None = None
-    notes: list[str] = field(default_factory=list)
     counted: tuple[str, ...] = ()
     left_out: frozenset[str] = frozenset()
     breaks: tuple[tuple[float, float], ...] = ()
@@ -87,6 +85,21 @@ class Run:
         if self.smoother is None or self.smoother[0] is not self.t or self.smoother[1] != width:
             self.smoother = self.t, width, LocalPolynomial(self.t, width)
         return self.smoother[2]
+
+    def only(self, columns: Sequence[int]) -> None:
+        """Keep these columns of its joints alone, in this order."""
+        k = list(columns)
+        self.joints = tuple(self.joints[i] for i in k)
+        for name in ("cmd", "q", *COLUMNS):
+            x = getattr(self, name)
+            setattr(self, name, None if x is None else x[:, k])
+
+    def between(self, start: float, end: float) -> Run:
+        """Return the run between two times [s]; commands stay, for what was sent before still acts."""
+        on = (self.t >= start) & (self.t <= end)
+        parts: dict[str, Any] = dict.fromkeys(("qs", "vs", "as_", "fine", "noises", "smoother"))  # of all of it
+        parts |= {n: None if (x := getattr(self, n)) is None else x[on] for n in ("t", "q", "supply", *COLUMNS)}
+        return replace(self, **parts, breaks=())
 
     def command_at(self, t: np.ndarray) -> np.ndarray:
         """Return [n, J] the target in force at each time (the first target before any)."""

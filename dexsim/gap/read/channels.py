@@ -327,11 +327,7 @@ def drop(
             k = [i for i, j in enumerate(run.joints) if j not in bad]
             if not k:
                 continue
-            run.joints = tuple(run.joints[i] for i in k)
-            run.cmd, run.q = run.cmd[:, k], run.q[:, k]
-            for name in COLUMNS:
-                x = getattr(run, name)
-                setattr(run, name, None if x is None else x[:, k])
+            run.only(k)
         kept.append(run)
     return kept
 

@@ -19,7 +19,7 @@ from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.finding import WRONG_SIGNAL, Finding
-from dexsim.gap.read import COLUMNS, Run, channels, joined, pieces
+from dexsim.gap.read import Run, channels, joined, pieces
 from dexsim.gap.rules import SIGNAL
 from dexsim.recording import readers, spikes
 from dexsim.recording.mechanism import Mechanism, merged
@@ -56,7 +56,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
             merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")),
             source=f"servo of {name}",
         )
-    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
+    run = Run(name, joints, ct, c, t, q, table, recording.gravity, counted=m.joints)
     run.breaks = tuple(recording.breaks)
     run.read = None if read.all() else read
     run.v = _at(recording.states.velocity, t, column)
@@ -264,7 +264,7 @@ def free_air(
         for a, b in spans:
             edges += [a - room[0], b + room[1]]
         edges.append(float(run.t[-1]))
-        pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= least]
+        pieces = [run.between(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= least]
         pieces = [p for p in pieces if len(p.t) >= 20 and (np.ptp(p.q, axis=0) > 2e-3).any()]
         share = sum(p.duration for p in pieces) / max(run.duration, 1e-9)
         notes.append(f"{run.name}: {why}; joints are judged by the {100 * share:.0f} % of its time {rest}" if pieces
@@ -272,33 +272,6 @@ def free_air(
         kept += range(len(out), len(out) + len(pieces)) if i in held else []
         out += pieces
     return out, kept
-
-
-def cut(run: Run, start: float, end: float) -> Run:
-    """Return the run between two times [s]; commands stay, for what was sent before still acts."""
-    on = (run.t >= start) & (run.t <= end)
-    part = lambda x: None if x is None else x[on]  # noqa: E731
-    return Run(
-        run.name,
-        run.joints,
-        run.cmd_t,
-        run.cmd,
-        run.t[on],
-        run.q[on],
-        run.servo,
-        run.gravity,
-        part(run.v),
-        part(run.torque),
-        run.torque_unit,
-        part(run.duty),
-        part(run.temperature),
-        part(run.enabled),
-        part(run.supply),
-        notes=list(run.notes),
-        counted=run.counted,
-        left_out=run.left_out,
-        read=part(run.read),
-    )
 
 
 def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
@@ -312,12 +285,7 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
         extra = [j for j in r.joints if j not in shared]
         if extra:
             notes.append(f"{r.name}: {', '.join(extra)} not in every recording; left out")
-        k = [r.joints.index(j) for j in shared]
-        r.cmd, r.q = r.cmd[:, k], r.q[:, k]
-        for name in COLUMNS:
-            x = getattr(r, name)
-            setattr(r, name, None if x is None else x[:, k])
-        r.joints = tuple(shared)
+        r.only([r.joints.index(j) for j in shared])
     # counts only where every run has it; enabled and supply act in the run that has them
     for name in ("torque", "temperature", "duty"):
         have = [getattr(r, name) is not None for r in runs]

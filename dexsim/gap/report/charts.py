@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,20 +28,37 @@ def _ticks(low: float, high: float, count: int = 5) -> np.ndarray:
     return np.arange(np.ceil(low / step) * step, high + 1e-9 * span, step)
 
 
+def _tag(name: str, inside: str | None = None, /, **attributes: Any) -> str:
+    """Return an element of SVG; numbers with one decimal, `_` of a name as `-`."""
+    given = (f'{k.replace("_", "-")}="{f"{v:.1f}" if isinstance(v, float) else v}"' for k, v in attributes.items())
+    head = f"<{name} {' '.join(given)}"
+    return f"{head}/>" if inside is None else f"{head}>{inside}</{name}>"
+
+
+def _picture(width: float, height: float, label: str, parts: Sequence[str], /, **more: Any) -> str:
+    return _tag("svg", "".join(parts), **more, viewBox=f"0 0 {width:g} {height:g}", role="img", aria_label=label)
+
+
 def _line(x: np.ndarray, y: np.ndarray, colour: str, width: float = 1.4) -> str:
     ok = np.isfinite(y)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[ok], y[ok], strict=True))
-    return f'<polyline fill="none" stroke="{colour}" stroke-width="{width}" stroke-linejoin="round" points="{points}"/>'
+    return _tag("polyline", fill="none", stroke=colour, stroke_width=width, stroke_linejoin="round", points=points)
+
+
+def _rule(x1: float, x2: float, y1: float, y2: float, colour: str, width: float = 1.0, **more: Any) -> str:
+    return _tag("line", x1=x1, x2=x2, y1=y1, y2=y2, stroke=colour, stroke_width=width, **more)
+
+
+def _box(x: float, y: float, width: float, height: float, fill: str, **more: Any) -> str:
+    return _tag("rect", x=x, y=y, width=width, height=height, fill=fill, **more)
 
 
 def text(
     x: float, y: float, words: str, anchor: str = "start", size: float = 11, colour: str = SOFT, weight: int = 400
 ) -> str:
     """Return a line of text at x, y."""
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{colour}" text-anchor="{anchor}" '
-        f'font-weight="{weight}">{html.escape(words)}</text>'
-    )
+    font = {"font_size": f"{size:g}", "font_weight": weight}
+    return _tag("text", html.escape(words), x=float(x), y=float(y), fill=colour, text_anchor=anchor, **font)
 
 
 def curves(
@@ -51,11 +69,10 @@ def curves(
     command: np.ndarray | None,
     unit: str = "rad",
     spans: Sequence[tuple[float, float]] = (),
-    width: int = 980,
 ) -> str:
     """Return the quantity above, simulated minus measured below in thousandths, against time [s]; spans: stretches that
     are shaded."""
-    top, bottom, left, right = 200, 96, 56, 12
+    width, top, bottom, left, right = 980, 200, 96, 56, 12
     height = top + bottom + 50
     t0, t1 = float(t[0]), float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1
     at = lambda v: left + (np.asarray(v) - t0) / (t1 - t0) * (width - left - right)  # noqa: E731
@@ -67,116 +84,75 @@ def curves(
     pad = 0.06 * max(high - low, 1e-6)
     low, high = low - pad, high + pad
     y = lambda v: 16 + (high - np.clip(v, low, high)) / (high - low) * (top - 8)  # noqa: E731
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="measured and simulated {unit}">']
-    for a, b in spans:
-        a, b = max(a, t0), min(b, t1)
-        if b > a:
-            out.append(
-                f'<rect x="{float(at(a)):.1f}" y="8" width="{max(float(at(b) - at(a)), 0.8):.1f}" '
-                f'height="{height - 34}" fill="#f3e9d2"/>'
-            )
-    for v in _ticks(low, high):
-        out.append(f'<line x1="{left}" x2="{width - right}" y1="{y(v):.1f}" y2="{y(v):.1f}" stroke="{GRID}"/>')
-        out.append(text(left - 6, float(y(v)) + 4, number(v if abs(v) > 1e-12 else 0.0), "end"))
-    if command is not None:
-        out.append(_line(x, y(command), COMMAND, 1.2))
-    out.append(_line(x, y(measured), INK, 2.0))
-    out.append(_line(x, y(before), BEFORE, 1.5))
-    if after is not None:
-        out.append(_line(x, y(after), AFTER, 1.5))
-    e0 = 1e3 * (before - measured)
-    e1 = 1e3 * (after - measured) if after is not None else None
-    size = max(float(np.percentile(np.abs(e0), 99.5)), 1e-3) * 1.1
+    simulated = [(before, BEFORE), *([] if after is None else [(after, AFTER)])]
+    size = max(float(np.percentile(np.abs(1e3 * (before - measured)), 99.5)), 1e-3)
     base = top + 28
-    z = lambda v: base + (1 - np.clip(v / size, -1, 1)) * bottom / 2  # noqa: E731
-    for v in (-size / 1.1, 0.0, size / 1.1):
-        out.append(f'<line x1="{left}" x2="{width - right}" y1="{z(v):.1f}" y2="{z(v):.1f}" stroke="{GRID}"/>')
-        out.append(text(left - 6, float(z(v)) + 4, number(v, 2), "end"))
-    out.append(_line(x, z(e0), BEFORE, 1.5))
-    if e1 is not None:
-        out.append(_line(x, z(e1), AFTER, 1.5))
-    for v in _ticks(t0, t1, 8):
-        out.append(text(float(at(v)), height - 6, f"{v:.3g} s", "middle"))
-    out.append(text(left + 4, 12, unit))
-    out.append(
-        text(left + 4, base - 5, f"error, m{unit}" if unit in ("rad", "m", "N", "A", "N.m") else "error, thousandths")
-    )
-    return "".join(out) + "</svg>"
+    z = lambda v: base + (1 - np.clip(v / (1.1 * size), -1, 1)) * bottom / 2  # noqa: E731
+    inside = ((max(a, t0), min(b, t1)) for a, b in spans)
+    out = [_box(float(at(a)), 8, max(float(at(b) - at(a)), 0.8), height - 34, "#f3e9d2") for a, b in inside if b > a]
+    for v, place, label in (
+        *((v, y, number(v if abs(v) > 1e-12 else 0.0)) for v in _ticks(low, high)),
+        *((v, z, number(v, 2)) for v in (-size, 0.0, size)),
+    ):
+        level = float(place(v))
+        out += [_rule(left, width - right, level, level, GRID), text(left - 6, level + 4, label, "end")]
+    out += [] if command is None else [_line(x, y(command), COMMAND, 1.2)]
+    out += [_line(x, y(measured), INK, 2.0), *(_line(x, y(s), colour, 1.5) for s, colour in simulated)]
+    out += [_line(x, z(1e3 * (s - measured)), colour, 1.5) for s, colour in simulated]
+    out += [text(float(at(v)), height - 6, f"{v:.3g} s", "middle") for v in _ticks(t0, t1, 8)]
+    of = f"m{unit}" if unit in ("rad", "m", "N", "A", "N.m") else "thousandths"
+    out += [text(left + 4, 12, unit), text(left + 4, base - 5, f"error, {of}")]
+    return _picture(width, height, f"measured and simulated {unit}", out)
 
 
-def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], unit: str, width: int = 560) -> str:
+def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], unit: str) -> str:
     """Return horizontal bars: (name, value, low, high, colour); values share one scale."""
-    left, right, step = 156, 118, 38
-    height = step * len(rows) + 6
+    width, left, right, step = 560, 156, 118, 38
     top = max([*(max(r[1], r[3] or 0.0) for r in rows), 1e-12])
     x = lambda v: left + v / top * (width - left - right)  # noqa: E731
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="errors on held-out data">']
+    out: list[str] = []
     for k, (name, value, low, high, colour) in enumerate(rows):
-        y = k * step + 4
+        y, end = k * step + 4, x(value)
         out.append(text(left - 10, y + 20, name, "end", 13, INK))
-        out.append(
-            f'<rect x="{left}" y="{y + 4}" width="{max(x(value) - left, 1.5):.1f}" height="{step - 14}" rx="3" '
-            f'fill="{colour}"/>'
-        )
-        end = x(value)
+        out.append(_box(left, y + 4, max(end - left, 1.5), step - 14, colour, rx=3))
         if low is not None and high is not None:
-            out.append(
-                f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 16}" y2="{y + 16}" stroke="{INK}" '
-                'stroke-width="1.4"/>'
-            )
-            out += [
-                f'<line x1="{x(v):.1f}" x2="{x(v):.1f}" y1="{y + 12}" y2="{y + 20}" stroke="{INK}" stroke-width="1.4"/>'
-                for v in (low, high)
-            ]
+            ends = ((x(low), x(high), y + 16, y + 16), *((x(v), x(v), y + 12, y + 20) for v in (low, high)))
+            out += [_rule(*ends_, INK, 1.4) for ends_ in ends]
             end = max(end, x(high))
         out.append(text(end + 8, y + 21, f"{number(value)} {unit}", "start", 14, INK, 600))
-    return "".join(out) + "</svg>"
+    return _picture(width, step * len(rows) + 6, "errors on held-out data", out)
 
 
-def interval(value: float, low: float, high: float, width: int = 190) -> str:
+def interval(value: float, low: float, high: float) -> str:
     """Return a value with its interval on a short axis that begins at 0 where that is near."""
-    lo, hi = min(low, value), max(high, value)
+    width, lo, hi = 190, min(low, value), max(high, value)
     span = max(hi - lo, 1e-12 + 0.02 * abs(value))
     a, b = lo - 0.6 * span, hi + 0.6 * span
     zero = a < 0 < b or (a > 0 and a < 0.35 * b) or (b < 0 and b > 0.35 * a)
     a, b = (min(a, 0.0), max(b, 0.0)) if zero else (a, b)
     x = lambda v: 6 + (v - a) / (b - a) * (width - 12)  # noqa: E731
-    out = [
-        f'<svg class="iv" width="{width}" height="26" viewBox="0 0 {width} 26" role="img" aria-label="{value:.4g}, '
-        f'{low:.4g} to {high:.4g}">',
-        f'<line x1="6" x2="{width - 6}" y1="10" y2="10" stroke="{GRID}" stroke-width="2"/>',
-    ]
-    if zero:
-        out.append(
-            f'<line x1="{x(0):.1f}" x2="{x(0):.1f}" y1="4" y2="16" stroke="{SOFT}"/>' + text(x(0), 25, "0", "middle", 9)
-        )
-    out.append(
-        f'<line x1="{x(lo):.1f}" x2="{x(hi):.1f}" y1="10" y2="10" stroke="{AFTER}" stroke-width="5" '
-        'stroke-linecap="round" opacity="0.45"/>'
-    )
-    out.append(f'<circle cx="{x(value):.1f}" cy="10" r="4.5" fill="{AFTER}"/>')
-    return "".join(out) + "</svg>"
+    out = [_rule(6, width - 6, 10, 10, GRID, 2)]
+    out += [_rule(x(0), x(0), 4, 16, SOFT), text(x(0), 25, "0", "middle", 9)] if zero else []
+    out.append(_rule(x(lo), x(hi), 10, 10, AFTER, 5, stroke_linecap="round", opacity="0.45"))
+    out.append(_tag("circle", cx=x(value), cy=10, r="4.5", fill=AFTER))
+    label = f"{value:.4g}, {low:.4g} to {high:.4g}"
+    return _picture(width, 26, label, out, **{"class": "iv", "width": width, "height": 26})
 
 
-def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]], width: int = 560) -> str:
+def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]]) -> str:
     """Return one strip a recording: (name, its end [s], stretches [s] that are dark)."""
     end = max(max(e, 1e-9) for _, e, _ in rows)
-    left, right, step = 118, 12, 22
+    width, left, right, step = 560, 118, 12, 22
     height = step * len(rows) + 18
     scale = (width - left - right) / end
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="when it acts">']
+    out: list[str] = []
     for k, (name, stop, spans) in enumerate(rows):
         y = k * step + 3
         out.append(text(left - 8, y + 12, name if len(name) < 20 else "..." + name[-17:], "end", 11, INK))
-        out.append(f'<rect x="{left}" y="{y}" width="{stop * scale:.1f}" height="{step - 8}" rx="2" fill="#eef1f4"/>')
-        for a, b in spans:
-            out.append(
-                f'<rect x="{left + a * scale:.1f}" y="{y}" width="{max((b - a) * scale, 0.8):.1f}" '
-                f'height="{step - 8}" fill="#d99a2b"/>'
-            )
-    for v in _ticks(0, end, 6):
-        out.append(text(left + v * scale, height - 3, f"{v:.3g} s", "middle"))
-    return "".join(out) + "</svg>"
+        out.append(_box(left, y, stop * scale, step - 8, "#eef1f4", rx=2))
+        out += [_box(left + a * scale, y, max((b - a) * scale, 0.8), step - 8, "#d99a2b") for a, b in spans]
+    out += [text(left + v * scale, height - 3, f"{v:.3g} s", "middle") for v in _ticks(0, end, 6)]
+    return _picture(width, height, "when it acts", out)
 
 
 def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, left: int = 400) -> str:
@@ -185,23 +161,18 @@ def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, le
     height = step * len(rows) + 22
     top = max([2.0, *(min(r[3], 8.0) for r in rows)])
     x = lambda v: left + min(max(v, 0.0), top) / top * (width - left - right)  # noqa: E731
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="error by regime">']
+    out: list[str] = []
     for k, (name, value, low, high) in enumerate(rows):
         y = k * step + 3
-        out.append(text(left - 8, y + 14, name if len(name) < 64 else name[:61] + "...", "end", 12, INK))
-        out.append(
-            f'<rect x="{left}" y="{y}" width="{max(x(value) - left, 0):.1f}" height="{step - 8}" fill="{BEFORE}" '
-            'opacity="0.75"/>'
-        )
-        out.append(
-            f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 9}" y2="{y + 9}" stroke="{INK}" stroke-width="1.6"/>'
-        )
-        out.append(text(x(min(high, top)) + 6, y + 13, f"{value:.2g}", colour=INK))
-    out.append(
-        f'<line x1="{x(1):.1f}" x2="{x(1):.1f}" y1="0" y2="{height - 18}" stroke="{SOFT}" stroke-dasharray="3 3"/>'
-    )
+        out += [
+            text(left - 8, y + 14, name if len(name) < 64 else name[:61] + "...", "end", 12, INK),
+            _box(left, y, max(x(value) - left, 0), step - 8, BEFORE, opacity="0.75"),
+            _rule(x(low), x(high), y + 9, y + 9, INK, 1.6),
+            text(x(min(high, top)) + 6, y + 13, f"{value:.2g}", colour=INK),
+        ]
+    out.append(_rule(x(1), x(1), 0, height - 18, SOFT, stroke_dasharray="3 3"))
     out.append(text(x(1), height - 4, "as elsewhere (1)", "middle"))
-    return "".join(out) + "</svg>"
+    return _picture(width, height, "error by regime", out)
 
 
 # -- a picture of the mechanism ---------------------------------------------------------------------------------------
@@ -211,26 +182,20 @@ PALE, HOT = (247, 243, 236), (196, 38, 46)
 UNKNOWN = 12  # taxels drawn in a column where no lattice is known
 
 
-def pad(error: np.ndarray, marked: set[int], lattice: tuple[int, int] | None, size: float = 15.0) -> str:
+def pad(error: np.ndarray, marked: set[int], lattice: tuple[int, int] | None) -> str:
     """Return one pad's taxels [K] N as its lattice of (columns, rows), rows from the joint (below) to the tip, coloured
     by error; the marked ringed. Without a lattice in rows of twelve, by number."""
-    columns, rows = lattice or (-(-len(error) // UNKNOWN), UNKNOWN)
+    size, (columns, rows) = 15, lattice or (-(-len(error) // UNKNOWN), UNKNOWN)
     error = error[: columns * rows]  # a smaller pad's end before the largest's
     most = max(float(error.max()), 1e-9)
-    width, height = columns * size + 2, rows * size + 2
-    out = [
-        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error '
-        'of each taxel">'
-    ]
+    width, height, out = columns * size + 2, rows * size + 2, []
     for k, e in enumerate(error):
         c, r = divmod(k, rows)
-        x, y = 1 + c * size, 1 + (rows - 1 - r) * size
-        ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
-        out.append(
-            f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" '
-            f'fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>'
-        )
-    return "".join(out) + "</svg>"
+        ring = {"stroke": INK, "stroke_width": 2} if k in marked else {"stroke": "#fff", "stroke_width": 1}
+        place = {"x": 2 + c * size, "y": 2 + (rows - 1 - r) * size, "width": size - 2, "height": size - 2, "rx": 2}
+        said = f"<title>taxel {k}: {1e3 * e:.0f} mN</title>"
+        out.append(_tag("rect", said, **place, fill=heat(e / most), **ring))
+    return _picture(width, height, "error of each taxel", out, width=width, height=height)
 
 
 def heat(share: float) -> str:
@@ -239,19 +204,13 @@ def heat(share: float) -> str:
     return "#" + "".join(f"{int(a + share * (b - a)):02x}" for a, b in zip(PALE, HOT, strict=True))
 
 
-def scale(most: float, unit: str, width: int = 360) -> str:
+def scale(most: float, unit: str) -> str:
     """Return the colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
-    left, right, steps = 60, width - 96, 24
+    left, right, steps = 60, 264, 24
     part = (right - left) / steps
-    out = [
-        f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">',
-        text(left - 8, 14, "0", "end"),
-    ]
-    out += [
-        f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>'
-        for k in range(steps)
-    ]
-    return "".join(out) + text(right + 8, 14, f"{number(1e3 * most)} {unit}") + "</svg>"
+    out = [_box(left + k * part, 4, part + 0.5, 11, heat((k + 0.5) / steps)) for k in range(steps)]
+    out += [text(left - 8, 14, "0", "end"), text(right + 8, 14, f"{number(1e3 * most)} {unit}")]
+    return _picture(360, 20, "colours of the error", out)
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
@@ -358,25 +317,23 @@ def mechanism(
     taxels: np.ndarray | None = None,
     marked: Set[str] = frozenset(),
     unit: str = "mrad",
-    width: int = 360,
     height: int = 400,
 ) -> str:
     """Return the links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named
     where found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads of
     `sensors`."""
-    names = [model.joint(i).name for i in range(model.njnt)]
+    width, names = 360, [model.joint(i).name for i in range(model.njnt)]
     joints = [i for i, n in enumerate(names) if n in error]
     drawing = _drawing(model, sensors, joints, not error, width, height)
     if drawing is None:
         return ""
     hot = {int(model.jnt_bodyid[i]) for i in joints if names[i] in found}
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="the mechanism, coloured by error">']
-    out += [*_outlines(drawing, hot), *_links(drawing, joints)]
+    out = [*_outlines(drawing, hot), *_links(drawing, joints)]
     if taxels is not None:
         out += _taxels(drawing, taxels, marked)
     most = max([*error.values(), 1e-12])
     out += _discs(drawing, {i: (names[i], error[names[i]]) for i in joints}, most, found, unit)
-    return "".join(out) + "</svg>"
+    return _picture(width, height, "the mechanism, coloured by error", out)
 
 
 def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
@@ -392,9 +349,8 @@ def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
             continue
         fill = "#f4d9c0" if int(d.model.geom_bodyid[g]) in hot else "#e3e8ee"
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in xy)
-        out.append(
-            f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>'
-        )
+        edge = {"stroke": "#aeb8c4", "stroke_width": "0.8", "stroke_linejoin": "round"}
+        out.append(_tag("polygon", points=points, fill=fill, **edge))
     return out
 
 
@@ -406,10 +362,7 @@ def _links(d: _Drawing, joints: list[int]) -> list[str]:
             inside = [k for k in joints if int(d.model.jnt_bodyid[k]) == parent]
             if inside:
                 a, b = d.at(d.data.xanchor[inside[-1]])[0], d.at(d.data.xanchor[i])[0]
-                out.append(
-                    f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" '
-                    'stroke-width="2"/>'
-                )
+                out.append(_rule(a[0], b[0], a[1], b[1], "#8f9baa", 2))
                 break
     return out
 
@@ -417,16 +370,12 @@ def _links(d: _Drawing, joints: list[int]) -> list[str]:
 def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
     """Return the taxels of the pads, coloured by their error [F, K] N; ringed where `marked`."""
     out = []
-    most = max(float(taxels.max()), 1e-9)
+    most, size = max(float(taxels.max()), 1e-9), 2.2 if d.scale < 4000 else 5.0
     for f, p in d.pads:
         for k, (x, y) in enumerate(d.at(p)):
-            mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
-            size = 2.2 if d.scale < 4000 else 5.0
-            out.append(
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
-                f'fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} '
-                'mN</title></circle>'
-            )
+            ring = {"stroke": INK, "stroke_width": 1} if f"{f}:{k}" in marked else {}
+            said = f"<title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} mN</title>"
+            out.append(_tag("circle", said, cx=x, cy=y, r=size, fill=heat(taxels[f, k] / most), **ring))
     return out
 
 
@@ -436,22 +385,11 @@ def _discs(d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found
     out, labels = [], []
     for i, (name, small) in joints.items():
         (x, y) = d.at(d.data.xanchor[i])[0]
-        ring = (
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>'
-            if name in found
-            else ""
-        )
-        out.append(
-            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / most)}" '
-            f'stroke="{SOFT}"><title>{html.escape(name)}: {1e3 * small:.3g} {unit}</title></circle>'
-        )
+        said = f"<title>{html.escape(name)}: {1e3 * small:.3g} {unit}</title>"
         if name in found:
-            labels.append((x, y, name))
-    for x, y, name in labels:
-        side = "end" if x > 0.62 * d.width else "start"
-        dx = -17 if side == "end" else 17
-        out.append(
-            '<g stroke="#fff" stroke-width="3" '
-            f'paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
-        )
-    return out
+            out.append(_tag("circle", cx=x, cy=y, r=13, fill="none", stroke=INK, stroke_width=2))
+            side, dx = ("end", -17) if x > 0.62 * d.width else ("start", 17)
+            label = text(x + dx, y + 4, name, side, 12, INK, 600)
+            labels.append(_tag("g", label, stroke="#fff", stroke_width=3, paint_order="stroke"))
+        out.append(_tag("circle", said, cx=x, cy=y, r=8, fill=heat(small / most), stroke=SOFT))
+    return out + labels

@@ -216,7 +216,6 @@ def readable(run: Run, j: int) -> bool:
     """Return whether a run's torque of joint j can be differentiated beside its motion."""
     if (
         run.torque is None
-        or run.torque_unit != "N.m"
         or not np.isfinite(run.torque[:, j]).all()
         or run.read is not None
         or len(run.t) < 2 * EDGE + 100
