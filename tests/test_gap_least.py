@@ -66,27 +66,6 @@ def test_an_effect_must_remove_a_part_of_what_was_held_out(share, hint):
     assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)
 
 
-@pytest.mark.parametrize("share", [0.1, 0.6])
-def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
-    """A moment of what was held out is missed by a hundred times the noise with the effect and without it; elsewhere it
-    removes a share of the squared error. It is a hint for the moment, as it is for removing little."""
-    answer = Judged(1.0, np.sqrt(1 - share))
-    answer.without[:50], answer.after[:50] = 100.0, 100.0**2
-    answer.before = answer.without**2
-    assert answer.told == pytest.approx((1.0, np.sqrt(1 - share)))
-    f = judged(answer)
-    assert f.confidence == JUDGE.hinted and f.held_out["after"] > 30
-    reasons = answer.evidence[0].reasons
-    assert reasons[-1] == joint_answer.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
-
-
-def test_what_removes_much_of_all_that_was_held_out_needs_no_moments_left_out():
-    answer = Judged(100.0, 1.0)
-    answer.without[:50], answer.after[:50] = 1e3, 1e6  # alike there, and hardly more than all the rest
-    answer.without[50:] = 3e3
-    assert judged(answer).confidence == 0.95 and answer.evidence[0].reasons == []
-
-
 def weighed(monkeypatch, fitted=False, reported=False, blurred="") -> confidence.Evidence:
     """Return the evidence of a name against which nothing else speaks. fitted, reported: which of the two intervals,
     the fit's and the reported one, holds the size at which nothing is missing; blurred: why the encoder does not
@@ -105,7 +84,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="") -> confidence
     monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)
     monkeypatch.setattr(joint_answer, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
-    return JointAnswer._weighed(answer, answer.member, {}, 1.0, 0.1, 1.0)
+    return JointAnswer._weighed(answer, answer.member, {}, 1.0, 0.1)
 
 
 @pytest.mark.parametrize(

@@ -231,23 +231,6 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
             assert (judged(Judged(1.0, 0.1)).confidence < 0.5) is hint, lost
 
 
-def test_moments_that_nothing_follows_do_not_speak():
-    """Among 20 half seconds some are missed far beyond the noise without an effect, and nearly so with it."""
-
-    def silent(count: int, missed: float, differs: float) -> bool:
-        squares, t = np.ones(200), 0.05 * np.arange(200)
-        squares[: 10 * count] = missed**2
-        with_it = squares.copy()
-        with_it[: 10 * count] *= 1 - differs
-        on = held_out.telling(squares, with_it, t, 1.0)
-        assert on.all() or not on[: 10 * count].any() and on[10 * count :].all()
-        return not on.all()
-
-    assert silent(1, 5.4, 0.09) and not silent(1, 5.4, 0.11)  # it differs
-    assert silent(1, 5.1, 0.01) and not silent(1, 4.9, 0.01)  # it is followed
-    assert silent(4, 9.0, 0.0) and not silent(5, 9.0, 0.0)  # not a few moments
-
-
 def test_a_size_that_fits_without_a_condition_do_not_repeat_is_a_hint():
     p = param("coefficient", "viscous_friction", "set", 0.0, 9.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.0}))

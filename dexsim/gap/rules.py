@@ -97,17 +97,14 @@ class JudgeRules:
     earns: float = 0.1
     # of the largest of an effect's sizes in fits without one condition each: the least must be as large
     repeated: float = 0.2
-    # share of what was held out that may say nothing of an effect: more of it is not a few moments
-    most_left_out: float = 0.2
     # of the squared error before: a further effect that removes less may be what the first one's law gets wrong
     least_share: float = 0.04
     left_costs: float = 0.5  # share of its confidence that a name loses at most by what stays unexplained
     # standard deviation over mean of the load on the gear while a joint slides: less is one load, under which friction
     # that grows with it is not told from friction that does not
     one_load: float = 0.3
-    # share of the squared error on what was held out that an effect removes at least that is more than a hint; a half
-    # second that it changes by half as much can speak of it; of several on a joint, one that surely removes less, and
-    # without which the error is lower, is taken back
+    # share of the squared error on what was held out that an effect removes at least that is more than a hint; of
+    # several on a joint, one that surely removes less, and without which the error is lower, is taken back
     part: float = 0.2
     # share of the bootstraps that a rival of its class wins without which the name is no set; false-discovery rate of
     # what the rest is said to depend on (Benjamini and Hochberg 1995)

@@ -24,7 +24,7 @@ from dexsim.gap.judge import confidence, held_out
 from dexsim.gap.judge.full_model import BELIEVED, WHOLE, Candidate, Written, files
 from dexsim.gap.judge.handed_on import earned, missing_of, model_changes, servo_changes, values_of, widen
 from dexsim.gap.judge.held_out import rms
-from dexsim.gap.judge.joint_answer import MUTE, JointAnswer, nuisances
+from dexsim.gap.judge.joint_answer import JointAnswer, nuisances
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, logged_torque, ringing
@@ -249,11 +249,6 @@ def _take_back(
         mine = [f for f in findings if joint in f.joints and not EFFECTS[f.effect].effort_only]
         v = d.joints[joint]
         if not mine or joint in rings or _less(v["after"], v["before"]):
-            continue
-        if _less(v["told_after"], v["told_before"]):  # but for moments that nothing follows
-            for e in d.evidence:
-                if e.joint == joint and not EFFECTS[e.effect].effort_only and MUTE not in e.reasons:
-                    e.hint(MUTE)
             continue
         refuted.add(joint)
         d.notes += [

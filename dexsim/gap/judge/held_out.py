@@ -396,29 +396,9 @@ def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray) -
     samples."""
     if not len(without):
         return 0.0, 0.0
-    b = _blocks(times)
+    # half seconds without any sample are not counted
+    _, b = np.unique(((times - times.min()) / BLOCK).astype(int), return_inverse=True)
     a, c = np.bincount(b, without), np.bincount(b, with_it)
     index = intervals.stretches(len(a), STRETCH, 0, DRAWS)
     share = (a - c)[index].sum(1) / max(float(a.sum()), 1e-300)
     return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))
-
-
-def _blocks(times: np.ndarray) -> np.ndarray:
-    """Number of the half second in which each of times [n] s lies; those without any are not counted."""
-    _, out = np.unique(((times - times.min()) / BLOCK).astype(int), return_inverse=True)
-    return out
-
-
-def telling(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, noise: float) -> np.ndarray:
-    """Return [n] which samples of what was held out can speak of an effect. without, with_it: squared errors [n]
-    without and with it at times [n] s; noise: of one sample. Where a limit is reached in what was held out alone, or
-    one stick more sends a free run another way, neither follows, and half a second of that outweighs the rest:
-    half-second blocks that are missed by more than `JUDGE.far` x the noise, alike with the effect and without (half of
-    `JUDGE.part`), are left out, as long as they are few (`JUDGE.most_left_out`)."""
-    if not len(without):
-        return np.ones(0, bool)
-    b = _blocks(times)
-    count = np.bincount(b)
-    a, c = np.bincount(b, without) / count, np.bincount(b, with_it) / count
-    mute = (np.minimum(a, c) > (JUDGE.far * noise) ** 2) & (np.abs(a - c) <= 0.5 * JUDGE.part * a)
-    return ~mute[b] if mute.mean() <= JUDGE.most_left_out else np.ones(len(b), bool)

@@ -27,8 +27,6 @@ from dexsim.gap.search.scan import cv_loss
 from dexsim.gap.search.search import law_spread, polished, widened
 from dexsim.recording.mechanism import Mechanism
 
-MUTE = "moments of what was held out are followed neither with it nor without; the others alone speak for it"
-
 
 class JointAnswer:
     """A searched joint on what was held out.
@@ -69,21 +67,12 @@ class JointAnswer:
     @property
     def numbers(self) -> dict[str, float]:
         """Errors for the page."""
-        told_before, told_after = self.told
         return {
             "before": rms(self.before),
             "after": rms(self.after),
             "sigma": self.case.sigma,
             "fitted": self._followed,
-            "told_before": told_before,
-            "told_after": told_after,
         }
-
-    @property
-    def told(self) -> tuple[float, float]:
-        """Errors before and after (rms) where what was held out can speak of what was found (`held_out.telling`)."""
-        on = held_out.telling(self.before, self.after, self.t, self.case.sigma)
-        return rms(self.before[on]), rms(self.after[on])
 
     @property
     def shown(self) -> np.ndarray:
@@ -178,12 +167,6 @@ class JointAnswer:
         else:
             was, left = rms(lost), rms(self.after)
         evidence = self._judged(mm, raw, was, left, gain[0])
-        on = held_out.telling(lost, self.after, self.t, self.case.sigma)
-        if not effort_only and not on.all():  # what the other moments say of it, as a hint
-            part = held_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
-            other = self._judged(mm, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
-            other.hint(MUTE)
-            evidence = max(other, evidence, key=lambda e: e.confidence)
         evidence.score = self._score(trial)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
@@ -207,14 +190,11 @@ class JointAnswer:
             held_out=removed(was, left, told),
         )
 
-    def _judged(
-        self, mm: Member, raw: dict[str, float], was: float, left: float, surely: float, before: float | None = None
-    ) -> confidence.Evidence:
+    def _judged(self, mm: Member, raw: dict[str, float], was: float, left: float, surely: float) -> confidence.Evidence:
         """Return the evidence of one effect: was, left: rms error of what was held out without and with it; surely:
-        share of the squared error that it removes in all but a twentieth of its draws; before: error before anything
-        was named, where that is not of all that was held out."""
+        share of the squared error that it removes in all but a twentieth of its draws."""
         effort_only = mm.effect.effort_only
-        evidence = self._weighed(mm, raw, was, left, rms(self.before) if before is None else before)
+        evidence = self._weighed(mm, raw, was, left)
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
@@ -245,21 +225,19 @@ class JointAnswer:
                 raw[key], spread[key] = float(x), (float(b[0]), float(b[1]))
         return raw, spread
 
-    def _weighed(
-        self, mm: Member, raw: dict[str, float], error_without: float, after: float, before: float
-    ) -> confidence.Evidence:
+    def _weighed(self, mm: Member, raw: dict[str, float], error_without: float, after: float) -> confidence.Evidence:
         """Return how sure the name is, and every reason to doubt it. error_without, after: rms error on what was held
         out without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the
-        motion then tells nothing of it). before: error of the motion before anything was named."""
+        motion then tells nothing of it)."""
         case, outcome, effort_only, params = self.case, self.outcome, mm.effect.effort_only, mm.variant.params
         # the one effect of the reading: nothing else explains the effort
-        before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (before, case.sigma)
+        before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (rms(self.before), case.sigma)
         earned = 1.0 if effort_only else confidence.earned(error_without, after)
         as_fitted, reported = (self._fitted(mm, x)[1] for x in (self.widest, self.bounds))
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence[mm.id], earned,
             confidence.left_over(after, before, noise),
-            confidence.left_over(after, error_without, noise), 0.0, len(self.best.members))
+            confidence.left_over(after, error_without, noise), 0.0, len(self.best.members))  # fmt: skip
         nothing, as_reported = (confidence.holds_nothing(params, x, case) for x in (as_fitted, reported))
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")

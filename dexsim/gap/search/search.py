@@ -1,4 +1,4 @@
-"""The search on one joint: effects are added, swapped and dropped while they earn it on conditions left out; then what
+"""The search on one joint: effects are added and dropped while they earn it on conditions left out; then what
 was found on whole recordings, and intervals."""
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ AGAIN = 2  # hypotheses from which the fit without any effect is begun again bef
 
 
 def search_joint(search: JointSearch) -> Outcome:
-    """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
+    """Adds effects while they earn it on left-out conditions, drops them, and prices what is claimed."""
     search.fitted, search.first_laws = {}, {}
     none = search.start()
     search.none_loss = cv_loss(search, none)
@@ -94,8 +94,6 @@ def search_joint(search: JointSearch) -> Outcome:
         current = best
         if cv_loss(search, current).sum() / per > SEARCH.unsettled and not search.deadline.over():
             current = by_laws(search, current)  # before what its law gets wrong is taken for a further effect
-        if len(current.members) > 1 and not search.deadline.over():
-            current = swapped(search, current, pool)
     search.tell("what is not needed")
     if not search.deadline.over():
         for move in (dropped, approximated, refined_members, by_laws):
@@ -259,24 +257,6 @@ def best_pair(search: JointSearch, current: Trial, listed: Sequence[Scanned]) ->
     if best is not None and earns(search, best, current):
         return best
     return None
-
-
-def swapped(search: JointSearch, current: Trial, pool: Pool) -> Trial:
-    """Return each earlier member replaced by others of the pool, while the rest stays."""
-    best = current
-    for i, member in enumerate(current.members[:-1]):
-        rest, kept = current.but(i)
-        for key, (other, start, _) in list(pool.items()):
-            if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
-                continue
-            trial = search.fit((*rest, other), np.concatenate([kept, start]), current, quick=True)
-            if (
-                trial.fit.loss < best.fit.loss
-                and cv_loss(search, trial).sum() < cv_loss(search, best).sum()
-                and not search.shrunk(trial)
-            ):
-                best = trial
-    return best
 
 
 def dropped(search: JointSearch, current: Trial) -> Trial:

@@ -303,34 +303,9 @@ class PadFit:
     def size(self, res: np.ndarray) -> float:
         return float(huber_square(res[self.train], 3.0).sum())
 
-    def _rounding(self, trial: TouchTrial) -> np.ndarray:
-        """Return [P] rms by which the numbers come back wrong from their own readings in whole counts, at three
-        slightly different levels: a held force rounds to the same side for as long as it is held, which no scatter
-        shows."""
-        if not trial.keys or not any(r.lsb for r in self.runs):
-            return np.zeros(len(trial.keys))
-        kept = [r.z for r in self.runs]
-        off = []
-        try:
-            for level in (0.985, 1.0, 1.015):
-                for r in self.runs:
-                    exact = level * readings(r, trial.values, trial.gains, trial.order)
-                    r.z = np.round(exact / r.lsb) * r.lsb if r.lsb else exact
-                again = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 18)
-                off.append(
-                    [
-                        (again.values[k] - trial.values[k]) if k not in ("gain", "scale", "stiffness") else 0.0
-                        for k in trial.keys
-                    ]
-                )
-        finally:
-            for r, z in zip(self.runs, kept, strict=True):
-                r.z = z
-        return np.sqrt(np.mean(np.square(off), 0))
-
     def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
-        """Return 90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds,
-        what whole counts do to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
+        """Return 90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds
+        and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
         squares."""
         keys = trial.keys
         fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
@@ -353,7 +328,6 @@ class PadFit:
         )
         m = len(folds)
         variance += (m - 1) / max(m, 1) * ((folds - folds.mean(0)) ** 2).sum(0)
-        variance += self._rounding(fitted) ** 2
         out = {}
         for k, s in zip(fitted.keys, variance, strict=True):
             x = trial.values[k]
