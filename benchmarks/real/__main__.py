@@ -72,7 +72,7 @@ def _named(f: dict) -> str:
 def emps(data: Path, out: Path, engine: Engine) -> dict:
     """Return what was fitted to the estimation data and judged on the pulses: by the search in closed loop, and by the
     tool's own stage for a logged motor torque."""
-    from benchmarks.real.convert_emps import FILES, REFERENCE, convert, load
+    from benchmarks.real.convert_emps import REFERENCE, convert, load, stretch
 
     made = convert(data, out / "recordings")
     d, said = diagnosed(out, "found", made.recordings, made.held_out, made)
@@ -81,10 +81,11 @@ def emps(data: Path, out: Path, engine: Engine) -> dict:
     result["found"] = found
     result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
     # the tool's own stage for a logged motor torque, as its report has it
-    from dexsim.gap.search.inverse_dynamics import identify
+    from dexsim.gap.search.inverse_dynamics import columns_of, highest, solve
 
-    given = {n: load(data, n)[:3] for n in FILES}
-    tool = identify(*given["estimation"], test=given["pulses"])
+    given = [load(data, n)[:3] for n in ("estimation", "pulses")]
+    at = lambda cutoff: tuple(columns_of([stretch(*x, cutoff)], 0) for x in given)  # noqa: E731
+    tool = solve(at, highest(given[0][0]))
     names = {"mass": "inertia", "viscous": "viscous_friction", "coulomb": "coulomb_friction", "offset": "offset"}
     by = {k: tool.value[n] for k, n in names.items()}
     result["inverse"] = {

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from benchmarks.real.common import Converted, rig, save
 from dexsim.errors import UserError
+from dexsim.gap.search.inverse_dynamics import Stretch, body, motion
 
 KP, KV, FORCE_PER_VOLT = 160.18, 243.45, 35.1507  # 1/s, V/(m/s), N/V: of the benchmark's controller and drive
 VOLTS = 10.0
@@ -33,6 +35,13 @@ def load(data: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     raw = loadmat(data / FILES[name])
     get = lambda key: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
     return get("t"), get("qm"), float(raw["gtau"].squeeze()) * get("vir"), get("qg")
+
+
+def stretch(t: np.ndarray, q: np.ndarray, force: np.ndarray, cutoff: float) -> Stretch:
+    """Return a recorded motion of the carriage (as of `load`), filtered, beside a body of 95 kg."""
+    m = motion(t, q[:, None], force[:, None], cutoff)
+    model = mujoco.MjModel.from_xml_string(MODEL.format(mass=95))
+    return Stretch(m, body(model, np.zeros(3), ("carriage",), m))
 
 
 def convert(data: Path, out: Path, mass: float = 95.0) -> Converted:

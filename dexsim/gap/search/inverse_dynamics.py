@@ -120,11 +120,11 @@ def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: M
 
 @dataclass(frozen=True)
 class Stretch:
-    """A recorded motion with what the model's body asks for along it (None: it has none), and the span [s from its
-    start] that is used, None for all."""
+    """A recorded motion with what the model's body asks for along it, and the span [s from its start] that is used,
+    None for all."""
 
     motion: Motion
-    body: Body | None
+    body: Body
     span: tuple[float, float] | None = None
 
 
@@ -177,24 +177,22 @@ def columns_of(given: Sequence[Stretch], j: int, efficiency: float = 1.0, loaded
     """Build it for joint j; given: of each recording; efficiency: of the drive, believed; loaded: whether gravity's
     factors are among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
-    bodies = [(x.motion, x.body) for x in given if x.body is not None]
-    inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b in bodies]))) if bodies else 0.0
+    inertia = float(np.median(np.concatenate([x.body.inertia[:, j] for x in given])))
     if loaded is None:
-        weights = [np.abs(b.gravity[:, j]).max() / max(np.abs(m.u[:, j]).max(), 1e-12) for m, b in bodies]
-        loaded = bool(max(weights, default=0.0) > BELIEF.tolerance)
+        weights = [np.abs(x.body.gravity[:, j]).max() / max(np.abs(x.motion.u[:, j]).max(), 1e-12) for x in given]
+        loaded = bool(max(weights) > BELIEF.tolerance)
     for x in given:
         m, b = x.motion, x.body
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
-        load = np.zeros_like(q) if b is None else b.torque[:, j]
+        load = b.torque[:, j]
         keep = np.zeros(len(q), bool)
         keep[m.edge : len(q) - m.edge : max(int(1.0 / (PER_CUTOFF * m.cutoff * m.step)), 1)] = True
         if x.span is not None:
             keep &= (m.t - m.t[0] >= x.span[0]) & (m.t - m.t[0] <= x.span[1])
         columns = [m.a[:, j], v, m.smooth(np.sign(v)), np.ones(len(v))]
         if loaded:
-            assert b is not None  # gravity pulls at a body
             columns += [b.gravity[:, j], b.across[:, j]]
-        rise = np.gradient(m.a[:, j] if b is None else load / inertia, m.step)
+        rise = np.gradient(load / inertia, m.step)
         block = at + ((m.t - m.t[0]) / BLOCK).astype(int)
         at = int(block.max()) + 1
         parts.append(tuple(c[keep] for c in (np.stack(columns, 1), torque - load, v, rise, torque, block)))
@@ -317,25 +315,6 @@ class Inverse:
     full: dict[str, float] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     cutoff: float = 0.0  # Hz, of the filter
-
-
-def identify(
-    t: np.ndarray, q: np.ndarray, torque: np.ndarray, seed: int = 0, test: tuple[np.ndarray, ...] | None = None
-) -> Inverse:
-    """From times [n] s, positions [n] and motor torques [n] of one joint without gravity. test: (t, q, torque) of a
-    recording that only judges the further effects. Raises ValueError for fewer than 200 samples."""
-    if len(t) < 200:
-        raise ValueError(f"{len(t)} samples are too few for inverse dynamics (200)")
-
-    def at(cutoff: float) -> tuple[Columns, Columns]:
-        given = [
-            motion(x[0], x[1][:, None], x[2][:, None], cutoff)
-            for x in ((t, q, torque), *([] if test is None else [test]))
-        ]
-        made = [columns_of([Stretch(m, None)], 0) for m in given]
-        return made[0], made[-1]
-
-    return solve(at, highest(t), seed)
 
 
 def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int = 0) -> Inverse:
