@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.sparse import csr_array
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX, Param, expand
@@ -119,10 +118,9 @@ class Fitter:
         order = np.flatnonzero(np.r_[True, np.diff(windows.sample_window) != 0])
         self.starts = np.concatenate([order, order + n]) if self.use_torque else order
         self.eliminate = residuals.sigma_q0 > 0
-        # samples of each window, one signal's after the other's; of `_adds`, by number of rows
+        # samples of each window, one signal's after the other's
         self._signals = 2 if self.use_torque else 1
         self._sizes = np.tile(np.bincount(windows.sample_window, minlength=self.count), self._signals)
-        self._sparse: dict[int, csr_array] = {}
         self.fixed: tuple[tuple[str, float], ...] = ()  # constants of a hypothesis (`given`)
 
     def given(self, members: Sequence[Member]) -> Self:
@@ -186,31 +184,8 @@ class Fitter:
         return out
 
     def by_window(self, x: np.ndarray) -> np.ndarray:
-        """Return [H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
-        interpreter."""
-        out, some = np.empty((len(x), self.count)), max(SUMMED // max(x.shape[1], 1), 1)
-        for a in range(0, len(x), some):
-            rows = x[a : a + some]
-            out[a : a + some] = (self._adds(len(rows)) @ rows.ravel()).reshape(len(rows), -1)
-        return out
-
-    def _adds(self, rows: int) -> csr_array:
-        """Return [rows * W, rows * m] what adds up so many rows of residuals by window, in their order: a sparse matrix
-        of ones, four times as fast as counting into bins, each of which waits for the one before. Made once for the
-        most."""
-        m, W = len(self.window), self.count
-        if rows not in self._sparse:
-            most = max([rows, *self._sparse])
-            if most == rows:
-                order = np.argsort(self.window, kind="stable")
-                at = (order + m * np.arange(rows)[:, None]).ravel().astype(np.int32)
-                ends = np.cumsum(np.tile(np.bincount(self.window, minlength=W), rows))
-                parts = np.ones(rows * m), at, np.r_[0, ends].astype(np.int32)
-            else:  # the first rows of those
-                known = self._sparse[most]
-                parts = known.data[: rows * m], known.indices[: rows * m], known.indptr[: rows * W + 1]
-            self._sparse[rows] = csr_array(parts, shape=(rows * W, rows * m))
-        return self._sparse[rows]
+        """Return [H, W] sums of x [H, m] by window."""
+        return np.add.reduceat(x, self.starts, axis=1).reshape(len(x), self._signals, -1).sum(1)
 
     def loss(self, res: np.ndarray) -> np.ndarray:
         """Return [H] mean of Huber's square."""
