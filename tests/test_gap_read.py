@@ -143,14 +143,6 @@ def test_enabled_acts_in_the_recording_that_has_it_and_a_second_is_enough(tmp_pa
     assert answer["verdict"] != "unusable" and answer["held_out"]["before"] > 0 and set(d.joints) == {"joint"}
 
 
-def test_correlation_is_numpy_s():
-    rng = np.random.default_rng(0)
-    for n in (2, 3, 50, 1500):
-        a, b = rng.standard_normal((2, n))
-        for y in (b, a + 0.1 * b, -3 * a):
-            assert channels.correlation(a, y) == pytest.approx(np.corrcoef(a, y)[0, 1], rel=1e-12, abs=1e-12)
-
-
 def chirp(t, low=0.1, high=10.0, span=10.0):
     """Return a sweep of constant size; t: s from its begin."""
     turns = low * span / np.log(high / low) * ((high / low) ** (np.clip(t, 0, span) / span) - 1)

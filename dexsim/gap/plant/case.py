@@ -9,6 +9,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
@@ -567,8 +568,7 @@ def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
 def _mean(x: np.ndarray, t: np.ndarray, seconds: float) -> np.ndarray:
     """Return moving mean over +- seconds."""
     n = max(int(round(seconds / max(float(np.median(np.diff(t))), 1e-6))), 1)
-    kernel = np.ones(2 * n + 1) / (2 * n + 1)
-    return np.convolve(np.pad(x, n, mode="edge"), kernel, mode="valid")
+    return uniform_filter1d(x, 2 * n + 1, mode="nearest")
 
 
 # -- motions sharper than their samples -------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import correlate
 
 from dexsim.gap.read import Run
 
@@ -67,14 +68,19 @@ def _lag(run: Run, j: int, grid: np.ndarray, t: np.ndarray, q: np.ndarray) -> fl
     dq, dc = rate(np.interp(grid, t, q)), rate(run.command_at(wide)[:, j])
     if len(wide) < len(grid) + 2 * reach or np.ptp(run.cmd[:, j]) < 0.02 or dq.std() == 0 or dc.std() == 0:
         return None
-    power = np.r_[0.0, np.cumsum(dc**2)]
-    size = np.sqrt(np.maximum(power[len(dq) :] - power[: -len(dq)], 1e-30)) * np.linalg.norm(dq)
-    found = np.correlate(dc, dq, "valid") / size  # by where the target's stretch begins: lag = reach - place
+    found = sliding_correlation(dc, dq)  # by where the target's stretch begins: lag = reach - place
     best = int(np.argmax(found))
     away = np.abs(np.arange(len(found)) - best) > 0.15 / STEP
     if found[best] < CLEAR or best in (0, len(found) - 1) or found[best] - found[away].max(initial=-1.0) < ALONE:
         return None
     return STEP * (reach - best)
+
+
+def sliding_correlation(wide: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return correlation of `part` [n] with every stretch of `wide` that is as long, by where the stretch begins."""
+    power = np.r_[0.0, np.cumsum(wide**2)]
+    size = np.sqrt(np.maximum(power[len(part) :] - power[: -len(part)], 1e-30)) * np.linalg.norm(part)
+    return correlate(wide, part, "valid", "fft") / (size + 1e-12)
 
 
 def contradictions(runs: Sequence[Run], joint: str) -> list[tuple[str, str, str]]:

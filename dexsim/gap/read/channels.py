@@ -21,11 +21,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy import fft
+from scipy.ndimage import uniform_filter1d
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.finding import WRONG_SIGNAL, Finding
 from dexsim.gap.read import COLUMNS, Run, pieces
+from dexsim.gap.read.agreement import sliding_correlation
 from dexsim.gap.rules import JUDGE, SIGNAL
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
@@ -351,7 +352,7 @@ def _assume(run: Run, j: int, follows: bool, model: mujoco.MjModel) -> None:
         width = int(np.clip(round(0.1 * rate), 1, len(run.t) // 4))
         q = run.command_at(run.t)[:, j]
         for _ in range(2):
-            q = np.convolve(np.pad(q, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
+            q = uniform_filter1d(q, 2 * width + 1, mode="nearest")
         run.q[:, j] = q
     else:
         run.q[:, j] = run.cmd[:, j] = model.qpos0[model.joint(run.joints[j]).qposadr[0]]
@@ -400,7 +401,7 @@ def _ways(targets: Targets, q: np.ndarray, j: int) -> tuple[float, float]:
         each = [0.0]
         if on.sum() > 10 and q[on].std() > 0:
             at = [targets.before(delay)[on, j] for delay in lags]
-            each += [correlation(c, q[on]) for c in at if c.std() > 0]
+            each += [float(np.corrcoef(c, q[on])[0, 1]) for c in at if c.std() > 0]
         return max(each), max(-x for x in each)
 
     along, against = most(LAGS)
@@ -447,16 +448,6 @@ def _rate(run: Run, joint: str) -> float:
     return float(np.sqrt(np.mean((np.diff(cmd) / np.diff(run.t)) ** 2)) / max(float(np.std(cmd)), 1e-9))
 
 
-def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return that of two series [n], neither of them constant: the steps of `np.corrcoef`, without its checks of
-    shapes."""
-    x = np.array([a, b])
-    x -= x.mean(1)[:, None]
-    products = np.dot(x, x.T) * np.true_divide(1, len(a) - 1)
-    size = np.sqrt(np.diag(products))
-    return float(np.clip(products[0, 1] / size[0] / size[1], -1, 1))
-
-
 def _clocked(run: Run, j: int, targets: Targets) -> bool:
     """Return whether other joints of the run, of whom most that can tell do not lead, show that its clocks belong
     together."""
@@ -499,12 +490,7 @@ def _lead(run: Run, j: int, targets: Targets | None = None) -> float:
     step, after = STEP, AFTER
     dq = np.gradient(np.interp(grid, run.t[part], run.q[part, j]))
     dc = np.convolve(np.gradient(command[:, j]), np.ones(9) / 9, "same")
-    power = np.concatenate([[0.0], np.cumsum(dc**2)])
-    norm = np.sqrt(np.maximum(power[len(grid) :] - power[: -len(grid)], 0.0)) * np.linalg.norm(dq) + 1e-12
-    # by the sample at which the target's stretch begins: shift = 80 - sample
-    size = fft.next_fast_len(len(dc) + len(dq) - 1, real=True)
-    product = fft.irfft(fft.rfft(dc, size) * fft.rfft(dq[::-1], size), size)
-    scores = product[len(dq) - 1 : len(dc)] / norm  # those at which all of dq lies within dc
+    scores = sliding_correlation(dc, dq)  # by where the target's stretch begins: shift = 80 - place
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
     ahead = best > after and scores[best] > SIGNAL.leads and scores[best] > causal + SIGNAL.beyond

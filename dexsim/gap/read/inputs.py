@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
@@ -510,9 +511,8 @@ def _end(
 def _still(run: Run, j: int, near: float) -> np.ndarray:
     """Return [S] whether the joint stands, as far as 0.1 s around each sample show."""
     n = max(int(round(0.05 / max(float(np.median(np.diff(run.t))), 1e-6))), 1)
-    q = np.pad(run.q[:, j], n, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(q, 2 * n + 1)
-    return np.ptp(windows, axis=1) < 0.25 * near
+    most, least = (f(run.q[:, j], 2 * n + 1, mode="nearest") for f in (maximum_filter1d, minimum_filter1d))
+    return most - least < 0.25 * near
 
 
 def _hard(model: mujoco.MjModel, data: mujoco.MjData, run: Run, j: int, i: int) -> bool:
