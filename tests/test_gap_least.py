@@ -35,7 +35,7 @@ class Judged(JointAnswer):
         self.measured, self.t = np.zeros(ROWS), 0.01 * np.arange(ROWS)
         self.without, self.after = np.full(ROWS, before), np.full(ROWS, after**2)
         self.before = self.without**2
-        self.effort_after, self.raw, self.spans, self.evidence, self._trials = None, {}, {}, [], {}
+        self.effort_after, self.spans, self.evidence, self._trials = None, {}, [], {}
         self.earlier = None
 
     def _fitted(self, mm, bounds):

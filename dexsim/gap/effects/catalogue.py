@@ -1,4 +1,4 @@
-"""The catalogue: every effect in the order in which the search asks for it, and the classes of effects that some
+"""The catalogue: every effect in the order of the files, and the classes of effects that some
 recordings cannot tell apart, each with the experiment that does.
 
 An effect names the classes that it belongs to; only members of one class may be reported as a set.
@@ -21,64 +21,19 @@ if TYPE_CHECKING:
     from dexsim.gap.finding import Finding
     from dexsim.gap.plant.case import Case
 
-FIRST = (
-    "coulomb_friction",
-    "stribeck_friction",
-    "viscous_friction",
-    "load_friction",
-    "backlash",
-    "compliance",
-    "command_delay",
-    "lag",
-    "torque_limit",
-    "torque_speed_limit",
-    "supply_sag",
-    "torque_ripple",
-    "thermal",
-    "joint_coupling",
-    "position_offset",
-    "position_scale",
-    "payload",
-    "inertia",
-    "gain_mismatch",
-    "deadband",
-    "current_sensor",
-    "braking_limit",
-    "controller_term",
-    "presliding",
-    "joint_spring",
-    "external_force",
-    "setpoint_profile",
-)
-"""The order in which the search asks; an effect that is not named here comes after, in the order of the files."""
-FIRST_BY_TORQUE = ("viscous_friction", "lag", "load_friction", "stribeck_friction")
-"""The same for inverse dynamics: of two effects that are the best to add in as many bootstraps, the first is the
-rival."""
-FIRST_TOUCH = (
-    "tactile_gain",
-    "tactile_stiffening",
-    "tactile_hysteresis",
-    "tactile_crosstalk",
-    "tactile_delay",
-    "thermal",
-    "contact_friction",
-    "contact_stiffness",
-)
-"""The same for touch."""
-
 Entry = TypeVar("Entry", Effect, TouchEffect)
 
 
-def gathered(kind: type[Entry], families: Sequence[ModuleType], first: Sequence[str]) -> tuple[Entry, ...]:
-    """Return an entry of each class of a kind that stands in the files of these families: to write it there is to add
-    it."""
+def gathered(kind: type[Entry], *families: ModuleType) -> tuple[Entry, ...]:
+    """Return an entry of each class of a kind that stands in the files of these families, in their order: to write it
+    there is to add it."""
     found: list[Entry] = [
         c()
         for family in families
         for c in vars(family).values()
         if isinstance(c, type) and issubclass(c, kind) and c.__module__ == family.__name__
     ]
-    return in_order(found + _brought(kind), first)
+    return tuple(found + _brought(kind))
 
 
 def _brought(kind: type[Entry]) -> list[Entry]:
@@ -94,17 +49,12 @@ def _brought(kind: type[Entry]) -> list[Entry]:
     return out
 
 
-def in_order(found: Sequence[Entry], first: Sequence[str]) -> tuple[Entry, ...]:
-    """Return entries with those of the ids `first` before all others."""
-    return tuple(sorted(found, key=lambda e: first.index(e.id) if e.id in first else len(first)))
-
-
-CATALOGUE = gathered(Effect, (friction, transmission, signals, drive, body), FIRST)
+CATALOGUE = gathered(Effect, friction, transmission, signals, drive, body)
 """Effects of a joint and its drive."""
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
-BY_TORQUE = in_order([e for e in CATALOGUE if e.by_torque], FIRST_BY_TORQUE)
+BY_TORQUE = tuple(e for e in CATALOGUE if e.by_torque)
 """Those that inverse dynamics have a column of."""
-TOUCH_CATALOGUE = gathered(TouchEffect, (touch,), FIRST_TOUCH)
+TOUCH_CATALOGUE = gathered(TouchEffect, touch)
 """Effects of touch and contact."""
 TOUCH_EFFECTS: dict[str, TouchEffect] = {e.id: e for e in TOUCH_CATALOGUE}
 

@@ -73,42 +73,6 @@ def gains(finding: Finding, pad: PadSettings, doubt: bool) -> str:
     return "; exchanged taxels are left out" if swapped and doubt else ""
 
 
-class TactileDelay(TouchEffect):
-    """Taxels that lag the joints."""
-
-    id = "tactile_delay"
-    words = "reports touch later than the joints move"
-    shows = "at the onset of touch"
-    experiment = "fast taps"
-    fits = ("delay",)
-    starts = ((0.02,), (0.06,))
-    report = (("delay", "delay"),)
-    replaces = frozenset(("clock",))
-
-    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
-        pad.values["delay"] = fitted(finding.parameters["delay"], 0.0 if doubt else None)
-        return ""
-
-
-class TactileHysteresis(TouchEffect):
-    """A rubber that relaxes under a held force: a standard linear solid."""
-
-    id = "tactile_hysteresis"
-    words = "has a rubber that relaxes under a held force"
-    shows = "while force falls, and in holds over 2 s"
-    experiment = "holds of 5 s and fast releases, cold and warm in random order"
-    fits = ("fraction", "time_constant")
-    starts = ((0.3, 0.1), (0.3, 0.5), (0.3, 2.5))
-    report = (("fraction", "fraction"), ("time_constant", "time_constant"))
-    classes = ("how touch changes with time",)
-
-    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
-        p = finding.parameters
-        pad.values["hysteresis"] = fitted(p["fraction"], 0.0 if doubt else None)
-        pad.values["hysteresis_time"] = fitted(p["time_constant"], None)
-        return ""
-
-
 class TactileStiffening(TouchEffect):
     """A rubber that stiffens as it is pressed in: a Mooney-Rivlin foundation under every taxel."""
 
@@ -134,6 +98,25 @@ class TactileStiffening(TouchEffect):
         return "; its rubber is left out" if doubt else ""
 
 
+class TactileHysteresis(TouchEffect):
+    """A rubber that relaxes under a held force: a standard linear solid."""
+
+    id = "tactile_hysteresis"
+    words = "has a rubber that relaxes under a held force"
+    shows = "while force falls, and in holds over 2 s"
+    experiment = "holds of 5 s and fast releases, cold and warm in random order"
+    fits = ("fraction", "time_constant")
+    starts = ((0.3, 0.1), (0.3, 0.5), (0.3, 2.5))
+    report = (("fraction", "fraction"), ("time_constant", "time_constant"))
+    classes = ("how touch changes with time",)
+
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        p = finding.parameters
+        pad.values["hysteresis"] = fitted(p["fraction"], 0.0 if doubt else None)
+        pad.values["hysteresis_time"] = fitted(p["time_constant"], None)
+        return ""
+
+
 class TactileCrosstalk(TouchEffect):
     """Neighbours that respond: part of a taxel's force shows on those beside it."""
 
@@ -153,6 +136,23 @@ class TactileCrosstalk(TouchEffect):
 
     def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
         pad.values["crosstalk"] = fitted(finding.parameters["fraction"], 0.0 if doubt else None)
+        return ""
+
+
+class TactileDelay(TouchEffect):
+    """Taxels that lag the joints."""
+
+    id = "tactile_delay"
+    words = "reports touch later than the joints move"
+    shows = "at the onset of touch"
+    experiment = "fast taps"
+    fits = ("delay",)
+    starts = ((0.02,), (0.06,))
+    report = (("delay", "delay"),)
+    replaces = frozenset(("clock",))
+
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        pad.values["delay"] = fitted(finding.parameters["delay"], 0.0 if doubt else None)
         return ""
 
 
@@ -180,6 +180,26 @@ class TactileDrift(TouchEffect):
         return 0.5 * (1.0 + ends[0]), min(1.0, *ends[1:]), max(1.0, *ends[1:])
 
 
+class ContactFriction(TouchEffect):
+    """An object that slips at another friction than believed."""
+
+    id = "contact_friction"
+    words = "lets the object slip at another friction than believed"
+    shows = "at the onset of slip"
+    experiment = "slow sliding under several normal forces"
+    fits = ("mu",)
+    starts = ((0.6,), (1.5,))
+    stage = "shear"
+    report = (("mu", "mu"),)
+
+    def changes(self, run: PadRun, t: TouchTrial, base: dict[str, float]) -> np.ndarray:
+        return np.linalg.norm(shear(run, t.values) - shear(run, t.values | {"mu": 1.0}), axis=1)
+
+    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
+        pad.shared["object.friction"] = fitted(finding.parameters["mu"], pad.fact.friction if doubt else None)
+        return ""
+
+
 class ContactStiffness(TouchEffect):
     """A contact that is softer or harder than believed."""
 
@@ -201,24 +221,4 @@ class ContactStiffness(TouchEffect):
         pad.shared["contact.stiffness"] = fitted(p, believed if doubt else None)
         if set(finding.indistinguishable) - {self.id}:  # a gain would do as well
             pad.values["gain"] = times(pad.values.get("gain"), absent(fitted(p, None, 1.0 / believed), 1.0))
-        return ""
-
-
-class ContactFriction(TouchEffect):
-    """An object that slips at another friction than believed."""
-
-    id = "contact_friction"
-    words = "lets the object slip at another friction than believed"
-    shows = "at the onset of slip"
-    experiment = "slow sliding under several normal forces"
-    fits = ("mu",)
-    starts = ((0.6,), (1.5,))
-    stage = "shear"
-    report = (("mu", "mu"),)
-
-    def changes(self, run: PadRun, t: TouchTrial, base: dict[str, float]) -> np.ndarray:
-        return np.linalg.norm(shear(run, t.values) - shear(run, t.values | {"mu": 1.0}), axis=1)
-
-    def hand_on(self, finding: Finding, pad: PadSettings, doubt: bool) -> str:
-        pad.shared["object.friction"] = fitted(finding.parameters["mu"], pad.fact.friction if doubt else None)
         return ""

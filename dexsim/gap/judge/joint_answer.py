@@ -34,8 +34,8 @@ class JointAnswer:
     before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at
     times t (rows,) [s]; effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 %
     intervals of the fitted parameters; widest: as they are before it is known how well what was held out is followed,
-    by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance:
-    refitted beliefs; found, evidence: see `judge`; spots, depends_on: see `locate`."""
+    by which names are doubted; numbers: the same as figures for the page; nuisance: refitted beliefs; found, evidence:
+    see `judge`; spots, depends_on: see `locate`."""
 
     def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: held_out.Split):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
@@ -58,7 +58,6 @@ class JointAnswer:
         self.nuisance = nuisances(case.joint, self.best)
         self._trials: dict[str, tuple[Trial, np.ndarray, np.ndarray]] = {}  # of `_without`
         self.earlier: JointAnswer | None = None  # with an effect that was taken back since
-        self.raw: dict[str, dict[str, float]] = {}
         self.found: list[Finding] = []
         self.evidence: list[confidence.Evidence] = []
         self.spots: list[locate.Spot] = []
@@ -154,7 +153,6 @@ class JointAnswer:
     def _finding(self, mm: Member, m: Mechanism) -> Finding:
         case = self.case
         raw, spread = self._fitted(mm, self.bounds)
-        self.raw[mm.id] = raw
         trial, q, effort = self._without(mm)
         lost = (self.measured - q) ** 2
         effort_only = mm.effect.effort_only
