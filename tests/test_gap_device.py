@@ -172,6 +172,8 @@ def test_guesses_side_by_side_are_what_each_is_alone(guesses, monkeypatch):
     many[27:, :, INDEX["bias"]], many[27:, :, INDEX["ripple_per_turn"]] = 0.0, 9.0
     for k, (name, value) in enumerate(called.items(), 28):
         many[27:k, :, INDEX[name]] = value
+    many[[15, 16, 22, 23, 24, 28, 29], :, INDEX["speed_feedforward"]] = 0.05 * rng.uniform(1, 2, (7, 1))
+    many[[16, 24, 25, 29], :, INDEX["acceleration_feedforward"]] = 0.002
     inits = 0.01 * rng.normal(size=(31, 2))
     vectors = {columns: which.tolist() for which, columns in plant._side_by_side(many[:, 0])}
     assert vectors[kernel.TWO] == [*range(10, 18)] and vectors[kernel.USUAL] == [*range(7), 8]

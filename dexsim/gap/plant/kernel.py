@@ -341,9 +341,9 @@ def unread(m: f64, p: Guess):
 
 
 @wp.func
-def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
-    """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken
-    off; command k of the run's first .. last - 1 is in force at its begin."""
+def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, rates: bool):
+    """Target [rad], with `rates` its speed and acceleration for a feed-forward, means over the step of dt [s] that ends
+    at `end`, the delay taken off; command k of the run's first .. last - 1 is in force at its begin."""
     target = c.cmd[k]
     kk = int(k)
     while kk + 1 < last:
@@ -352,10 +352,10 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
             break
         target += arrived(end, stamp, dt) * (c.cmd[kk + 1] - c.cmd[kk])
         kk += 1
-    if not p.beyond:
-        return wp.vec2d(target, f64(0.0))
     speed = f64(0.0)
     acceleration = f64(0.0)
+    if not rates:
+        return wp.vec3d(target, speed, acceleration)
     for m in range(wp.max(k, first + 1), kk + 1):
         since = c.cmd_t[m]
         span = since - c.cmd_t[m - 1]
@@ -369,7 +369,7 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
         share = hold(since, span, until, end - dt, dt)
         speed += share * rate
         acceleration += share * difference(rate, earlier, span, dt)
-    return wp.vec2d(target, feed_forward(p.feed_v, p.feed_a, speed, acceleration))
+    return wp.vec3d(target, speed, acceleration)
 
 
 # -- what holds in a step ----------------------------------------------------------------------------------------------
@@ -944,9 +944,9 @@ def plant_kernel() -> wp.Kernel:
             end = t + dt - waits
             while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
                 k += 1
-            aim = command(c, c_begin, k, c_end, end, dt, p)
+            aim = command(c, c_begin, k, c_end, end, dt, p.beyond)
             n.target = aim[0]
-            n.feed = aim[1]
+            n.feed = feed_forward(p.feed_v, p.feed_a, aim[1], aim[2])
             n, kept = drive_now(c, of, g, dt, x, p, n)
             x.memory = kept
             n = body_now(c, of, g, p, n)
@@ -986,9 +986,12 @@ USUAL = tuple(
         "effort_gain", "effort_offset", "readout_scale", "readout_offset", "spring", "spring_preload",
     )
 )  # fmt: skip
-MORE = USUAL + tuple(  # by another joint, or by what hangs on it
-    INDEX[n] for n in ("linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across")
-)
+MORE = USUAL + tuple(  # by another joint, by what hangs on it, or of a target that moves
+    INDEX[n] for n in (
+        "linkage", "reaction", "coupling_from", "own_payload", "com_out", "com_across", "speed_feedforward",
+        "acceleration_feedforward",
+    )
+)  # fmt: skip
 TWO = MORE + tuple(INDEX[n] for n in ("backlash", "softness", "rebound", "hardening"))  # of rotor and link
 # what calls exp() or sin(), which would keep the others from being vectors: worked out before, as friction and bias
 CALLED = tuple(k for k in MORE if k != P_BIAS) + tuple(
@@ -1013,6 +1016,8 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
     Columns = wp.types.vector(length=LANES * len(usual), dtype=f64)
     absent, places = wp.constant(Row(*ABSENT)), wp.constant(wp.types.vector(length=len(usual), dtype=int)(*usual))
     two, count, wait_at = usual == TWO, len(usual), LANES * usual.index(P_DELAY)
+    fed = P_FEEDV in usual
+    speed_at, acceleration_at = (LANES * usual.index(k) if fed else 0 for k in (P_FEEDV, P_FEEDA))
     substeps = TWO_BODY_STEPS if two else ONE_BODY_STEPS
     flags = f"{compiled()} -mprefer-vector-width=512"
 
@@ -1047,7 +1052,10 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
         before = Lanes()
         after = Lanes()
         leads = Lanes()
+        feeds = Lanes()
         lead = int(0)
+        rates = bool(False)
+        aim = wp.vec3d()
         l = int(0)
         while l < LANES:
             of = c.params[h0 + l]
@@ -1062,12 +1070,12 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
             fresh[l] = f64(1.0)
             ks[l] = f64(c.window[w, 7])
             after[l] = shown(of, x.q, x, p)[0]
+            rates = rates or p.beyond
             if warm == 0:
                 leads[l] = f64(asked_before(c, of, c.window[w, 7], c_end, t, dt, x, p))
                 lead = wp.max(lead, int(leads[l]))
             l += 1
         t -= f64(lead) * dt
-        plain = guess(c, c.params[h0], dt)  # none asks for a feed-forward
         for j in range(c.window[w, 1] + lead):
             i = j - lead
             g = g0 + wp.max(i, 0)
@@ -1114,7 +1122,11 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                     while k + 1 < c_end and c.cmd_t[k + 1] <= end - dt:
                         k += 1
                     ks[l] = f64(k)
-                    targets[l] = command(c, c_begin, k, c_end, end, dt, plain)[0]
+                    aim = command(c, c_begin, k, c_end, end, dt, rates)
+                    targets[l] = aim[0]
+                if wp.static(fed):
+                    by_speed = columns[wp.static(speed_at) + l]
+                    feeds[l] = feed_forward(by_speed, columns[wp.static(acceleration_at) + l], aim[1], aim[2])
                 l += 1
             part = int(0)
             while part < wp.static(substeps):
@@ -1157,6 +1169,8 @@ def lanes_kernel(usual: tuple[int, ...]) -> wp.Kernel:
                     n = Now()
                     n.held = i < warm or i < 0
                     n.target = targets[l]
+                    if wp.static(fed):
+                        n.feed = feeds[l]
                     n, kept = drive_now(c, row, g, dt, one, fixed, n)
                     one.memory = kept
                     n = body_now(c, row, g, fixed, n)
