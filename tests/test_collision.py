@@ -3,6 +3,8 @@ step."""
 
 from __future__ import annotations
 
+from concurrent.futures import Future
+
 import mujoco
 import numpy as np
 import pytest
@@ -409,7 +411,23 @@ def test_kernels_of_a_step_are_listed_and_compiled_alone_with_the_same_bits(gras
     assert {kernel.module for kernel, _ in _launched(e._one_step)} <= alone
     assert torch.equal(stepped(), before) and bool((before[:, -len(e.pairs) :] > 0).any())
     assert all(len(module.kernels) == 1 for module in alone if module.name.startswith("mujoco_warp."))
-    assert warmup.compile_side_by_side(e._one_step, "cpu") == 0
+    assert warmup.begin(e._one_step, "cpu") == 0
+
+
+def test_what_is_needed_first_is_waited_for_alone(grasping, monkeypatch):
+    e = grasping[0].engine
+    begun = {key: Future() for key in warmup.listed(e._one_step)}
+    monkeypatch.setattr(warmup, "_begun", begun)
+    first = warmup.listed(e._positions)
+    for key in first:
+        begun[key].set_result(None)
+    rest = len(begun) - len(first)
+    warmup.finish(e._positions)
+    assert first and len(begun) == rest > 10
+    for future in begun.values():
+        future.set_exception(RuntimeError("nvrtc"))
+    with pytest.raises(RuntimeError, match="nvrtc"):
+        warmup.finish()
 
 
 def _launched(program) -> list:

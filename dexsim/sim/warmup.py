@@ -1,14 +1,15 @@
 """Compile many kernels at once: a first start takes as long as the longest of them, not as their sum.
 
 Warp compiles a kernel when it is first launched, one after another. Here a program's launches are first only listed,
-then all their modules are compiled on as many threads as there are cores, then the program may run.
+then all their modules are compiled on as many threads as there are cores, while the caller does something else; then
+the program may run.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,19 +18,30 @@ from warp._src import context
 
 from dexsim.system import cores
 
+_begun: dict[tuple[Any, int], Future] = {}
 
-def compile_side_by_side(program: Callable[[], None], device: str) -> int:
-    """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what
-    it reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
+
+def begin(program: Callable[[], None], device: str) -> int:
+    """Begin to compile what `program` launches on `device`; returns how many modules. The program runs without its
+    kernels: what it reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a
+    time."""
     where = wp.get_device(device)
     if not where.is_cuda:
         return 0
     with wp.ScopedDevice(where):
         modules = listed(program)
-        with ThreadPoolExecutor(max_workers=min(len(modules), cores()) or 1) as pool:
-            for done in [pool.submit(module.load, device, block_dim=block_dim) for module, block_dim in modules]:
-                done.result()
+    pool = ThreadPoolExecutor(max_workers=min(len(modules), cores()) or 1)
+    for module, block_dim in modules:
+        _begun[module, block_dim] = pool.submit(module.load, where, block_dim=block_dim)
+    pool.shutdown(wait=False)
     return len(modules)
+
+
+def finish(program: Callable[[], None] | None = None) -> None:
+    """Wait for what `program` launches, where its compilation has begun; None: for all that has."""
+    for key in list(_begun) if program is None or not _begun else listed(program):
+        if key in _begun:
+            _begun.pop(key).result()
 
 
 def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:

@@ -14,12 +14,11 @@ import warp as wp
 
 from dexsim.errors import UserError
 from dexsim.sim import collision as narrow_phase
-from dexsim.sim import contact
+from dexsim.sim import contact, warmup
 from dexsim.sim import solver as newton
 from dexsim.sim.begin import Begin
 from dexsim.sim.beside import Beside
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
-from dexsim.sim.warmup import compile_side_by_side
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 _STREAMS: dict[int, wp.Stream] = {}
@@ -116,7 +115,9 @@ class WarpEngine(Engine):
         self._fields_t = {k: wp.to_torch(v) for k, v in self._fields.items()}
         self._graphs: dict = {}
         self._eager_done: set = set()
-        compile_side_by_side(self._one_step, device)
+        warmup.begin(self._one_step, device)
+        with wp.ScopedDevice(device):
+            warmup.finish(self._positions)  # the others are compiled while a task is built
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:
@@ -128,12 +129,14 @@ class WarpEngine(Engine):
     def step(
         self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None
     ) -> None:
+        warmup.finish()
+
         def program() -> None:
             for _ in range(substeps):
                 if before_each is not None:
                     before_each()
                 self.physics_step()
-            mjw.kinematics(self.m, self.d)
+            self._positions()
             self._outputs()
             if after is not None:
                 after()
@@ -155,11 +158,14 @@ class WarpEngine(Engine):
 
     def _one_step(self) -> None:
         self.physics_step()
-        mjw.kinematics(self.m, self.d)
+        self._positions()
         self._outputs()
 
+    def _positions(self) -> None:
+        mjw.kinematics(self.m, self.d)
+
     def refresh(self) -> None:
-        self._run(("refresh",), lambda: mjw.kinematics(self.m, self.d))
+        self._run(("refresh",), self._positions)
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self._begin(mask, qpos, qvel)

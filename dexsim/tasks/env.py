@@ -20,7 +20,7 @@ from tensordict import TensorDict
 
 from dexsim import typed
 from dexsim.errors import UserError
-from dexsim.sim.warmup import compile_side_by_side
+from dexsim.sim import warmup
 from dexsim.tasks import state_kernels
 from dexsim.tasks.keeping import Kept
 from dexsim.tasks.nan_dump import NanDump
@@ -59,7 +59,8 @@ class HandEnv(Kept):
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
-        compile_side_by_side(self._name_kernels, device)
+        warmup.begin(self._name_kernels, device)
+        warmup.finish()
         self.reset_all()
         self._check_widths()
 

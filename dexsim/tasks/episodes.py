@@ -175,7 +175,7 @@ class Episodes(Built):
         return [*own, *write, servos.draw_kernel(real), randomize.spread]
 
     def _name_kernels(self) -> None:
-        """Launch each kernel once, for `compile_side_by_side`, which only notes what is launched."""
+        """Launch each kernel once, for `dexsim.sim.warmup`, which only notes what is launched."""
         for kernel in self.kernels():
             wp.launch(kernel, dim=1)
         t, nobody = self.engine.t, torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
