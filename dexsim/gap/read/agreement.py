@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
 
 from dexsim.gap.read import Run
 
@@ -78,6 +77,8 @@ def _lag(run: Run, j: int, grid: np.ndarray, t: np.ndarray, q: np.ndarray) -> fl
 
 def sliding_correlation(wide: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Return correlation of `part` [n] with every stretch of `wide` that is as long, by where the stretch begins."""
+    from scipy.signal import correlate  # it takes an audit half a second to import
+
     power = np.r_[0.0, np.cumsum(wide**2)]
     size = np.sqrt(np.maximum(power[len(part) :] - power[: -len(part)], 1e-30)) * np.linalg.norm(part)
     return correlate(wide, part, "valid", "fft") / (size + 1e-12)
