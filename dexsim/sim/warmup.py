@@ -18,7 +18,7 @@ from warp._src import context
 
 from dexsim.system import cores
 
-begun: dict[tuple[Any, int], Future] = {}
+_begun: dict[tuple[Any, int], Future] = {}
 
 
 def begin(program: Callable[[], None], device: str) -> int:
@@ -32,33 +32,35 @@ def begin(program: Callable[[], None], device: str) -> int:
         modules = listed(program)
     pool = ThreadPoolExecutor(max_workers=min(len(modules), cores()) or 1)
     for module, block_dim in modules:
-        begun[module, block_dim] = pool.submit(module.load, where, block_dim=block_dim)
+        _begun[module, block_dim] = pool.submit(module.load, where, block_dim=block_dim)
     pool.shutdown(wait=False)
     return len(modules)
 
 
 def finish(program: Callable[[], None] | None = None) -> None:
     """Wait for what `program` launches, where its compilation has begun; None: for all that has."""
-    for key in list(begun) if program is None or not begun else listed(program):
-        if key in begun:
-            begun.pop(key).result()
+    for key in list(_begun) if program is None or not _begun else listed(program):
+        if key in _begun:
+            _begun.pop(key).result()
 
 
 def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
-    """Return (module, threads a block) of what `program` launches, in order, none twice. Of MuJoCo-Warp's modules a
-    model launches a part, which gets a module of its own, to the same machine code."""
-    found: dict[tuple[wp.Kernel, int], None] = {}
-    with _instead_of_launching(lambda kernel, block_dim: found.setdefault((kernel, block_dim))):
+    """Return (module, threads a block) of each kernel that `program` launches, in order, none twice."""
+    found: dict[tuple[Any, int], None] = {}
+    with _instead_of_launching(lambda kernel, block_dim: found.setdefault((_own_module(kernel), block_dim))):
         program()
-    own: dict[Any, Any] = {}
-    for kernel, _ in found:
-        if (shared := kernel.module).name.startswith("mujoco_warp."):
-            if shared not in own:  # one for each of theirs: NVRTC reads sources one after another
-                own[shared] = context.Module(f"launched.{shared.name}")
-                own[shared].options |= shared.options
-            kernel.module = own[shared]
-            kernel.module.register_kernel(kernel)
-    return list(dict.fromkeys((kernel.module, block_dim) for kernel, block_dim in found))
+    return list(found)
+
+
+def _own_module(kernel: wp.Kernel) -> Any:
+    """Return the module that a kernel is compiled in. Of MuJoCo-Warp's modules a model launches a part: each of their
+    kernels gets one of its own, to the same machine code."""
+    shared = kernel.module
+    if shared.name.startswith("mujoco_warp.") and len(shared.kernels) > 1:
+        kernel.module = context.Module(f"{shared.name}.{kernel.key}")
+        kernel.module.options |= shared.options
+        kernel.module.register_kernel(kernel)
+    return kernel.module
 
 
 @contextmanager
