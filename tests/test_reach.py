@@ -109,7 +109,7 @@ SERVO = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.02, "torque_li
 def test_what_lies_far_outside_the_models_range_is_left_out(change, topics):
     r = recordings.signal()
     run = Run("x.mcap", r.joints, r.commands.t, r.commands.value.copy(), r.states.position.t.copy(),
-              r.states.position.value.copy(), SERVO, r.gravity, notes=[], counted=r.joints)  # fmt: skip
+              r.states.position.value.copy(), SERVO, r.gravity, counted=r.joints)  # fmt: skip
     change(run)
     found, out, _ = channels.inspect([run], mujoco.MjModel.from_xml_string(MODEL), {})
     far = [f for f in found if "the model allows" in f.regime]
